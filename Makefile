@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -266,6 +266,9 @@ bench-develop: setup-dev ## frames developed per second on one core; writes runs
 bench-regenerate: setup-dev ## number of frames that are identical when rendered again from the manifest; writes runs/bench/regenerate.json
 	@$(BIN)/python -m benchmarks.dataset.regenerate
 
+bench-same-bytes: setup-dev ## hash of every stage of a frame, to find where two processors differ (COMPARE=file of another machine); writes runs/bench/same_bytes.json
+	@$(BIN)/python -m benchmarks.dataset.same_bytes $(if $(COMPARE),--compare $(call quoted,$(COMPARE)))
+
 bench-labels: setup-dev ## label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
 
@@ -293,6 +296,9 @@ bench-paper-causes: setup-dev ## why short trainings of the paper's detector fai
 
 bench-captured: setup-dev ## training speed of both detectors with steps one operation at a time and captured, on a GPU; writes runs/bench/captured.json
 	@$(BIN)/python -m benchmarks.train.captured
+
+bench-pose-limits: setup-dev ## what limits the navigator of poses (steps, descents, views, features), on the experiment's runs; writes runs/bench/pose-limits.json
+	@$(BIN)/python -m benchmarks.train.pose_limits --detector $(RUNS)/paper/detect/yolov3-half-0 --dataset data/paper/headline/nav --hidden 256
 
 bench-shared: setup-dev ## speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
 	@$(BIN)/python -m benchmarks.shared

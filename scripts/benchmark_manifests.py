@@ -12,6 +12,10 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import typer
 
 REGIONS = ("highland", "mare")

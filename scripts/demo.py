@@ -16,6 +16,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import typer
 
 from perilune_render.config import DatasetConfig
@@ -192,4 +196,5 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    # Longer than for the commands that it starts, which print how to resume.
+    run_command_line(lambda: typer.run(main), ended_after_s=2.5)

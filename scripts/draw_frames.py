@@ -2,6 +2,10 @@
 
 from pathlib import Path
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import matplotlib
 
 matplotlib.use("Agg")

@@ -6,6 +6,10 @@ scripts/draw_hazard.py data/hazard/nav scene-0000/trajectory-0000/000004
 import sys
 from pathlib import Path
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import cv2
 import matplotlib
 

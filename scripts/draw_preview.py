@@ -1,11 +1,16 @@
 """Draw docs/pictures/small_preview.jpg, the picture of the README: the preview of `small`, 1280 pixels wide."""
 
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
+import perilune_render.processor  # noqa: F401, I001 - before NumPy
 import cv2
+
+from perilune_render.cli.main import app
 
 PICTURE = Path(__file__).parent.parent / "docs/pictures/small_preview.jpg"
 WIDTH_PX = 1280
@@ -13,10 +18,9 @@ WIDTH_PX = 1280
 
 def main() -> None:
     """Render the preview and write the picture."""
-    program = Path(sys.executable).with_name("perilune-render")
     with tempfile.TemporaryDirectory() as folder:
         sheet = Path(folder) / "preview.png"
-        subprocess.run([program, "preview", "--preset", "small", "--out", sheet], check=True)
+        app(["preview", "--preset", "small", "--out", str(sheet)], standalone_mode=False)
         image = cv2.imread(str(sheet))
     height_px = round(image.shape[0] * WIDTH_PX / image.shape[1])
     small = cv2.resize(image, (WIDTH_PX, height_px), interpolation=cv2.INTER_AREA)

@@ -7,6 +7,10 @@ Scenes and frames are made by perilune_render.
 import argparse
 from pathlib import Path
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import cv2
 import matplotlib
 

@@ -22,6 +22,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import typer
 
 from perilune_render.config import DatasetConfig
@@ -36,7 +40,7 @@ from perilune_train.paper.claimed import DETECTION
 
 PROTOCOL = Path("configs/paper_protocol.yaml")
 ATTITUDE_DEG = 1.0
-"""Standard deviation of the attitude in the second experiment, per axis."""
+"""Standard deviation of the attitude per axis in the datasets with attitude noise."""
 CALIBRATED_AP = DETECTION["YOLOv3"]["ap50_paper"]
 """Validation AP of YOLOv3 without attention on the headline ground: the paper's."""
 SPARSE, LUNAR = "0.1", "lunar"
@@ -75,7 +79,10 @@ class Sizes:
     curve: tuple[str, ...]
     """Shares of the equilibrium density of the grounds between the sparse and our usual one."""
     epochs: int
-    """Epochs of each detector."""
+    """Epochs of each detector on the headline ground and on the curve."""
+    long_epochs: int
+    """Epochs on the sparse and on our usual ground. If there are more than `epochs`, two detectors on the headline
+    ground train as long, to show what epochs change."""
     curve_width: float
     """Width of the detectors on the curve, and of the lunar ones."""
     half_width: float
@@ -109,6 +116,7 @@ _TWO_CORES = {
     "navigate.workers": "0",
     "navigate.stack.batch_sequences": "1",
     "navigate.stack.accumulate": "8",
+    "navigate.stack.views": "4",
 }
 """Settings that fit two cores and 16 GB."""
 _GPU = {
@@ -120,6 +128,7 @@ _GPU = {
     # Two navigators and three detectors at once need 60 GB so.
     "navigate.stack.batch_sequences": "4",
     "navigate.stack.accumulate": "2",
+    "navigate.stack.views": "8",
 }
 PARTS = {
     Part.WHOLE: Sizes(
@@ -128,6 +137,7 @@ PARTS = {
         nav_trajectories=49,
         curve=("0.25", "0.8"),
         epochs=5,
+        long_epochs=5,
         curve_width=0.5,
         half_width=0.5,
         seeds=(0, 1, 2),
@@ -144,15 +154,16 @@ PARTS = {
         nav_trajectories=49,
         curve=("0.25", "0.5", "1.0"),
         epochs=12,
+        long_epochs=24,
         curve_width=1.0,
         half_width=0.5,
         seeds=(0, 1, 2),
         navigator_width=1.0,
         more=True,
-        coarse_epochs=104,
-        fine_epochs=6,
+        coarse_epochs=160,
+        fine_epochs=10,
         render_workers=14,
-        trainings=4,
+        trainings=6,
         settings=_GPU,
     ),
     Part.FULL: Sizes(
@@ -161,6 +172,7 @@ PARTS = {
         nav_trajectories=49,
         curve=("0.25", "0.5", "1.0"),
         epochs=20,
+        long_epochs=20,
         curve_width=1.0,
         half_width=0.5,
         seeds=(0, 1, 2),
@@ -179,6 +191,7 @@ TINY = Sizes(
     nav_trajectories=5,
     curve=("0.5",),
     epochs=1,
+    long_epochs=2,
     curve_width=0.125,
     half_width=0.125,
     seeds=(0,),
@@ -186,7 +199,7 @@ TINY = Sizes(
     more=True,
     coarse_epochs=2,
     fine_epochs=1,
-    settings={"detect.batch_size": "8", "detect.validate_every": "1"},
+    settings={"detect.batch_size": "8", "detect.validate_every": "1", "navigate.stack.views": "1"},
 )
 """Sizes with PRESET=tiny: all steps in minutes; the networks learn nothing."""
 
@@ -234,11 +247,10 @@ class Experiment:
 
     @property
     def label(self) -> str:
-        """Name of the dataset and of the folders: paper, paper-gpu, paper-tiny, paper-lunar-attitude."""
+        """Name of the dataset and of the folders: paper, paper-gpu, paper-tiny, paper-lunar."""
         parts = ["paper"]
         parts += [self.preset] if self.preset != "paper" else [] if self.part == Part.WHOLE else [str(self.part)]
-        parts += [LUNAR] if self.ground == Ground.LUNAR else []
-        return "-".join([*parts, *(["attitude"] if self.attitude else [])])
+        return "-".join([*parts, *([LUNAR] if self.ground == Ground.LUNAR else [])])
 
     @property
     def data(self) -> Path:
@@ -270,13 +282,10 @@ class Experiment:
                 for kind, count in counts.items():
                     found |= {f"dataset.{kind}.trajectories_per_scene": str(count)}
                     found |= {f"dataset.{kind}.n_frames": str(sizes.frames)}
-            if self.attitude:
-                for kind in ("detect", "nav"):
-                    found[f"dataset.{kind}.flight.attitude_sigma_deg"] = str(ATTITUDE_DEG)
             return found
         own = {key: value for key, value in sizes.settings.items() if key.startswith(f"{section}.")}
         if section == "detect":
-            return own | {"detect.epochs": str(sizes.epochs)}
+            return own
         return own | {
             "navigate.stack.coarse_epochs": str(sizes.coarse_epochs),
             "navigate.stack.fine_epochs": str(sizes.fine_epochs),
@@ -319,11 +328,15 @@ def steps(one: Experiment) -> list[Step]:
     """All steps, the most important first, since a run with a limit on its time may not reach the last."""
     sizes, ground = one.sizes, "headline"
     curve = [step for share in sizes.curve for step in _on_curve(one, share)] if one.ground == Ground.PANGU else []
-    if curve and sizes.curve_width != 1.0:
-        # The network on the sparse ground has full width.
+    # The networks on the two ends of the curve are points of it only if they are as large and train as long.
+    if curve and (sizes.curve_width != 1.0 or sizes.long_epochs != sizes.epochs):
         curve.append(_detector(one, SPARSE, f"curve-{SPARSE}", "none", sizes.curve_width))
+    if curve and sizes.long_epochs != sizes.epochs:
+        curve.append(_detector(one, LUNAR, f"curve-{LUNAR}", "none", sizes.curve_width))
     first = [*curve, _calibration(one)] if one.calibrate else []
     needs = ("choose the headline ground",) if one.calibrate else ()
+
+    longer = {"detect__epochs": str(sizes.long_epochs)}
 
     def seeds(folder: str, attention: str) -> list[Step]:
         return [
@@ -344,25 +357,33 @@ def steps(one: Experiment) -> list[Step]:
         *(_navigator(one, *words, "pose") for words in navigators),
         _explanation(one),
     ]
-    sparse = [*_on_curve(one, SPARSE), _detector(one, SPARSE, "sparse-attention-yolov3", "cbam", 1.0)]
-    identity = [
-        _detector(one, ground, "attention-identity", "cbam_identity", 1.0),
-        *([_detector(one, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0)] if sizes.more else []),
-        _detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width),
+    identity = _detector(one, ground, "attention-identity", "cbam_identity", 1.0)
+    sparse = [*_on_curve(one, SPARSE), _detector(one, SPARSE, "sparse-attention-yolov3", "cbam", 1.0, **longer)]
+    lunar = [
+        *_on_curve(one, LUNAR),
+        _detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width, **longer),
     ]
     if one.ground == Ground.LUNAR:
-        sparse, identity = [], identity[:1]
+        sparse, lunar = [], []
+    long = [
+        _detector(one, ground, "long-yolov3", "none", 1.0, **longer),
+        _detector(one, ground, "long-attention-yolov3", "cbam", 1.0, **longer),
+    ]
+    sparse_identity = _detector(one, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0, **longer)
     found = [
         *first,
         *headline,
+        identity,
         *sparse,
         *seeds("yolov3", "none")[len(half) // 2 :],
         *seeds("attention-yolov3", "cbam")[len(half) // 2 :],
-        *(_on_curve(one, LUNAR) if one.ground == Ground.PANGU else []),
-        *identity,
-        *([] if first else curve),
         *seeds("attention-identity", "cbam_identity"),
+        *lunar,
+        *(_attitude(one, navigators) if one.attitude else []),
+        *(long if sizes.long_epochs > sizes.epochs else []),
+        *([] if first else curve),
         *(_navigator(one, *words, "motion") for words in navigators),
+        *([sparse_identity] if sizes.more and sparse else []),
         *_transfer(one),
         *_benchmark_steps(one),
     ]
@@ -389,9 +410,10 @@ def _detector(one: Experiment, ground: str, folder: str, attention: str, width: 
     """Training of a detector on a ground, into detect/<folder>."""
     width = 0.125 if one.preset == "tiny" else width
     settings = {"detect__attention": attention, "detect__width": str(width)}
-    options = one.options("detect", **settings, **more)
+    options = one.options("detect", **settings, **({"detect__epochs": str(one.sizes.epochs)} | more))
     command = [*program("perilune-train"), "detect", "train", *options, "--dataset", str(one.data / ground / "detect")]
-    images = 0.8 * one.sizes.trajectories * one.sizes.frames * one.sizes.epochs
+    epochs = int(more.get("detect__epochs", one.sizes.epochs))
+    images = 0.8 * one.sizes.trajectories * one.sizes.frames * epochs
     return Step(
         f"train {folder}",
         [*command, "--out", str(one.runs), "--name", folder],
@@ -407,9 +429,10 @@ def _on_curve(one: Experiment, share: str) -> list[Step]:
     """A ground of the curve, and YOLOv3 without attention on it."""
     folder = {SPARSE: "sparse-yolov3", LUNAR: "lunar-yolov3"}.get(share, f"curve-{share}")
     width = 1.0 if share == SPARSE else one.sizes.curve_width
+    longer = {"detect__epochs": str(one.sizes.long_epochs)} if share in (SPARSE, LUNAR) else {}
     return [
         _render(one, share, "detect", crater_density(share), ()),
-        _detector(one, share, folder, "none", width),
+        _detector(one, share, folder, "none", width, **longer),
     ]
 
 
@@ -467,23 +490,36 @@ def _explanation(one: Experiment) -> Step:
     return Step("explain", command, _finished(one.runs / "explain" / "attention"), needs)
 
 
-def _navigator(one: Experiment, folder: str, detector: str, attention: str, target: str) -> Step:
-    name = folder if target == "pose" else f"{folder}-motion"
+def _attitude(one: Experiment, navigators: list[tuple[str, str, str]]) -> list[Step]:
+    """Navigators over descents with attitude noise, on the backbones of the descents without."""
+    noise = {"dataset__nav__flight__attitude_sigma_deg": str(ATTITUDE_DEG)}
+    needs = ("choose the headline ground",) if one.calibrate else ()
+    rendered = _render(one, "attitude", "nav", headline_density(one) | noise, needs)
+    return [rendered, *(_navigator(one, *words, "attitude") for words in navigators)]
+
+
+def _navigator(one: Experiment, folder: str, detector: str, attention: str, reading: str) -> Step:
+    """Training of a navigator in one of the readings pose, motion, or attitude (the pose with attitude noise)."""
+    name = folder if reading == "pose" else f"{folder}-{reading}"
     sizes = one.sizes
     detector = detector if sizes.navigator_width == 1.0 else f"{detector}-half-{sizes.seeds[0]}"
     width = 0.125 if one.preset == "tiny" else sizes.navigator_width
     backbone = one.runs / "detect" / detector / "checkpoints" / "best.ckpt"
+    target, ground = (
+        ("motion" if reading == "motion" else "pose"),
+        ("attitude" if reading == "attitude" else "headline"),
+    )
     settings = {"navigate__stack__attention": attention, "navigate__stack__target": target}
     settings |= {"navigate__detector": str(backbone), "navigate__stack__width": str(width)}
-    if target == "motion":
-        settings["navigate__stack__fine_epochs"] = "1"
+    if reading == "motion":
+        settings |= {"navigate__stack__fine_epochs": "1", "navigate__stack__views": "0"}
     options = one.options("navigate", **settings)
-    command = [*program("perilune-train"), "navigate", "train", *options, "--dataset", str(one.data / "headline/nav")]
+    command = [*program("perilune-train"), "navigate", "train", *options, "--dataset", str(one.data / ground / "nav")]
     return Step(
         f"train {name}",
         [*command, "--out", str(one.runs), "--name", name],
         _finished(one.runs / "navigate" / f"{name}-stack"),
-        (f"train {detector}", "render headline, navigation"),
+        (f"train {detector}", f"render {ground}, navigation"),
         width=width,
         attention=attention,
     )
@@ -522,12 +558,13 @@ def _benchmark_steps(one: Experiment) -> list[Step]:
 
 def _page(one: Experiment) -> Step:
     sizes = one.sizes
-    noise = ATTITUDE_DEG if one.attitude else 0
-    about = [f"preset `{one.preset}`, part `{one.part}`, attitude noise of {noise:g} degrees"]
+    about = [f"preset `{one.preset}`, part `{one.part}`"]
+    about += [f"attitude noise: {ATTITUDE_DEG:g} degree per axis, where named"] if one.attitude else []
     about += [
         f"{sizes.trajectories * sizes.frames} detection frames over each ground (the paper: 34,300), "
         f"{sizes.nav_trajectories} navigation trajectories of {sizes.frames} frames (the paper: 49 of 100); "
-        f"{sizes.epochs} epochs of each detector"
+        f"{sizes.epochs} epochs of each detector on the headline ground and the curve, {sizes.long_epochs} on the "
+        "sparse and on our usual ground"
     ]
     command = [*program("perilune-train"), "paper", "--runs", str(one.runs)]
     command += ["--dataset", str(one.data / "headline" / "detect"), "--headline-share", headline_share(one)]
@@ -573,8 +610,9 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
             seconds = navigate_seconds(navigate.model_copy(update={"stack": own}))
             pairs = 0.8 * one.sizes.nav_trajectories * one.sizes.frames
             # Features of the coarse stage are computed once, forward only.
-            fine = 1 if step.title.endswith("motion") else one.sizes.fine_epochs
-            found[step.title] = seconds * pairs * (fine + 1 / 3)
+            motion = step.title.endswith("motion")
+            fine, views = (1, 0) if motion else (one.sizes.fine_epochs, navigate.stack.views)
+            found[step.title] = seconds * pairs * (fine + (1 + views) / 3)
     return found
 
 
@@ -604,7 +642,9 @@ def main(
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Choose the density of the headline ground again, on validation.")
     ] = False,
-    attitude: Annotated[bool, typer.Option("--attitude", help="The second experiment, with attitude noise.")] = False,
+    attitude: Annotated[
+        bool, typer.Option("--attitude", help="Also train navigators over descents with attitude noise.")
+    ] = False,
     darknet: Annotated[Path | None, typer.Option(help="YOLOv3's weights of COCO (yolov3.weights).")] = None,
     benchmark: Annotated[Path, typer.Option(help="Folder of the rendered locked benchmark.")] = Path("data/benchmark"),
     minutes: Annotated[
@@ -783,4 +823,5 @@ if __name__ == "__main__":
 
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(main)
-    run_command_line(app)
+    # Longer than for the commands that it starts, which print how to resume.
+    run_command_line(app, ended_after_s=2.5)

@@ -14,6 +14,10 @@ import tarfile
 from pathlib import Path
 from typing import Annotated
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import torch
 import typer
 from safetensors.torch import load, save

@@ -28,6 +28,6 @@ fi
 export PYTHONPATH="${site:+$site:}$PWD/shared:$PWD/render:$PWD/train${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
 [ "$preset" = tiny ] && runs=runs/paper-tiny || runs=runs/paper-gpu
 # What is done by then is packed, whatever happened.
-"$python" scripts/paper.py --preset "$preset" --part gpu ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
+"$python" scripts/paper.py --preset "$preset" --part gpu --attitude ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
 "$python" scripts/paper_files.py pack "$runs" "$out"
 exit "${code:-0}"

@@ -15,6 +15,10 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 

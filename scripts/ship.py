@@ -14,6 +14,10 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import typer
 from model_card import Shipment, model_card
 

@@ -10,6 +10,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import perilune_shared
 import perilune_train
 

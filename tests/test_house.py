@@ -111,6 +111,51 @@ def test_the_distributions_have_one_version():
     assert f"\nversion: {version}\n" in citation
 
 
+BYPASSES = {
+    r"(?<![\w.])print|\.print|typer\.echo|click\.echo|Console|std(out|err)\.write": {
+        "shared/perilune_shared/terminal.py",
+        # Before a program's imports.
+        "shared/perilune_shared/command_line.py",
+    },
+    r"\.to_csv|csv\.writer|DictWriter": {"shared/perilune_shared/export/foreign_text.py"},
+    r"\.to_html|\.to_markdown|\.savefig": {
+        "train/perilune_train/evaluation/pictures.py",
+        "train/perilune_train/report/pictures.py",
+        # Its texts are our own.
+        "shared/perilune_shared/export/card_pictures.py",
+    },
+}
+"""Calls that print, or write tables and figures, and the files whose functions make other people's text safe."""
+PAGE = re.compile(r"\.md\b|\bPAGE\b|\bREADME\b|\bSUMMARY\b|_PAGE\b")
+
+
+def test_text_reaches_terminals_pages_and_tables_through_one_function_each():
+    found = []
+    for _, path in sources():
+        name = path.relative_to(ROOT).as_posix()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call):
+                continue
+            called = ast.unparse(node.func)
+            for pattern, allowed in BYPASSES.items():
+                if re.search(f"(?:{pattern})$", called) and name not in allowed:
+                    found.append(f"{name}:{node.lineno}: {called}")
+            page = node.args and PAGE.search(ast.unparse(node.args[0]))
+            if called.endswith("write_text") and page and name not in MARKDOWN_WRITERS:
+                found.append(f"{name}:{node.lineno}: {called} of a page")
+    assert not found, found
+
+
+MARKDOWN_WRITERS = {
+    "train/perilune_train/evaluation/markdown.py",
+    # Both pages put every text into code spans, and have a comment or a head that is no Markdown.
+    "shared/perilune_shared/export/hugging_face.py",
+    "shared/perilune_shared/export/card.py",
+    # The page of HTML, which Jinja2 escapes.
+    "train/perilune_train/report/page.py",
+}
+"""Files that write pages without `write_markdown`."""
+
 OWN_MODULES = [
     "perilune_shared.config",
     "perilune_render.cli.main",

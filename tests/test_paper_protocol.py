@@ -138,17 +138,38 @@ def test_the_headline_ground_is_chosen_where_the_baseline_has_the_papers_ap(scri
     assert "equilibrium_share={low: 0.5, high: 0.5}" in commands(script, one)["render headline"]
 
 
-def test_the_second_experiment_and_given_weights(script):
+def test_attitude_noise_and_given_weights(script):
     one = experiment(script, attitude=True, darknet=Path("yolov3.weights"))
     found = commands(script, one)
     assert "train transfer-yolov3" not in commands(script, experiment(script)), "too long for two cores"
     assert "detect.init_from=yolov3.weights" in found["train transfer-attention-yolov3"]
-    for kind in ("detect", "nav"):
-        assert f"dataset.{kind}.flight.attitude_sigma_deg=1.0" in found["render headline"]
-    assert one.runs == Path("runs/paper-attitude")
+    without, noisy = found["render headline, navigation"], found["render attitude, navigation"]
+    assert (
+        noisy.replace(" --set dataset.nav.flight.attitude_sigma_deg=1.0", "").replace("/attitude", "/headline")
+        == without
+    )
+    plain, noisy = found["train darknet53-lstm"], found["train darknet53-lstm-attitude"]
+    assert noisy.replace("headline/nav", "").replace("attitude/nav", "").replace("-attitude", "") == plain.replace(
+        "headline/nav", ""
+    )
+    assert "train darknet53-lstm-attitude" not in commands(script, experiment(script))
     assert experiment(script).runs == Path("runs/paper")
     assert experiment(script, part=script.Part.GPU).runs == Path("runs/paper-gpu")
-    assert experiment(script, ground=script.Ground.LUNAR).runs == Path("runs/paper-lunar")
+
+
+def test_what_trains_longer(script):
+    found = commands(script, experiment(script, part=script.Part.GPU))
+    for folder in (
+        "long-yolov3",
+        "sparse-yolov3",
+        "sparse-attention-yolov3",
+        "lunar-yolov3",
+        "lunar-attention-identity",
+    ):
+        assert "detect.epochs=24" in found[f"train {folder}"], folder
+    for folder in ("yolov3", "attention-identity", "yolov3-half-1", "curve-0.1", "curve-0.25", "curve-lunar"):
+        assert "detect.epochs=12" in found[f"train {folder}"], folder
+    assert "train long-yolov3" not in commands(script, experiment(script)), "too long for two cores"
 
 
 def test_every_setting_of_every_step_is_valid(script):

@@ -11,15 +11,15 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors cgroups threads interrupts run_record terminal progress content yaml_text command_line config_errors "
-        "config config_page storage geometry client dataset labels validation editing export cli"
+        "errors cgroups threads interrupts run_record terminal progress content yaml_text command_line "
+        "config_errors config config_page storage geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
         "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene "
         "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
         "heightfield engines outputs dataset preview server jobs cli"
     ),
-    "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main",
+    "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main program",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
         "level_ground cache export"
@@ -28,7 +28,8 @@ ROOMS = {
         "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
     ),
     "train/perilune_train": (
-        "config cli_options compiled data evaluation models training shipped detect navigate explain paper report cli"
+        "config cli_options compiled data evaluation models training shipped detect navigate explain paper report cli "
+        "program"
     ),
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"

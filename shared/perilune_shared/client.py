@@ -143,6 +143,18 @@ class SceneClient:
         camera["distortion"] = tuple(camera["distortion"])
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
+    def health(self) -> dict[str, str]:
+        """Names and addresses (host:port) of the server's interfaces, each of which it has just connected to.
+
+        Raises UserError, which names an interface that does not answer, as for other requests. The reply waits for
+        the requests of other clients, so it also says that frames are rendered.
+        """
+        head, _ = self._ask({"request": "health"})
+        try:
+            return {str(name): str(place) for name, place in head["interfaces"].items()}
+        except (KeyError, AttributeError):
+            raise UserError(self.address, "interfaces", "none", "a reply of `perilune-render serve`") from None
+
     def ground(self, scene: int, *, wait: bool = True) -> ServedGround | None:
         """What a scene is, once it is generated; without `wait`, None if it is not yet."""
         head, _ = self._ask({"request": "ground", "scene": scene}, wait=wait)

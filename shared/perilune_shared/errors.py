@@ -20,8 +20,10 @@ DISK_FAULTS = (
     errno.EISDIR,
     errno.ENAMETOOLONG,
     errno.ELOOP,
+    errno.EMFILE,
+    errno.ENFILE,
 )
-"""Errors of disk and files that a user can correct: no space, no permission, no such folder."""
+"""Errors of disk and files that a user can correct: no space, no permission, no such folder, too few descriptors."""
 
 
 class UserError(Exception):

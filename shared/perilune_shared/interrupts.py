@@ -1,6 +1,11 @@
-"""Delay Ctrl-C until a step is finished, but not for long."""
+"""Ctrl-C: end a program with one line from its first import on; delay it until a step is finished, but not for long.
 
+Imports as little as possible: until `end_at_interrupt` is called, Python prints a traceback at Ctrl-C.
+"""
+
+import atexit
 import contextlib
+import importlib
 import os
 import select
 import signal
@@ -12,6 +17,34 @@ from perilune_shared.errors import EXIT_INTERRUPTED, STOPPED
 _BELOW_BAR = "\n\x1b[?25h"
 """New line, and the control sequence that shows the cursor."""
 _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
+
+
+def start(module: str) -> None:
+    """Import a module and call its function `main`, which calls `command_line.run_command_line`."""
+    end_at_interrupt()
+    importlib.import_module(module).main()
+
+
+def end_at_interrupt() -> None:
+    """From now on Ctrl-C ends the process at once with one line and exit code 130, unless it is ignored.
+
+    Scripts call it before they import large modules, and must have written nothing. `run_command_line` ends it.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+        # At the end all work is done.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+
+
+def ends_at_interrupt() -> bool:
+    """Whether `end_at_interrupt` is in force."""
+    return signal.getsignal(signal.SIGINT) is _end
+
+
+def _end(*_: object) -> None:
+    # Not an exception: modules that are half imported, and C code, would turn it into other errors.
+    os.write(2, f"{STOPPED}\n".encode())
+    os._exit(EXIT_INTERRUPTED)
 
 
 @contextlib.contextmanager

@@ -39,6 +39,7 @@ NO_PROGRESS: Progress = _NoProgress()
 
 def say(line: str, style: str | None = None) -> None:
     """Print a line on standard error, above the progress bar if one is shown; `style` is a style of Rich."""
-    from perilune_shared.terminal import console
+    # Rich is not imported before.
+    from perilune_shared import terminal
 
-    console.print(line, style=style, markup=False, highlight=False, soft_wrap=True)
+    terminal.say(line, style)

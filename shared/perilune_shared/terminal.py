@@ -1,7 +1,12 @@
-"""Console on standard error and progress bar of the command lines, both from Rich."""
+"""All that the command lines print: lines, pages, tables and the progress bar.
 
+Names from files are part of most lines, so none reaches the terminal with a control character, and none is read as
+markup. `tests/test_house.py` finds prints elsewhere.
+"""
+
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -10,16 +15,63 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
-    TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
+from perilune_shared.errors import one_line
+
 console = Console(stderr=True)
-"""Console for messages; text that it prints appears above a running progress bar."""
+"""Console on standard error of the progress bar; text that it prints appears above the bar."""
 _LOG_INTERVAL_S = 60.0
 _LOG_WIDTH = 120
 """Characters of a line of progress in a file."""
+
+
+def say(line: object, style: str | None = None) -> None:
+    """Print a line on standard error, above a running progress bar; `style` is a style of Rich."""
+    console.print(Text(one_line(line), style=style or ""), soft_wrap=True)
+
+
+def say_page(text: str) -> None:
+    """Print several lines on standard error; a name in them cannot start a line unless the caller lets it."""
+    console.print(Text(_lines(text)), soft_wrap=True)
+
+
+def answer(line: object) -> None:
+    """Print a line on standard output."""
+    answer_page(one_line(line))
+
+
+def answer_page(text: str) -> None:
+    """Print several lines on standard output."""
+    # A terminal of another encoding shows a question mark for what it lacks.
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    sys.stdout.write(_lines(text).rstrip("\n").encode(encoding, "replace").decode(encoding) + "\n")
+    sys.stdout.flush()
+
+
+def answer_table(
+    head: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    title: str = "",
+    caption: str = "",
+    *,
+    numbers: bool = False,
+) -> None:
+    """Print a table on standard output; long cells are folded. With `numbers` all columns but the first are aligned."""
+    table = Table(title=Text(one_line(title)) if title else None, caption=Text(one_line(caption)) if caption else None)
+    for place, name in enumerate(head):
+        table.add_column(Text(one_line(name)), justify="right" if numbers and place else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(one_line(cell), overflow="fold") for cell in row))
+    Console().print(table)
+
+
+def _lines(text: str) -> str:
+    """Keep line ends and indents; replace other control characters by question marks."""
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
 class _Rate(ProgressColumn):
@@ -31,11 +83,18 @@ class _Rate(ProgressColumn):
         return Text("" if speed is None else f"{speed:.1f} {unit}/s")
 
 
+class _Name(ProgressColumn):
+    """Column with the task's description."""
+
+    def render(self, task) -> Text:
+        return Text(one_line(task.description))
+
+
 class _Note(ProgressColumn):
     """Column with the task's current note, if it has one."""
 
     def render(self, task) -> Text:
-        return Text(task.fields.get("note", ""))
+        return Text(one_line(task.fields.get("note", "")))
 
 
 class _LoggedProgress(Progress):
@@ -68,7 +127,7 @@ def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
     In a file or pipe it is a line per task, at most once a minute and at the end. `clock` returns the time, s.
     """
     return _LoggedProgress(
-        TextColumn("{task.description}"),
+        _Name(),
         BarColumn(),
         MofNCompleteColumn(),
         _Rate(),

@@ -7,6 +7,7 @@ import typer
 from perilune_shared.command_line import Verbose, run_command_line
 from perilune_shared.config import Section, resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
+from perilune_shared.terminal import answer_page
 from perilune_train.cli_options import ConfigFile, Preset, Settings
 from perilune_train.detect.cli.main import app as detect
 from perilune_train.detect.config import DetectConfig
@@ -53,7 +54,7 @@ def config(
     """Print all settings of detection, navigation and explanation as a configuration file to edit."""
     for section, model in SECTIONS.items():
         resolved = resolve(model, section, "perilune_train", preset, config, tuple(settings or ()))
-        typer.echo(annotated_yaml(section, resolved) if show else to_yaml(section, resolved), nl=False)
+        answer_page(annotated_yaml(section, resolved) if show else to_yaml(section, resolved))
 
 
 @app.command()
@@ -63,7 +64,7 @@ def models() -> None:
     The folder can be given as --run; its card.md states training data, figures and limits.
     """
     for model in shipped_models():
-        typer.echo(f"{model.name}  {model.task}  {model.megabytes:.1f} MB  {model.headline}  {model.folder}")
+        answer_page(f"{model.name}  {model.task}  {model.megabytes:.1f} MB  {model.headline}  {model.folder}")
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 import perilune_shared as ps
 from perilune_render.cli.dataset import How, made_or_exit
@@ -15,6 +14,7 @@ from perilune_shared.dataset.names import Split
 from perilune_shared.errors import UserError
 from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
+from perilune_shared.terminal import answer
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -85,10 +85,9 @@ def counterfactual(
     made = made_or_exit(Job(plan, config, begun, manifest), store, how)
     if made is not None:
         _write(craters, *table)
-        Console().print(
+        answer(
             f"{made.store}: {made.info.counts.frames} frames over {made.info.counts.scenes} scenes; "
-            f"{len(craters)} craters removed, listed in {table[0].at(table[1])}",
-            soft_wrap=True,
+            f"{len(craters)} craters removed, listed in {table[0].at(table[1])}"
         )
 
 

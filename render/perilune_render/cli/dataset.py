@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.console import Console
 
 import perilune_shared as ps
 from perilune_render.cli.options import (
@@ -26,7 +25,7 @@ from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
 from perilune_shared.interrupts import ended_by_interrupt
 from perilune_shared.storage.store import Store, open_store
-from perilune_shared.terminal import console, progress_bar
+from perilune_shared.terminal import answer, progress_bar, say
 
 if TYPE_CHECKING:
     from perilune_render.jobs.job import Job
@@ -157,10 +156,9 @@ def dataset(
                 continue
             if made is not None:
                 counts = made.info.counts
-                Console().print(
+                answer(
                     f"{made.store}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
-                    f"look at {made.store.at('overview.png')}",
-                    soft_wrap=True,
+                    f"look at {made.store.at('overview.png')}"
                 )
     if failed:
         raise typer.Exit(1)
@@ -194,7 +192,7 @@ def _made(job: "Job", out: Store, how: How, early: "Worker | None" = None) -> "D
         if how.shard is None:
             return render_job(job, out, progress, _executor(how, early))
         n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how, early))
-    Console().print(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish", soft_wrap=True)
+    answer(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish")
     return None
 
 
@@ -225,14 +223,14 @@ def _print_estimate(job: "Job", out: Store, how: How, early: "Worker | None") ->
         found = estimate(job, out, progress, _executor(how, early), how.workers or 1)
     hours = f"{found.seconds / 3600:.2f} hours" if found.seconds > 360 else f"{found.seconds:.0f} seconds"
     size = next(f"{found.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if found.n_bytes >= 10**n or n == 0)
-    Console().print(f"{out}: {found.n_frames} frames left, {hours}, {size}", soft_wrap=True)
+    answer(f"{out}: {found.n_frames} frames left, {hours}, {size}")
 
 
 def _print_failures(error: "RenderingFailed") -> None:
     for name, text in error.errors.items():
-        console.print(f"error: {error.out}: {name}: {text}", markup=False, highlight=False, soft_wrap=True)
+        say(f"error: {error.out}: {name}: {text}")
     again = "run the same command again to try them again"
-    console.print(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}", soft_wrap=True)
+    say(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}")
 
 
 def _executor(how: How, early: "Worker | None") -> "MakeExecutor":
@@ -276,6 +274,4 @@ def _render_manifest(
     same, known, other_scenes = compare_hashes(given, made)
     comparison = f"; {same} of {known} frames are byte-identical to the manifest's" if known else ""
     comparison += f"; terrain hash mismatch in {other_scenes} scenes" if other_scenes else "; terrain hashes match"
-    Console().print(
-        f"{store}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}", soft_wrap=True
-    )
+    answer(f"{store}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}")

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from perilune_render.cli.dataset import How, first_worker, made_or_exit
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
@@ -15,6 +14,7 @@ from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.calibration import Calibration, read_camera_file
 from perilune_shared.storage.store import open_store
+from perilune_shared.terminal import answer
 
 Scene = Annotated[
     Path | None,
@@ -79,10 +79,7 @@ def frames(
         made = made_or_exit(Job(plan, config, begun, str(poses)), store, how, early)
     if made is not None:
         counts = made.info.counts
-        Console().print(
-            f"{made.store}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}",
-            soft_wrap=True,
-        )
+        answer(f"{made.store}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}")
 
 
 def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:

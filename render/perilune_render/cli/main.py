@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
-from rich.console import Console
 
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
@@ -32,7 +31,7 @@ from perilune_shared.command_line import Verbose, run_command_line
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
 from perilune_shared.errors import EXIT_USER_ERROR, UserError
-from perilune_shared.terminal import progress_bar
+from perilune_shared.terminal import answer, answer_page, progress_bar
 
 app = typer.Typer(
     help="Generate lunar terrain and trajectories, and render labelled frames with Blender.",
@@ -58,7 +57,7 @@ def config(
 ) -> None:
     """Print every setting as a configuration file to start from."""
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(settings or ()))
-    typer.echo(annotated_yaml("dataset", resolved) if show else to_yaml("dataset", resolved), nl=False)
+    answer_page(annotated_yaml("dataset", resolved) if show else to_yaml("dataset", resolved))
 
 
 app.command()(dataset)
@@ -85,10 +84,7 @@ def develop(
     with progress_bar() as progress:
         made = develop_dataset(ps.open_dataset(dataset), out, progress, config, tuple(setting or ()))
     counts = made.info.counts
-    Console().print(
-        f"{out}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}",
-        soft_wrap=True,
-    )
+    answer(f"{out}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}")
 
 
 @app.command()
@@ -110,9 +106,7 @@ def plan(
     with progress_bar() as progress:
         write_manifest_only(resolved, one_kind(kind), preset, out, progress)
     counts = ps.open_dataset(out).info.counts
-    Console().print(
-        f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned"
-    )
+    answer(f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned")
 
 
 @app.command()
@@ -148,10 +142,10 @@ def regenerate(
     counts = {state: sum(o.state == state for o in outcomes) for state in get_args(State)}
     for outcome in outcomes:
         if outcome.state != "identical" and not verify:
-            Console().print(f"{outcome.png_path}: {outcome.state}", soft_wrap=True)
+            answer(f"{outcome.png_path}: {outcome.state}")
     states = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     ground = "" if all(o.same_ground for o in outcomes) else "; terrain hash mismatch"
-    Console().print(f"{len(outcomes)} frames: {states}{ground}", soft_wrap=True)
+    answer(f"{len(outcomes)} frames: {states}{ground}")
     if counts["different"] or ground:
         raise typer.Exit(EXIT_USER_ERROR)
 
@@ -201,7 +195,7 @@ def preview(
         )
     map_path = out.with_name(f"{out.stem}-map.png")
     write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
-    Console().print(f"look at {out} and {map_path}", soft_wrap=True)
+    answer(f"look at {out} and {map_path}")
 
 
 @app.command()
@@ -234,7 +228,7 @@ def export(
         export_raster(scene, out, pixel_m)
     else:
         export_mesh(scene, out, step=step)
-    Console().print(f"{out}: {len(scene.craters)} craters, {len(scene.boulders)} boulders")
+    answer(f"{out}: {len(scene.craters)} craters, {len(scene.boulders)} boulders")
 
 
 def main() -> None:

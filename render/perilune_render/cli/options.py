@@ -11,7 +11,7 @@ from perilune_render.config_terrain import SITE_FIELDS
 from perilune_shared.config import resolve
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""
@@ -59,7 +59,7 @@ def warn_of_size(config: DatasetConfig) -> None:
     for name, side in sides.items():
         if side % 32:
             line = f"dataset.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
-            console.print(line, soft_wrap=True)
+            say(line)
 
 
 def resolved_config(

@@ -1,6 +1,5 @@
 """The command `perilune-render serve`."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -66,10 +65,10 @@ def serve(
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
     from perilune_render.server.grounds import Grounds
-    from perilune_render.server.native_serve import native_address, serve_native
-    from perilune_render.server.pangu_serve import serve_pangu
+    from perilune_render.server.native.serve import Native, native_address
+    from perilune_render.server.pangu_serve import greets, serve_pangu
     from perilune_render.server.pangu_session import Conventions, Session
-    from perilune_render.server.serve import Ask, Connection, Limits, Server
+    from perilune_render.server.serve import Connection, Interface, Limits, Server
 
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
@@ -81,14 +80,14 @@ def serve(
         async def handle(connection: Connection) -> None:
             await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
 
-        async def native(ask: Ask, ready: Callable[[int], object]) -> None:
-            await serve_native(native_address(host, native_port), grounds, ask, ready, limits, say)
-
-        server = Server(host, port, handle, limits, say, native)
+        pangu = Interface("PANGU", host, port, handle, greets, limits)
+        native = Native(grounds, limits, say, [pangu])
+        own = native.interface(host, native_port)
+        server = Server(native.interfaces, say)
         server.begin()
         stated = config.scene or SceneConfig()
         say(
-            f"PANGU protocol 1.20 at {server.host}:{server.port}, {engine}, images of {config.camera.width_px} x "
+            f"PANGU protocol 1.20 at {host}:{pangu.port}, {engine}, images of {config.camera.width_px} x "
             f"{config.camera.height_px} px; Ctrl-C ends it"
         )
         say(
@@ -103,7 +102,7 @@ def serve(
             "not known either, and fixed: first viewpoint 1000 m above the site, straight down; a pulse that misses "
             "has range 0 and cosine 0; error codes 1 (refused) and 2 (faulty); docs/reference/pangu.md has the rest"
         )
-        say(f"perilune_shared.client at {native_address(server.host, server.other_port)}")
+        say(f"perilune_shared.client at {native_address(host, own.port)}")
         if host not in _OWN:
             say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
         server.run()

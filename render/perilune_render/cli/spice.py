@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from perilune_render.cli.frames import Scene
 from perilune_render.cli.options import Dem, Preset, Setting, resolved_config
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
+from perilune_shared.terminal import answer
 
 
 def spice(
@@ -54,9 +54,8 @@ def spice(
     height = site_height_m if site_height_m is not None else 0.0 if model is None else height_of_site_m(model)
     poses = read_spice(source, *place, height)
     write_text(out, poses_csv(poses, source, *place, height))
-    Console().print(
+    answer(
         f"{out}: {len(poses.time_s)} poses from {poses.start} UTC relative to {poses.fixed_frame}; site at "
         f"{place[0]:.6f}, {place[1]:.6f}, {height:.1f} m above 1737.4 km; height above the site "
-        f"{poses.position_m[0, 2]:.1f} to {poses.position_m[-1, 2]:.1f} m; Sun {poses.sun_deg[0, 1]:.2f} degrees high",
-        soft_wrap=True,
+        f"{poses.position_m[0, 2]:.1f} to {poses.position_m[-1, 2]:.1f} m; Sun {poses.sun_deg[0, 1]:.2f} degrees high"
     )

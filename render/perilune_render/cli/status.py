@@ -3,9 +3,9 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from perilune_shared.storage.store import open_store
+from perilune_shared.terminal import answer_page
 
 
 def status(
@@ -28,4 +28,5 @@ def status(
         if found.n_silent:
             lines.append(f"  silent        {found.n_silent} processes, for {SILENT_S:.0f} s or more")
         lines += [f"  failed        {name}: {error}" for name, error in found.failed.items()]
-        Console().print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+        # Names and messages are those of other processes: each stays within its line.
+        answer_page("\n".join("".join(line.splitlines()) for line in lines))

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 import perilune_shared as ps
 from perilune_render.cli.dataset import How, made_or_exit
@@ -12,6 +11,7 @@ from perilune_render.config_survey import SurveyConfig
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
+from perilune_shared.terminal import answer
 
 _DEFAULT = SurveyConfig()
 
@@ -71,8 +71,7 @@ def survey(
     made = made_or_exit(Job(plan, config, begun, manifest), store, how)
     if made is not None:
         counts = made.info.counts
-        Console().print(
+        answer(
             f"{made.store}: {counts.frames} frames of {plan.camera.width_px} px over {counts.scenes} scenes; "
-            f"`perilune-train navigate map --dataset {made.store}` makes catalogues of them",
-            soft_wrap=True,
+            f"`perilune-train navigate map --dataset {made.store}` makes catalogues of them"
         )

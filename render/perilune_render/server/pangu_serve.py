@@ -1,5 +1,6 @@
 """Serve PANGU's protocol: read each message of a client whole, then answer it."""
 
+import asyncio
 import socket
 import time
 from collections.abc import Callable
@@ -57,6 +58,14 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
         items = items_of(message, data)
         session.asked_us = time.time() * 1e6
         await connection.send(await connection.ask(lambda: answer(session, message, values, items)))  # noqa: B023
+
+
+async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    """Whether the other end of a new connection greets as a server of this protocol."""
+    writer.write(unsigned(m.VERSION))
+    greeting = await reader.readexactly(4)
+    writer.write(unsigned(m.GOODBYE))
+    return greeting == unsigned(m.OKAY)
 
 
 def items_of(message: m.Message, data: bytes) -> np.ndarray | bytes:

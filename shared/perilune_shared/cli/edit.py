@@ -3,14 +3,11 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 import perilune_shared as ps
 from perilune_shared.dataset.names import ImageChoice, ImageMode, SplitUnit
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import progress_bar
+from perilune_shared.terminal import answer, answer_table, progress_bar
 
 EXIT_DIFFERENT = 1
 
@@ -49,7 +46,7 @@ def _print_counts(out: str) -> None:
     counts = info.counts
     text = f"{counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames, {counts.labels} labels"
     line = f"{out}: {text}, frames {info.images}, split by {info.split_by}{info.leak}"
-    Console().print(Text(line), soft_wrap=True)
+    answer(line)
 
 
 def merge(
@@ -115,13 +112,10 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
 
     found = differences(ps.open_dataset(first), ps.open_dataset(second))
     if not found:
-        Console().print("no difference")
+        answer("no difference")
         return
-    table = Table("where", "column", "rows", "for example", "first", "second")
-    for each in found:
-        cells = (each.place, each.column, str(each.rows), each.example, each.first, each.second)
-        table.add_row(*(Text(cell, overflow="fold") for cell in cells))
-    Console().print(table)
+    rows = [(one.place, one.column, one.rows, one.example, one.first, one.second) for one in found]
+    answer_table(("where", "column", "rows", "for example", "first", "second"), rows)
     raise typer.Exit(EXIT_DIFFERENT)
 
 

@@ -3,13 +3,11 @@
 from typing import Annotated, Literal
 
 import typer
-from rich.console import Console
-from rich.text import Text
 
 import perilune_shared as ps
 from perilune_shared.cli.edit import DatasetArgument, LinkOption
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import progress_bar
+from perilune_shared.terminal import answer, progress_bar
 
 ExportFormat = Literal["coco", "yolo", "tum", "kitti", "croissant", "huggingface"]
 _WITH_LABELS = ("coco", "yolo", "huggingface")
@@ -114,4 +112,4 @@ def card(
 
 def _say(line: str) -> None:
     # Text, since a plain string would be parsed as markup.
-    Console().print(Text(line), soft_wrap=True)
+    answer(line)

@@ -89,7 +89,7 @@ class Part:
         self._checked: set[tuple[int, str]] = set()
         try:
             # Read a small file at once; of a large file read only the requested columns.
-            self._content = store.read(path) if self._n_bytes <= _SMALL_BYTES else None
+            self._content = store.read(path, most_bytes=_SMALL_BYTES) if self._n_bytes <= _SMALL_BYTES else None
             self._ranges = None
             if self._content is None and not store.is_local:
                 self._ranges = Ranges(functools.partial(store.read, path), self._n_bytes)

@@ -6,7 +6,6 @@ Datasets are untrusted: each text from a dataset is put in a code span, with onl
 
 import os
 import shlex
-import string
 from collections.abc import Iterable
 from urllib.parse import quote
 
@@ -17,11 +16,12 @@ from perilune_shared.content import terrain_of
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo, Recipe
-from perilune_shared.errors import UserError, one_line, shortened
+from perilune_shared.errors import UserError
 from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.card_head import head_of, table_configs
 from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.export.citation import citation_of
+from perilune_shared.export.foreign_text import code_span
 from perilune_shared.export.stats import summary
 from perilune_shared.progress import Progress
 
@@ -30,7 +30,6 @@ _PICTURE_NAME = "card.png"
 _MARK_START = "<!-- written by `perilune-manifest card`"
 """Start of the comment that identifies a card; the rest of the comment may differ between versions."""
 _MARK = f"{_MARK_START}, which overwrites this file; manual changes are lost -->"
-_SAFE = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
 _PURPOSE = {"detect": "Crater detection", "nav": "Navigation"}
 _IMAGES = {
     "files": "8- or 16-bit grey PNGs under frames/",
@@ -65,19 +64,13 @@ def write_card(dataset: Dataset, out: str | os.PathLike[str] | None, progress: P
     return page.address, picture.address
 
 
-def code(value: object) -> str:
-    """Format untrusted text as a code span that is safe in Markdown, in its tables and in HTML."""
-    text = "".join(c if c in _SAFE else "?" for c in shortened(one_line(value), 200))
-    return f"`{text.strip() or 'none'}`"
-
-
 def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
     """Return the page as Markdown."""
     info = dataset.info
     state = "" if info.complete else "\n\n**Not complete**: rendering is in progress or was interrupted."
     parts = [
         head_of(dataset, table_configs(dataset)),
-        f"{_MARK}\n\n# {code(info.name)}",
+        f"{_MARK}\n\n# {code_span(info.name)}",
         "Rendered images of lunar landing trajectories with exact crater ellipses and camera poses. "
         f"{_purpose(info)}{state}",
         f"![Frames with labels, and histograms]({quote(picture_name)})",
@@ -89,12 +82,16 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
         "## Splits\n\n" + _splits(dataset),
         "## Files\n\n" + _files(dataset),
         "## Reproduction\n\n" + "\n\n".join(_remake(key, recipe) for key, recipe in info.recipes.items()),
-        "## History\n\n" + ("\n".join(f"- {code(line)}" for line in info.history) or "Not edited since rendering."),
-        f"## Licence\n\n{code(info.licence)}",
+        "## History\n\n" + (_history(info) or "Not edited since rendering."),
+        f"## Licence\n\n{code_span(info.licence)}",
         "## Citation\n\nThe hash identifies the tables, which contain the hashes of the frames.\n\n"
         f"```bibtex\n{citation_of(dataset)}\n```",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _history(info: DatasetInfo) -> str:
+    return "\n".join(f"- {code_span(line)}" for line in info.history)
 
 
 def _purpose(info: DatasetInfo) -> str:
@@ -140,7 +137,7 @@ def _scenes(dataset: Dataset) -> str:
     rows = [[title, f"{scenes[name].min():.6g} to {scenes[name].max():.6g}"] for title, name in numbers.items()]
     for title, name in {"photometry": "photometry", "source of the terrain": "dem_source"}.items():
         counted = scenes[name].value_counts()
-        shown = ", ".join(f"{code(value)} ({number})" for value, number in counted.head(8).items())
+        shown = ", ".join(f"{code_span(value)} ({number})" for value, number in counted.head(8).items())
         rows.append([title, shown + (f" and {len(counted) - 8} more" if len(counted) > 8 else "")])
     return _table([f"{len(scenes)} scenes", ""], rows)
 
@@ -169,7 +166,7 @@ def _files(dataset: Dataset) -> str:
             "- Tables: manifest/*/*.parquet; the metadata of the files has the unit and meaning of each column.",
             f"- {INFO_NAME}: settings, random seeds and versions; it contains the SHA-256 of index/*.parquet.",
             "- index/*.parquet: path, size and SHA-256 of every other file.",
-            f"- Schema version {code(info.schema_version)}.",
+            f"- Schema version {code_span(info.schema_version)}.",
         ]
     )
 
@@ -192,10 +189,11 @@ def _remake(key: str, recipe: Recipe) -> str:
     else:
         make = "perilune-render develop --dataset FIRST"
         origin = recipe.developed_from
-        source = f" FIRST is {code(origin.name)}, whose {INFO_NAME} has the SHA-256 {code(origin.sha256)}."
-    versions = ", ".join(code(f"{name} {version}") for name, version in recipe.versions.items())
+        sha256 = code_span(origin.sha256)
+        source = f" FIRST is {code_span(origin.name)}, whose {INFO_NAME} has the SHA-256 {sha256}."
+    versions = ", ".join(code_span(f"{name} {version}") for name, version in recipe.versions.items())
     return (
-        f"Recipe {code(key)}: preset {code(recipe.preset)}, seed {recipe.seed}, with {versions}.{source} The "
+        f"Recipe {code_span(key)}: preset {code_span(recipe.preset)}, seed {recipe.seed}, with {versions}.{source} The "
         f"edits in the history were made afterwards. `perilune-render regenerate` renders single frames again.\n\n"
         f"```sh\n{unpack}\n{make} --config recipe.yaml --out again\n```"
     )
@@ -209,4 +207,4 @@ def _table(head: list[str], rows: Iterable[list[str]]) -> str:
 def _shown(value: object) -> str:
     if value is None or value is pd.NA or (isinstance(value, float) and np.isnan(value)):
         return ""
-    return f"{value:,}" if isinstance(value, int | float) else code(value)
+    return f"{value:,}" if isinstance(value, int | float) else code_span(value)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from perilune_shared.errors import UserError
+
 
 @dataclass(frozen=True, slots=True)
 class Item:
@@ -39,11 +41,25 @@ def local_items(folder: Path, prefix: str) -> Iterator[Item]:
         yield Item(prefix + entry.name, size_bytes)
 
 
-def object_items(found: Mapping[str, Any], prefix: str) -> Iterator[Item]:
-    """Yield the objects that fsspec found below a prefix, in the order of their paths."""
-    start = len(prefix) + 1
+def object_items(found: Mapping[str, Any], prefix: str, address: str) -> Iterator[Item]:
+    """Yield the objects that fsspec found below a prefix, in the order of their paths.
+
+    Raises UserError about `address` if the store lists a key elsewhere, or a size that is none.
+    """
     for key in sorted(found):
-        path = key.lstrip("/")[start:]
+        path = key.lstrip("/")
+        if not path.startswith(f"{prefix}/"):
+            if path == prefix:
+                continue
+            raise UserError(address, "list", repr(key), "only keys below this address")
+        path = path[len(prefix) + 1 :]
         # A console may have made an empty object for a folder.
         if path and not path.endswith("/"):
-            yield Item(path, int(found[key]["size"]))
+            yield Item(path, checked_size(found[key].get("size"), f"{address}: {path}"))
+
+
+def checked_size(size: object, where: str) -> int:
+    """Return the size of an object as the store states it. Raises UserError if it is no number of bytes."""
+    if isinstance(size, bool) or not isinstance(size, int) or not 0 <= size < 2**53:
+        raise UserError(where, "size", repr(size), "the size of an object, bytes")
+    return size

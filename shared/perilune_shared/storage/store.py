@@ -23,7 +23,7 @@ from typing import Any, BinaryIO, cast
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.file_systems import OBJECT_STORES, file_system
-from perilune_shared.storage.items import Item, local_items, object_items
+from perilune_shared.storage.items import Item, checked_size, local_items, object_items
 from perilune_shared.storage.ranges import Ranges
 from perilune_shared.storage.store_faults import is_missing_bucket, store_faults
 
@@ -241,7 +241,7 @@ class ObjectStore(Store):
             except FileNotFoundError as error:
                 if is_missing_bucket(error):
                     raise
-        yield from object_items(found, self._prefix)
+        yield from object_items(found, self._prefix, self.address)
 
     def size(self, path: str) -> int | None:
         with store_faults(self.at(path)):
@@ -249,7 +249,7 @@ class ObjectStore(Store):
                 found = self._system.info(self._key(path))
             except FileNotFoundError:
                 return None
-        return int(found["size"]) if found["type"] == "file" else None
+        return checked_size(found.get("size"), self.at(path)) if found.get("type") == "file" else None
 
     def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
         if end is not None and end <= start:
@@ -258,17 +258,27 @@ class ObjectStore(Store):
             end = min(most_bytes + 1, most_bytes + 1 if end is None else end)
         with store_faults(self.at(path)):
             try:
-                content = cast(bytes, self._system.cat_file(self._key(path), start=start or None, end=end))
+                content = self._system.cat_file(self._key(path), start=start or None, end=end)
             except FileNotFoundError as error:
                 if is_missing_bucket(error):
                     raise
                 raise _missing(self, path) from None
+        if not isinstance(content, bytes):
+            raise UserError(self.at(path), "content", type(content).__name__, "the bytes of the object")
         if most_bytes is not None and start + len(content) > most_bytes:
             raise _too_large(self, path, start + len(content), most_bytes)
         return content
 
     def open(self, path: str) -> BinaryIO:
-        return cast(BinaryIO, Ranges(functools.partial(self.read, path), self.plain_size(path)))
+        return cast(BinaryIO, Ranges(functools.partial(self._exactly, path), self.plain_size(path)))
+
+    def _exactly(self, path: str, start: int, end: int) -> bytes:
+        """Return the bytes [start, end) of a file. Raises UserError if the store gives more or fewer."""
+        content = self.read(path, start, end)
+        if len(content) != max(end - start, 0):
+            found = f"{len(content)} bytes of {max(end - start, 0)}"
+            raise UserError(self.at(path), "content", found, "an object that does not change while it is read")
+        return content
 
     def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
         with store_faults(self.at(path)):

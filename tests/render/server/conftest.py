@@ -13,9 +13,9 @@ from perilune_render.config_terrain import TerrainConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import scene_view
 from perilune_render.poses.plan import scene_seed, trajectory_seed
-from perilune_render.server.pangu_serve import serve_pangu
+from perilune_render.server.pangu_serve import greets, serve_pangu
 from perilune_render.server.pangu_session import Conventions, Session
-from perilune_render.server.serve import Limits, Server
+from perilune_render.server.serve import Interface, Limits, Server
 from perilune_render.server.world import World
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.frames import sun_direction
@@ -103,7 +103,8 @@ class Running:
         async def handle(connection):
             await serve_pangu(connection, lambda: Session(world, *start, conventions), self.server.stop)
 
-        self.server = Server("127.0.0.1", 0, handle, limits, note or self.notes.append)
+        self.interface = Interface("PANGU", "127.0.0.1", 0, handle, greets, limits)
+        self.server = Server([self.interface], note or self.notes.append)
         self.server.begin()
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
@@ -117,7 +118,7 @@ class Running:
         assert not self.thread.is_alive()
 
     def client(self, hello: str | None = "00000114") -> Client:
-        return Client(self.server.port, hello)
+        return Client(self.interface.port, hello)
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,7 @@
 import threading
 
 from perilune_render.server.grounds import Grounds
-from perilune_render.server.native_serve import native_address, serve_native
+from perilune_render.server.native.serve import Native, native_address
 from perilune_render.server.serve import Limits, Server
 
 
@@ -14,13 +14,9 @@ class NativeRunning:
         self.host = host
         self.notes: list[str] = []
 
-        async def refuse(connection):
-            connection.writer.close()
-
-        async def other(ask, ready):
-            await serve_native(native_address(host, 0), grounds, ask, ready, limits, self.notes.append)
-
-        self.server = Server(host, 0, refuse, limits, self.notes.append, other)
+        self.native = Native(grounds, limits, self.notes.append)
+        self.interface = self.native.interface(host, 0)
+        self.server = Server(self.native.interfaces, self.notes.append)
         self.server.begin()
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
@@ -33,7 +29,7 @@ class NativeRunning:
 
     @property
     def address(self) -> str:
-        return native_address(self.host, self.server.other_port)
+        return native_address(self.host, self.interface.port)
 
     def close(self) -> None:
         self.server.stop()

@@ -103,7 +103,7 @@ def test_malformed_messages_are_answered_in_time_and_others_get_the_same_frames(
             head = json.loads(reply[1] if reply[0] == b"" else reply[0])
             assert "busy" not in head, head
             answers["error" if "error" in head else "result"] += 1
-            assert running.notes == [], parts
+            assert not [note for note in running.notes if "disconnected" in note or "client:" in note], parts
             if n % PER_CONNECTION == PER_CONNECTION - 1:
                 socket.close()
         after = good.frame((0, 0, 500), DOWN, index=0, labels=True)

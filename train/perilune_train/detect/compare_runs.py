@@ -9,11 +9,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from perilune_shared.errors import UserError
-from perilune_shared.storage.files import write_text
+from perilune_shared.export.foreign_text import for_markdown
 from perilune_train.detect.evaluate.figures import draw_curves
 from perilune_train.detect.evaluate.metrics import Curve
 from perilune_train.detect.evaluate.report import CURVE_FILE
-from perilune_train.evaluation.markdown import number, table
+from perilune_train.evaluation.markdown import number, table, write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.evaluation.provenance import Status, TerrainCheck
@@ -60,7 +60,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         status, mark = _terrain(folder, metrics, allow_overlap)
         marks += [f"{name}: {mark}"] if mark else []
         entries.insert(3, status)
-        cells = [name, *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
+        cells = [for_markdown(name), *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # AP of the whole curve, not of the saved points.
@@ -69,7 +69,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]
     head += [*_COLUMNS.values(), *_LOWEST.values()]
     text = "\n".join(table(head, rows)) + "\n"
-    write_text(
+    write_markdown(
         out / "compare.md",
         "# Comparison of runs\n\n"
         "In brackets: 95 % intervals, or the value of each unit if there are fewer than five.\n\n" + text,
@@ -111,7 +111,7 @@ def _name(folder: Path) -> str:
 
 
 def _text(value: object) -> str:
-    return "-" if value is None else " ".join(str(value).split())
+    return "-" if value is None else for_markdown(value)
 
 
 def _cell(figures: dict, key: str) -> str:

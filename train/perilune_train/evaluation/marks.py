@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 
-from perilune_shared.storage.files import write_text, written_aside
+from perilune_shared.export.foreign_text import for_markdown
+from perilune_shared.storage.files import written_aside
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.pictures import save_image
 
 _METADATA_KEY = b"terrain_mark"
@@ -21,15 +23,24 @@ def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
 
     Skips files that do not exist. Does nothing if `mark` is empty.
     """
-    for path in (folder / name for name in names) if mark else ():
-        if not path.is_file():
-            continue
-        if path.suffix == ".png":
-            mark_picture(path, mark)
-        elif path.suffix == ".md":
-            write_text(path, marked_page(path.read_text(encoding="utf-8"), mark))
-        else:
-            mark_table(path, mark)
+    unmarked = [folder / name for name in names if mark and (folder / name).is_file()]
+    try:
+        while unmarked:
+            _mark_file(unmarked[0], mark)
+            del unmarked[0]
+    finally:
+        # After a fault, as a full disk, no file stays that looks as if it needed no mark.
+        for path in unmarked:
+            path.unlink(missing_ok=True)
+
+
+def _mark_file(path: Path, mark: str) -> None:
+    if path.suffix == ".png":
+        mark_picture(path, mark)
+    elif path.suffix == ".md":
+        write_markdown(path, marked_page(path.read_text(encoding="utf-8"), mark))
+    else:
+        mark_table(path, mark)
 
 
 def mark_table(path: Path, mark: str) -> None:
@@ -59,8 +70,8 @@ def marked_page(text: str, mark: str) -> str:
     lines: list[str] = []
     for line in text.split("\n"):
         if line.startswith("## "):
-            line = f"{line} ({short})"
+            line = f"{line} ({for_markdown(short)})"
         lines.append(line)
         if line.startswith("# "):
-            lines += ["", f"**{mark}**"]
+            lines += ["", f"**{for_markdown(mark)}**"]
     return "\n".join(lines)

@@ -3,14 +3,21 @@
 from pathlib import Path
 
 import cv2
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from perilune_shared.storage.files import write_bytes, written_aside
 
 
 def save_figure(path: Path, figure: Figure, dpi: int = 110) -> None:
-    """Write a figure in the format of the file's suffix."""
+    """Write a figure in the format of the file's suffix. Names in it are drawn as they are, signs of formulas too."""
+    # Matplotlib writes the numbers at logarithmic axes as formulas.
+    of_axes = {id(text) for axis in figure.findobj(Axis) for text in axis.findobj(Text) if text is not axis.label}
+    for text in figure.findobj(Text):
+        if id(text) not in of_axes:
+            text.set_parse_math(False)
     with written_aside(path) as aside:
         figure.savefig(aside, dpi=dpi)
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from perilune_shared.export.foreign_text import for_markdown
+
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Interval = tuple[float, float]
@@ -57,15 +59,15 @@ class Spread:
     by_unit: dict[str, float] = field(default_factory=dict)
     """Value of each unit; only if there is no interval."""
 
-    def text(self, value: float | None) -> str:
-        """The value, and its spread if known, with three decimals; a dash if the value is undefined."""
+    def text(self, value: float | None, shown: Callable[[object], str] = for_markdown) -> str:
+        """The value, and its spread if known; a dash if the value is undefined. `shown` makes names of units safe."""
         if value is None or not np.isfinite(value):
             return "-"
         known = {name: one for name, one in self.by_unit.items() if np.isfinite(one)}
         if self.interval is not None and all(map(np.isfinite, self.interval)):
             return f"{value:.3f} ({self.interval[0]:.3f} to {self.interval[1]:.3f})"
         if known:
-            return f"{value:.3f} (" + ", ".join(f"{name} {one:.3f}" for name, one in known.items()) + ")"
+            return f"{value:.3f} (" + ", ".join(f"{shown(name)} {one:.3f}" for name, one in known.items()) + ")"
         return f"{value:.3f}"
 
     def keys(self, key: str) -> dict[str, float | None]:

@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Preset, RunsFolder, Settings
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.shipped.models import shipped_run
@@ -74,4 +74,4 @@ def explain(
     run = explain_run(
         settings, f"{above}/detect", f"{above}/nav", detector, navigator, runs, name, overwrite, allow_overlap
     )
-    console.print(f"{run.root}: claims.json, metrics.json, *.parquet, *.png")
+    say(f"{run.root}: claims.json, metrics.json, *.parquet, *.png")

@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.data.frames import normalised
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.inference.detector import Detector
@@ -49,7 +49,7 @@ def explain_detector(
     masks, known = (detector_masks(network, one.images, where) for one in (frames, validation))
     untrained = untrained_detector(detector, validation.images, settings.seed)
     blank, known_blank = (detector_masks(untrained, one.images, where) for one in (frames, validation))
-    console.print("detector: masks and null maps", markup=False)
+    say("detector: masks and null maps")
     before = _values(validation, known, known_blank, rng)
     signs = validation_signs(before)
     plain = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
@@ -82,7 +82,7 @@ def explain_detector(
     measure = DetectionPerformance(detector, [frames.labels[i] for i in changed], frames.radius_px)
     gates = forced_gates(network.backbone, gate_means(known), images, measure, "force gates of the detector")
     to_remove = {strongest: masks[strongest][changed], f"edge/stage_{stage}": nulls[f"edge/stage_{stage}"][changed]}
-    console.print(f"detector: remove pixels by {strongest}, chosen on validation frames, and by edges", markup=False)
+    say(f"detector: remove pixels by {strongest}, chosen on validation frames, and by edges")
     removal = removal_effect(images, to_remove, plain, measure, rng, settings.removed_share)
 
     def masks_of(given: NDArray[np.uint8]) -> Masks:
@@ -130,7 +130,7 @@ def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
 def attributions(settings: ExplainConfig, network: YOLOv3, images: NDArray[np.uint8]) -> Masks:
     """Grad-CAM, integrated gradients and occlusion (N, height, width) of the detector's objectness."""
     target, given = DetectorTarget(network), normalised(images)
-    console.print("detector: Grad-CAM, integrated gradients, occlusion", markup=False)
+    say("detector: Grad-CAM, integrated gradients, occlusion")
     return {
         "grad_cam": grad_cam(target, given),
         "integrated_gradients": integrated_gradients(target, given, settings.integration_steps),

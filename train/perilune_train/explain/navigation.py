@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import pair_values
 from perilune_train.explain.detection import SHALLOW_STAGES
@@ -53,7 +53,7 @@ def explain_navigator(
     masks, known = masks_of(pairs.images), masks_of(validation.images)
     untrained = untrained_navigator(navigator, architecture, validation.images, settings.seed)
     blank = navigator_masks(untrained, pairs.images, size_px, where)
-    console.print("navigator: masks and null maps", markup=False)
+    say("navigator: masks and null maps")
     strongest = strongest_gate(known, validation)
     homographies, ids_of_pairs, scenes = list(pairs.homographies), pairs.pair_ids, pairs.scene_ids
     halves = np.split(pairs.images, 2, axis=1)
@@ -77,7 +77,7 @@ def explain_navigator(
     edge = f"edge/stage_{strongest[2]}"
     halved = [baseline_maps(half[changed], scale)[edge] for half in halves]
     to_remove = {strongest: masks[strongest][changed], edge: np.concatenate(halved, axis=1)}
-    console.print(f"navigator: remove pixels by {strongest}, chosen on validation pairs, and by edges", markup=False)
+    say(f"navigator: remove pixels by {strongest}, chosen on validation pairs, and by edges")
     removal = removal_effect(images, to_remove, dict.fromkeys(to_remove, 1), measure, rng, settings.removed_share)
 
     few = images[: max(2, settings.n_changed // 2)]

@@ -9,7 +9,7 @@ import pandas as pd
 
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say_page
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
 from perilune_train.detect.train.guide import GUIDED
 from perilune_train.evaluation.marks import mark_files
@@ -85,7 +85,7 @@ def explain_run(
         mark_files(run.root, PICTURES[name], mark)
     joined = "; ".join(f"{name}: {mark}" for name, mark in marks.items() if mark)
     mark_files(run.root, [f"{name}.parquet" for name in TABLES], joined)
-    console.print(page.headline(claims), markup=False, soft_wrap=True)
+    say_page(page.headline(claims))
     write_metrics(run.root, metrics)
     return run
 

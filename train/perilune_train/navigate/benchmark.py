@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from perilune_shared.storage.files import write_text
+from perilune_shared.export.foreign_text import code_span
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import progress_bar
 from perilune_train.evaluation.benchmark_parts import Part, open_parts, part_names
-from perilune_train.evaluation.markdown import number, table
+from perilune_train.evaluation.markdown import number, table, write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
@@ -78,7 +78,7 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     figures[f"headline/{HEADLINE}"] = figures[f"{fusion}/{HEADLINE}"]
     for name, (n_frames, n_locked) in counts.items():
         figures |= {f"frames/{name}": n_frames, f"locked_frames/{name}": n_locked}
-    write_text(out / PAGE, _page(run, fusion, errors, figures, ms, counts))
+    write_markdown(out / PAGE, _page(run, fusion, errors, figures, ms, counts))
     mark_files(out, [PAGE], mark)
     write_metrics(out, figures | details | {"scored": f"run {run.resolve().name}"}, FIGURES)
     return figures
@@ -132,7 +132,10 @@ def _page(
     spreads = {method: summary_spreads(own) for method, own in errors.items()}
     headline = spreads[fusion][HEADLINE].text(float(figures[f"{fusion}/{HEADLINE}"] or np.nan))
     lines = ["# Locked benchmark of navigation", ""]
-    lines += [f"**Position RMSE of a step {headline} m** (length of the error vector), run `{run.resolve().name}`.", ""]
+    lines += [
+        f"**Position RMSE of a step {headline} m** (length of the error vector), run {code_span(run.resolve().name)}.",
+        "",
+    ]
     for name in part_names("nav"):
         n_frames, n_locked = counts.get(name, (0, 0))
         whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"

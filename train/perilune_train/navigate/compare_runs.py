@@ -7,8 +7,8 @@ import pandas as pd
 import pyarrow as pa
 
 from perilune_shared.errors import UserError
-from perilune_shared.storage.files import write_text
-from perilune_train.evaluation.markdown import number, table
+from perilune_shared.export.foreign_text import for_markdown
+from perilune_train.evaluation.markdown import number, table, write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.evaluation.spread import read_spread
@@ -51,7 +51,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         where += [_text(metrics.get(f"{split}/pairs")), _text(metrics.get("terrain/status"))]
         target = metrics.get("evaluation/target", "motion")
         label = method if target == "motion" else f"{method}, {target}"
-        rows.append([f"{name} ({label})", *where, *_cells(metrics, split)])
+        rows.append([for_markdown(f"{name} ({label})"), *where, *_cells(metrics, split)])
         own = _read_errors(folder / ERRORS_FILE)
         errors[name] = own[own["method"] == method]
         for other in ("klt", "nominal", "mean_at_step", "mean", *FLOORS):
@@ -61,7 +61,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     head = ["run (network) or method", "dataset", "split", "protocol", "pairs", "terrain", *_COLUMNS.values()]
     text = "\n".join(table(head, rows)) + "\n"
     note = "In brackets: 95 % intervals, or the value of each unit if there are fewer than five."
-    write_text(out / "compare.md", f"# Comparison of navigation runs\n\n{note}\n\n{text}")
+    write_markdown(out / "compare.md", f"# Comparison of navigation runs\n\n{note}\n\n{text}")
     draw_errors(out / "errors.png", errors)
     mark_files(out, ("compare.md", "errors.png"), "; ".join(marks))
     return text
@@ -93,4 +93,4 @@ def _name(folder: Path) -> str:
 
 
 def _text(value: object) -> str:
-    return "-" if value is None else " ".join(str(value).split())
+    return "-" if value is None else for_markdown(value)

@@ -55,6 +55,13 @@ class FusionConfig(Section):
     jitter: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of a random extra motion of each training pair, as a fraction of the spread of the residuals
     in the training set."""
+    views: Annotated[int, Field(ge=0, le=64)] = 0
+    """Further versions of each training trajectory for `target=pose`, seen from poses near it: frames are warped over
+    the mean ground plane, and these poses are the truth. Each training sequence is of one version, drawn at random.
+    Frames of validation and test are never warped."""
+    view_spread: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Size of the moves of these versions, as a factor on the deviations of the training trajectories from the mean
+    pose of each frame."""
 
 
 class StreamConfig(Section):
@@ -119,7 +126,9 @@ class NavigateConfig(Section):
 
     @model_validator(mode="after")
     def _only_stack(self) -> "NavigateConfig":
-        for name in ("target", "pool", "stages", "dropout"):
+        if self.stack.views and self.stack.target != "pose":
+            raise ValueError("stack.target=pose, since stack.views is given")
+        for name in ("target", "pool", "stages", "dropout", "views", "view_spread"):
             default = FusionConfig.model_fields[name].default
             if getattr(self.warp, name) != default:
                 raise ValueError(f"warp.{name}={default}, since only stack has another")

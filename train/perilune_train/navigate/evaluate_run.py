@@ -10,7 +10,7 @@ import numpy as np
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console, progress_bar
+from perilune_shared.terminal import progress_bar, say_page
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
 from perilune_train.navigate.covariance import stated_covariances
@@ -90,7 +90,7 @@ def _evaluate_pose(
     }
     methods = {"stack": poses, "mean_pose": [constant_pose(*mean, one.n_pairs) for one in trajectories]}
     page = write_pose_evaluation(out, "stack", split, trajectories, methods, own | details)
-    console.print(page, markup=False)
+    say_page(page)
 
 
 def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:

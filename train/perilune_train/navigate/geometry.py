@@ -56,6 +56,16 @@ def plane_homography(
     return k @ np.asarray(rotation_c2_from_c1) @ induced @ np.linalg.inv(k)
 
 
+def ground_homography(camera_matrix: ArrayLike, position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> Array:
+    """Homographies (n, 3, 3) from points (x, y, 1), metres, of the ground plane z = 0 of O_L to image coordinates.
+
+    The camera at position_m (n, 3) with rotation_camera_from_site (n, 3, 3) sees X in O_C at R (X - p).
+    """
+    p, r = np.asarray(position_m, np.float64), np.asarray(rotation_camera_from_site, np.float64)
+    offset = -np.einsum("nij,nj->ni", r, p)
+    return np.asarray(camera_matrix, np.float64) @ np.concatenate([r[:, :, :2], offset[:, :, None]], axis=2)
+
+
 def pixel_index_homography(homography: ArrayLike) -> Array:
     """The same homography (3, 3) in OpenCV's coordinates, which are 0, not 0.5, at the first pixel's centre."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])

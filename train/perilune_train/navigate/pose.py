@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from perilune_train.models.navigator import Recurrent, StackNavigator
 from perilune_train.navigate.data.trajectories import Pose, Trajectory
 from perilune_train.navigate.network import Scales, decoded_rotation
 
-_PAIRS = 16
-"""Pairs at a time through the backbone, to bound memory."""
+_PAIRS = {"cpu": 16, "cuda": 32}
+"""Pairs at a time through the backbone, to bound memory. More on a GPU, which would wait for launches of kernels."""
 
 
 def normalised_frames(frames: Tensor) -> Tensor:
@@ -28,14 +29,37 @@ def normalised_frames(frames: Tensor) -> Tensor:
     return (pixels - mean) / deviation.clamp(min=1.0)
 
 
-def pooled_features(network: StackNavigator, frames: Tensor) -> Iterator[Tensor]:
+def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
+    """8-bit frames (n, height, width), resampled by homographies (n, 3, 3) from output to input image coordinates.
+
+    Float, between 0 and 255. Bicubic, because bilinear resampling blurs more, which a network would take for another
+    altitude. Beyond the edge the frame is reflected: no level of grey or edge appears that no camera sees.
+    """
+    height, width = (int(size) for size in frames.shape[1:])
+    x = torch.arange(width, device=frames.device) + 0.5
+    y = (torch.arange(height, device=frames.device) + 0.5)[:, None]
+    # Not as a product of matrices, which autocast would compute in bfloat16.
+    rows = homographies[:, :, :, None, None]
+    u, v, w = (rows[:, i, 0] * x + rows[:, i, 1] * y + rows[:, i, 2] for i in range(3))
+    grid = torch.stack([2 * u / (w * width) - 1, 2 * v / (w * height) - 1], dim=-1)
+    pixels = frames[:, None].float()
+    found = functional.grid_sample(pixels, grid, mode="bicubic", padding_mode="reflection", align_corners=False)
+    return found[:, 0].clamp(0, 255)
+
+
+def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tensor | None = None) -> Iterator[Tensor]:
     """Averages of the backbone's features (pairs, inputs) of the pairs of consecutive 8-bit frames (n, height, width).
 
-    In portions, on the network's device.
+    In portions, on the network's device. With homographies (n, 3, 3) the frames are warped first (`warped_frames`).
     """
     device = next(network.parameters()).device
-    for start in range(0, len(frames) - 1, _PAIRS):
-        part = normalised_frames(frames[start : start + _PAIRS + 1].to(device, non_blocking=True))
+    at_once = _PAIRS.get(device.type, 16)
+    for start in range(0, len(frames) - 1, at_once):
+        span = slice(start, start + at_once + 1)
+        part = frames[span].to(device, non_blocking=True)
+        if homographies is not None:
+            part = warped_frames(part, homographies[span].to(device, non_blocking=True))
+        part = normalised_frames(part)
         yield network.pooled(part[None, :-1], part[None, 1:])[0]
 
 

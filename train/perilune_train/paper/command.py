@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 
 
 def paper(
@@ -33,4 +33,4 @@ def paper(
     from perilune_train.paper.page import write_page
 
     page = write_page(runs, dataset, tuple(about or ()), headline_share)
-    console.print(f"{page}: tables, figures and verdicts; paper.json has the figures")
+    say(f"{page}: tables, figures and verdicts; paper.json has the figures")

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from perilune_shared.errors import UserError
-from perilune_shared.storage.files import write_text
 from perilune_shared.storage.store import Address
 from perilune_train.detect.finished_run import config_of_run
-from perilune_train.evaluation.markdown import table
+from perilune_train.evaluation.markdown import table, write_markdown
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.paper.curves import (
     AP_KEY,
@@ -43,6 +42,7 @@ NOT_RUN = "Not run."
 _EXPLAINED = ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png")
 _READINGS = {
     "pose": "Pose in O_L: position and attitude in the landing frame, the reading of the paper",
+    "attitude": "Pose in O_L over descents with attitude noise, on the backbones of the descents without",
     "motion": "Motion from frame to frame",
 }
 
@@ -81,7 +81,7 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
         lines += ["", *settings]
     for title, own in sections.items():
         lines += ["", f"## {title}", "", *own]
-    write_text(root / PAGE, "\n".join([*lines, ""]))
+    write_markdown(root / PAGE, "\n".join([*lines, ""]))
     write_metrics(root, _figures(read, found), FIGURES)
     return root / PAGE
 

@@ -36,7 +36,7 @@ DEVIATIONS = (
     "Navigation: in the paper the network gives the pose in the landing frame; motion between frames is a second "
     "reading. The backbone starts from the detector. It is frozen in the coarse stage, and its features are stored.",
     "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, and "
-    "the orientation error says nothing. The second experiment (ATTITUDE=1) measures it.",
+    "the orientation error says nothing. Descents with attitude noise (ATTITUDE=1) measure it.",
     "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
     "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own (the "
     "paper: 1e-4 in both).",

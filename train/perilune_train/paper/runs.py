@@ -8,9 +8,11 @@ Below the root of the runs:
     detect/<network>-half-<seed>    the same at half width, seeds `SEEDS`
     detect/sparse-<network>         sparse ground, full width
     detect/lunar-<network>          our usual ground by the paper's rule of labels
+    detect/long-<network>           headline ground, full width, more epochs
     detect/transfer-<network>       headline ground, started from our own network, with frozen epochs
-    navigate/<navigator>-stack, navigate/<navigator>-motion-stack
-                                    pose in O_L (the paper's reading), and motion between frames
+    navigate/<navigator>-stack, navigate/<navigator>-attitude-stack, navigate/<navigator>-motion-stack
+                                    pose in O_L (the paper's reading), the same with attitude noise, and motion
+                                    between frames
     explain/attention
     benchmark/<network>, benchmark/<navigator>
                                     the locked benchmark; of navigators, that for motion: the landing frame of other
@@ -39,16 +41,16 @@ NAMES = {
 """Names of the detectors on the page."""
 SEEDS = (0, 1, 2)
 """Random seeds of the trainings at half width."""
-HEADLINE, SPARSE, USUAL, TRANSFER = "", "sparse", "lunar", "transfer"
-"""Grounds, and the headline ground after transfer: the first part of a run's name."""
+HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
+"""Grounds, and the headline ground after transfer and with more epochs: the first part of a run's name."""
 SPARSE_SHARE = "0.1"
 """equilibrium_share of the sparse ground."""
 CURVE = "curve"
 """First part of the names of the runs on grounds of rising density."""
 NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
 """First part of the names of the navigate runs, by the paper's names; their folders end in -stack."""
-READINGS = {"pose": "", "motion": "-motion"}
-"""End of the names of the navigate runs by navigate.stack.target."""
+READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
+"""End of the names of the navigate runs: pose in O_L, with attitude noise, motion between frames."""
 EXPLAINED = "attention"
 """Name of the explain run."""
 CAUSES = "paper-causes.json"
@@ -118,18 +120,18 @@ class PaperRuns:
     def curve(self, headline: str | None = None) -> dict[str, Metrics]:
         """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
 
-        Runs on the sparse, the headline and our usual ground are points too if their networks are as large as in the
-        runs of the curve. `headline` is the share of the headline ground.
+        Runs on the sparse, the headline and our usual ground are points too if their networks are as large, and train
+        for as many epochs, as in the runs of the curve. `headline` is the share of the headline ground.
         """
         found = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
         read = {share: finished(self.detector(name)) for share, name in found.items()}
         plain = next(iter(ATTENTION))
-        sizes = {metrics.get("parameters") for metrics in read.values() if metrics is not None}
+        sizes = {_size(metrics) for metrics in read.values() if metrics is not None}
         others = [(SPARSE_SHARE, detect_name(plain, SPARSE)), (USUAL, detect_name(plain, USUAL))]
         others += [(headline, detect_name(plain, seed=seed)) for seed in (None, SEEDS[0]) if headline is not None]
         for share, name in others:
             metrics = finished(self.detector(name))
-            if metrics is not None and read.get(share) is None and metrics.get("parameters") in sizes:
+            if metrics is not None and read.get(share) is None and _size(metrics) in sizes:
                 read[share] = metrics
         shares = sorted((share for share in read if _is_number(share)), key=float)
         ordered = {share: read[share] for share in [*shares, *({USUAL} & set(read))]}
@@ -164,6 +166,11 @@ class PaperRuns:
 def finished(folder: Path, file: str = METRICS_FILE) -> Metrics | None:
     """Metrics of a run; None if it is missing or not finished."""
     return read_metrics(folder, file) if (folder / file).is_file() else None
+
+
+def _size(metrics: Metrics) -> tuple[object, object]:
+    """Size of a detector and of its training."""
+    return metrics.get("parameters"), metrics.get("train/epochs")
 
 
 def _is_number(text: str) -> bool:

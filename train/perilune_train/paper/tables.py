@@ -12,6 +12,7 @@ from perilune_train.paper.claimed import DETECTION, NAVIGATION
 from perilune_train.paper.runs import (
     CAUSES,
     HEADLINE,
+    LONG,
     NAMES,
     NAVIGATORS,
     SPARSE,
@@ -32,13 +33,16 @@ _DETECTION = {
 }
 _GROUNDS = {
     HEADLINE: "headline",
+    LONG: "headline with more epochs",
     SPARSE: f"sparse ({SPARSE_SHARE})",
     USUAL: "our usual",
     TRANSFER: "headline after transfer",
 }
 _HALF = "headline at half width"
-_PLAIN_ONLY = (_GROUNDS[USUAL], _GROUNDS[TRANSFER])
+_PLAIN_ONLY = (_GROUNDS[LONG], _GROUNDS[TRANSFER])
 """Where gates from identity are not planned."""
+_IDENTITY_ONLY = (_GROUNDS[USUAL],)
+"""Where plain CBAM is not planned."""
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 _NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
@@ -60,23 +64,28 @@ def table_2(runs: PaperRuns) -> list[str]:
     rows, missing = [], []
     for network, figures in DETECTION.items():
         cells = [f"{figures[key]:.4f}" if key in figures else "-" for key in _DETECTION]
-        rows.append(["the paper", network, "-", *cells, "-"])
+        rows.append(["the paper", network, "-", "-", *cells, "-"])
     groups = {_GROUNDS[HEADLINE]: runs.detections(), _HALF: runs.halves()}
     groups |= {title: runs.detections(ground) for ground, title in _GROUNDS.items() if ground != HEADLINE}
     scored = {network: runs.scored(network) for network in NAMES}
     for title, trainings in groups.items():
-        planned = [network for network in NAMES if network != "attention-identity" or title not in _PLAIN_ONLY]
+        planned = [
+            network
+            for network in NAMES
+            if not (network == "attention-identity" and title in _PLAIN_ONLY)
+            and not (network == "attention-yolov3" and title in _IDENTITY_ONLY)
+        ]
         absent = [NAMES[network] for network in planned if not trainings[network]]
         missing += [title if len(absent) == len(planned) else f"{title} ({'; '.join(absent)})"] if absent else []
         for network, own in trainings.items():
             if own:
                 cells = [values(own, f"test/{key}") for key in _DETECTION]
-                rows.append([title, NAMES[network], str(len(own)), *cells, labels_a_frame(own[0])])
+                rows.append([title, NAMES[network], str(len(own)), epochs(own), *cells, labels_a_frame(own[0])])
     for network, metrics in scored.items():
         if metrics is not None:
             cells = [values([metrics], f"paper/{key}") for key in _DETECTION]
-            rows.append(["locked benchmark", NAMES[network], "1", *cells, labels_a_frame(metrics, "paper")])
-    lines = table(["ground", "network", "trainings", *_DETECTION.values(), "labels a frame"], rows)
+            rows.append(["locked benchmark", NAMES[network], "1", "-", *cells, labels_a_frame(metrics, "paper")])
+    lines = table(["ground", "network", "trainings", "epochs", *_DETECTION.values(), "labels a frame"], rows)
     return [*lines, "", f"Not run: {', '.join(missing)}."] if missing else lines
 
 
@@ -181,6 +190,12 @@ def numbers(trainings: Sequence[Metrics], key: str) -> list[float]:
     """The finite values of a figure."""
     found = [metrics.get(key) for metrics in trainings]
     return [float(value) for value in found if isinstance(value, int | float) and math.isfinite(value)]
+
+
+def epochs(trainings: Sequence[Metrics]) -> str:
+    """Epochs of the trainings; a dash if unknown."""
+    found = {str(metrics["train/epochs"]) for metrics in trainings if "train/epochs" in metrics}
+    return " or ".join(sorted(found, key=int)) or "-"
 
 
 def labels_a_frame(metrics: Metrics, prefix: str = "test") -> str:

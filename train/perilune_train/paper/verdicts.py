@@ -86,7 +86,9 @@ def _large_craters(ratio: WidthRatio | None) -> Verdict:
 def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
     found = runs.navigation(reading)
     plain, attended = ([found[name]] if name in found else [] for name in NAVIGATORS)
-    where = {"pose": "pose in O_L", "motion": "motion between frames"}[reading]
+    where = {"pose": "pose in O_L", "attitude": "pose in O_L, attitude noise", "motion": "motion between frames"}[
+        reading
+    ]
     verdicts = []
     for what, field in (("position", "position_m"), ("orientation", "orientation_deg")):
         unit = field.rpartition("_")[2]

@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import is_plain
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say, say_page
 
 USUAL_MB = 15
 """Size below which the page of `small` is to be, MB (1e6 bytes); a larger page opens slowly."""
@@ -46,5 +46,5 @@ def report(
     megabytes = page.stat().st_size / 1e6
     if megabytes > USUAL_MB:
         text = f"warning: {page}: size: got {megabytes:.1f} MB, expected below {USUAL_MB} MB; it opens slowly"
-        console.print(text, markup=False, soft_wrap=True)
-    console.print(f"{page}: {megabytes:.1f} MB, open it in a browser; {SUMMARY} has the tables", soft_wrap=True)
+        say_page(text)
+    say(f"{page}: {megabytes:.1f} MB, open it in a browser; {SUMMARY} has the tables")

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from perilune_shared.errors import UserError
+from perilune_shared.errors import UserError, one_line
 from perilune_train.evaluation.spread import MIN_UNITS, read_spread
 from perilune_train.report.content import Figure, FramePicture, Section, Table
 from perilune_train.report.frames import LabelledFrames
@@ -119,7 +119,7 @@ def _value(run: Run, key: str, *, spread: bool = False) -> str:
     value = run.metrics.get(key)
     if not isinstance(value, int | float):
         return "-"
-    return read_spread(run.metrics, key).text(float(value)) if spread else f"{value:.3f}"
+    return read_spread(run.metrics, key).text(float(value), one_line) if spread else f"{value:.3f}"
 
 
 def _curves(runs: Sequence[Run], prefix: str) -> list[Figure]:

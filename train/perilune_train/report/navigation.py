@@ -8,7 +8,7 @@ import pandas as pd
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.errors import UserError
+from perilune_shared.errors import UserError, one_line
 from perilune_train.evaluation.markdown import number
 from perilune_train.evaluation.spread import read_spread
 from perilune_train.navigate.evaluate.floors import FLOORS
@@ -335,7 +335,7 @@ def _spread(run: Run, key: str) -> str:
         return "-"
     spread = read_spread(run.metrics, key)
     # Values of single trajectories would fill the table.
-    return f"{value:.3f}" if spread.interval is None else spread.text(float(value))
+    return f"{value:.3f}" if spread.interval is None else spread.text(float(value), one_line)
 
 
 def _cell(value: object) -> str:

@@ -18,6 +18,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.paper.detections import read_detections
 from perilune_train.report import detection, explanation, navigation
@@ -74,7 +75,7 @@ def write_report(kind: Kind, name: str, dataset: Path, runs: Path, out: Path) ->
     """
     report = gather(kind, name, dataset, runs)
     page, summary = html_of(report), summary_of(report)
-    write_text(out / SUMMARY, summary)
+    write_markdown(out / SUMMARY, summary)
     write_text(out / PAGE, page)
     return out / PAGE
 

@@ -14,7 +14,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_shared.storage.store import Address, open_store
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.training.runs import RunFolder, is_first_process
 
 State = Literal["new", "resume", "finished"]
@@ -64,9 +64,9 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
         expected = "the file of the first process: share the runs folder between the machines, or copy it"
         raise UserError(run.last, "last state", "no such file", expected)
     if state == "finished":
-        console.print(f"{run.root}: finished, left unchanged; --overwrite replaces it", soft_wrap=True)
+        say(f"{run.root}: finished, left unchanged; --overwrite replaces it")
     elif state == "resume":
-        console.print(f"{run.root}: resuming", soft_wrap=True)
+        say(f"{run.root}: resuming")
     return state
 
 

@@ -135,22 +135,24 @@ def _step(task, places, monkeypatch):
     """The gradients of a training step of the coarse stage."""
     for name in ("log", "log_dict"):
         monkeypatch.setattr(task, name, lambda *_, **__: None)
-    task.windows = Windows(task.training_trajectories, range(4), 4, task.scales, "pose", torch.device("cpu"))
+    place = task.training_trajectories, range(4), 4, task.scales, "pose", torch.device("cpu")
+    task.windows = Windows(*place, task.views)
     task.zero_grad()
     task.training_step(places, 0).backward()
     return {name: own.grad.clone() for name, own in task.network.recurrent.named_parameters()}
 
 
-def test_a_step_on_stored_features_is_that_of_the_whole_network(trajectories, detector, monkeypatch):
+@pytest.mark.parametrize("views", [0, 1])
+def test_a_step_on_stored_features_is_that_of_the_whole_network(trajectories, detector, monkeypatch, views):
     torch.manual_seed(1)
     content = torch.load(detector, weights_only=True)["state_dict"]
     backbone = {key.removeprefix("backbone."): value for key, value in content.items() if key.startswith("backbone.")}
-    task = NavigationTask(settings(dropout=0.0), "stack", trajectories, backbone)
+    task = NavigationTask(settings(dropout=0.0, views=views), "stack", trajectories, backbone)
     assert task.stores and task.coarse
     torch.nn.init.normal_(task.network.recurrent.output.weight)
     task._store()
     assert float(task.network.feature_spread.min()) > 0 and float(task.stored["train"][0].mean().abs()) < 1e-4
-    places = torch.tensor([[2, 1], [0, 3]])
+    places = torch.tensor([[2, 1], [4 * views, 3]])
     stored = _step(task, places, monkeypatch)
     task.stores = False
     task.network.backbone.eval()
@@ -162,10 +164,11 @@ def test_a_step_on_stored_features_is_that_of_the_whole_network(trajectories, de
 
 def test_no_step_needs_a_value(trajectories, monkeypatch):
     """A GPU would have to be waited for. Fake tensors have no values: an operation that needs one raises an error."""
-    task = NavigationTask(settings(coarse_epochs=0, dropout=0.0), "stack", trajectories)
+    task = NavigationTask(settings(coarse_epochs=0, dropout=0.0, views=1), "stack", trajectories)
     for name in ("log", "log_dict"):
         monkeypatch.setattr(task, name, lambda *_, **__: None)
-    windows = Windows(task.training_trajectories, range(4), 4, task.scales, "pose", torch.device("cpu"))
+    place = task.training_trajectories, range(4), 4, task.scales, "pose", torch.device("cpu")
+    windows = Windows(*place, task.views)
     windows.pictures(torch.tensor([[0, 0]]))
     task.windows = windows
     with FakeTensorMode(allow_non_fake_inputs=True) as fake:

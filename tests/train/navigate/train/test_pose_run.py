@@ -47,8 +47,8 @@ def detector(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(dataset_nav, tmp_path_factory, detector):
-    """A finished run; its files stay."""
-    (own,) = navigate_run(settings(), dataset_nav, tmp_path_factory.mktemp("runs"), "p", detector)
+    """A finished run, with views; its files stay."""
+    (own,) = navigate_run(settings(views=1), dataset_nav, tmp_path_factory.mktemp("runs"), "p", detector)
     return own
 
 
@@ -99,8 +99,8 @@ def test_pair_by_pair_gives_the_poses_of_the_whole_trajectory(run, trajectories)
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(("epoch", "batch"), [(1, 2), (2, 1)])
 def test_a_killed_run_goes_on_to_the_same_weights(run, dataset_nav, tmp_path, detector, monkeypatch, epoch, batch):
-    """In the coarse stage and in the fine one, with dropout."""
-    own = settings().model_copy(update={"checkpoint_minutes": 0.0})
+    """In the coarse stage and in the fine one, with dropout and views."""
+    own = settings(views=1).model_copy(update={"checkpoint_minutes": 0.0})
     original = NavigationTask.training_step
 
     def dies(self, given, batch_idx):

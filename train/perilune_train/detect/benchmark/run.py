@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from perilune_shared.storage.files import write_text
+from perilune_shared.export.foreign_text import code_span
 from perilune_shared.storage.store import Address
 from perilune_train.detect.benchmark.page import page_of
 from perilune_train.detect.benchmark.score import Score, load_parts, score
@@ -14,6 +14,7 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.evaluation.benchmark_parts import Part, open_parts
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import TerrainCheck, check_terrain, read_provenance
@@ -44,7 +45,7 @@ def score_run(
     for name, split in next(iter(loaded.values())).items():
         found[name], rates[name] = detect_split(detector, split, name)
     scales = " and ".join(f"{factor:g}" for factor in config.evaluation.scales)
-    about = [f"run `{run.resolve().name}`, best weights, frames evaluated at scale {scales}"]
+    about = [f"run {code_span(run.resolve().name)}, best weights, frames evaluated at scale {scales}"]
     about.append(f"threshold {threshold:.4f}, chosen on the validation split of the run's own dataset")
     more: Metrics = {"scored": f"run {run.resolve().name}", "scales": scales}
     more |= {f"images_per_s/{name}": round(rate, 2) for name, rate in rates.items()}
@@ -62,7 +63,7 @@ def score_submission(
     loaded = load_parts(parts)
     ids = {name: split.frames.table["frame_id"].tolist() for name, split in next(iter(loaded.values())).items()}
     found = read_submission(detections, ids)
-    about = [f"detections of `{name}`; training data and choices are as its authors state"]
+    about = [f"detections of {code_span(name)}; training data and choices are as its authors state"]
     about.append(f"threshold {threshold:g}, as given; it must be chosen on other frames")
     return _written(out, parts, loaded, found, threshold, about, {"scored": f"detections of {name}"}, [])
 
@@ -83,7 +84,7 @@ def _written(
     for rule, evaluation in made.evaluations.items():
         write_evaluation(out / rule, evaluation, made.images, [*about, f"labels: selection `{rule}`"])
         mark_files(out / rule, _PICTURES, mark)
-    write_text(out / PAGE, page_of(made, about))
+    write_markdown(out / PAGE, page_of(made, about))
     mark_files(out, [PAGE], mark)
     write_metrics(out, made.figures() | more | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
     return made

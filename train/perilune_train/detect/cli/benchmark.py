@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.detect.finished_run import check_output, config_of_run
 from perilune_train.shipped.models import shipped_run
@@ -48,6 +48,4 @@ def benchmark(
         check_output(folder, run)
         made = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
     rule, account, value = made.least("ap50_paper")
-    console.print(
-        f"AP {value:.3f} by the least favourable account (labels by {rule}, {account}); {folder}: {PAGE}, {FIGURES}"
-    )
+    say(f"AP {value:.3f} by the least favourable account (labels by {rule}, {account}); {folder}: {PAGE}, {FIGURES}")

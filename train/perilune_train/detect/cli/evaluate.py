@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.config import parse_setting, resolve_over
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
 from perilune_train.detect.config import DetectConfig
@@ -105,7 +105,7 @@ def evaluate(
         folder = out or run / "images"
         tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
         evaluate_images(run, config, images, folder, tiling, min_size, threshold)
-        console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
+        say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return
     if scale:
         own = config.model_dump(mode="json")
@@ -116,4 +116,4 @@ def evaluate(
 
     address = dataset or Path("data", run.resolve().name, "detect")
     folder = evaluate_again(run, config, address, split, threshold, out, choose_threshold, allow_overlap)
-    console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
+    say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.shipped.models import shipped_run
 
@@ -42,4 +42,4 @@ def export(
     from perilune_train.detect.deploy.export import export_run
 
     export_run(run or shipped_run("detect"), out, asked, size_px, dataset, int8, allow_overlap)
-    console.print(f"{out}: README.md explains how to use the files")
+    say(f"{out}: README.md explains how to use the files")

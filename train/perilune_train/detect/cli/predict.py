@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.tiling import Tiling
@@ -44,4 +44,4 @@ def predict(
     )
     places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
     written = f"detections.parquet, detections.csv{places}, *.overlay.png"
-    console.print(f"{out}: {count} craters in {len(images)} images; {written}")
+    say(f"{out}: {count} craters in {len(images)} images; {written}")

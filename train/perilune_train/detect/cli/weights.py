@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 
 
 def weights(
@@ -33,4 +33,4 @@ def weights(
     content = darknet_content(network, architecture, checkpoint, whole=out.suffix == ".weights")
     write_darknet(out, content)
     gates = "" if architecture["attention"] == "none" else "; attention gates are not included"
-    console.print(f"{out}: {len(content.values)} floats{gates}")
+    say(f"{out}: {len(content.values)} floats{gates}")

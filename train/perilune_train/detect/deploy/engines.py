@@ -4,6 +4,7 @@ import contextlib
 import functools
 import importlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +27,9 @@ def package(name: str) -> Any:
     """Import a module of the extra `export`. Raises UserError if it is not installed."""
     # Official builds of ONNX Runtime send telemetry unless this is set before the import.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    # OpenVINO reports each import to an analytics service, and keeps an identity in the home folder for it. It does
+    # neither where this package is absent; a program that has imported it itself keeps it.
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     try:
         return importlib.import_module(name)
     except ImportError:

@@ -11,7 +11,7 @@ from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say, say_page
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
@@ -24,6 +24,7 @@ from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import load_detector
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import (
     Provenance,
@@ -154,18 +155,18 @@ def export_run(
         }
         metadata["differences_from_torch"] = differences
         for name, largest in differences.items():
-            console.print(
+            say(
                 f"{name}: boxes within {largest['largest_px']:.2g} px of torch's, scores {largest['largest_score']:.2g}"
             )
         if int8 and opened is not None:
             verdict = try_int8(onnx_path, folder / "detector-int8.onnx", opened, val, trained.config)
             metadata["int8"] = verdict.as_metadata()
-            console.print(verdict.summary())
+            say_page(verdict.summary())
         if "onnx" not in formats:
             onnx_path.unlink()
         metadata["files"] = {p.name: sha256_of(p) for p in sorted(folder.iterdir())}
         write_text(folder / "detector.json", json.dumps(metadata, indent=2) + "\n")
-        write_text(folder / "README.md", readme(metadata))
+        write_markdown(folder / "README.md", readme(metadata))
         if terrain_check is not None:
             mark_files(folder, ("README.md",), terrain_check.mark)
     return verdict

@@ -8,13 +8,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from perilune_shared.storage.files import write_text, written_aside
+from perilune_shared.storage.files import written_aside
 from perilune_train.detect.evaluate.bins import BinFigures
 from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
-from perilune_train.evaluation.markdown import number, table
+from perilune_train.evaluation.markdown import number, table, write_markdown
 from perilune_train.evaluation.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 
 CURVE_FILE = "precision_recall.parquet"
@@ -36,7 +36,7 @@ def write_evaluation(
 
     `images` are the frames (height, width), grey; `about` are lines of Markdown that state what was evaluated and how.
     """
-    write_text(folder / "report.md", markdown(evaluation, about))
+    write_markdown(folder / "report.md", markdown(evaluation, about))
     curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}
     others = {"edge": evaluation.at_edge, "strict": evaluation.matches.strict()}
     dashed = {f"IoU {evaluation.match_iou:g}, {name}": curve(matches) for name, matches in others.items()}

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_shared.storage.files import written_aside
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import facts_of
@@ -70,7 +71,8 @@ def report_head(
     settings = config.evaluation
     thresholds = config.labels.model_dump(exclude={"selection"}, exclude_none=True)
     return [
-        f"run `{run}`, best weights; dataset `{dataset.info.name}`, split {split}; protocol: {protocol}",
+        f"run {code_span(run)}, best weights; dataset {code_span(dataset.info.name)}, "
+        f"split {for_markdown(split)}; protocol: {protocol}",
         f"labels: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
         f"threshold {threshold_source}",
         f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "

@@ -14,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_shared.storage.files import written_aside
 from perilune_shared.terminal import progress_bar
 from perilune_train.detect.config import DetectConfig
@@ -71,7 +72,7 @@ def evaluate_images(
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
-        f"run `{run.resolve().name}`, best weights; {len(images)} images of `{source.name}`",
+        f"run {code_span(run.resolve().name)}, best weights; {len(images)} images of {code_span(source.name)}",
         f"labels: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
         f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
         + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
@@ -79,7 +80,7 @@ def evaluate_images(
         f"oracle: with the threshold of highest F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
-    about += [given.categories] * bool(given.categories)
+    about += [for_markdown(given.categories)] * bool(given.categories)
     write_evaluation(out, evaluation, images, about)
     table = pd.concat(table_of(image.name, part) for image, part in zip(given.images, found, strict=True))
     with written_aside(out / "detections.parquet") as aside:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.detect.images.read import SUFFIXES, picture_size
 
 Array = NDArray[np.float64]
@@ -81,6 +81,8 @@ def read_images(source: Path) -> ImageSet:
         raise UserError(source, "--images", "no PNG, TIFF or JPEG", "images with boxes beside them")
     images = []
     for path in paths:
+        if not path.name.isascii() and any("\ud800" <= sign <= "\udfff" for sign in path.name):
+            raise UserError(source, "image", path.name, "file names in UTF-8")
         boxes = read_table(path.with_suffix(".txt"))
         images.append(LabelledImage(path.name, path, *picture_size(path), boxes, np.ones(len(boxes), bool)))
     return ImageSet(images, clipped=False)
@@ -170,9 +172,9 @@ def _read_coco(path: Path) -> ImageSet:
         own = np.array(boxes[k], np.float64).reshape(-1, 4)
         result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(not_ignored[k], bool)))
     if n_empty:
-        console.print(f"{path.name}: {n_empty} boxes without width or height are left out", markup=False)
+        say(f"{path.name}: {n_empty} boxes without width or height are left out")
     if chosen:
-        console.print(f"{path.name}: {chosen}", markup=False)
+        say(f"{path.name}: {chosen}")
     return ImageSet(result, clipped=True, categories=chosen)
 
 

@@ -10,8 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.storage.files import new_folder
-from perilune_shared.terminal import console, progress_bar
+from perilune_shared.terminal import progress_bar, say
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold
@@ -74,10 +75,10 @@ def predict_images(
                 if len(own) < len(found.boxes):
                     left_out = len(found.boxes) - len(own)
                     message = f"{path.name}: {left_out} craters are off the map and not in detections.geojson"
-                    console.print(message, markup=False)
+                    say(message)
         table = pd.concat(tables, ignore_index=True)
         table.to_parquet(folder / "detections.parquet", index=False)
-        table.round(4).to_csv(folder / "detections.csv", index=False)
+        write_csv(table.round(4), folder / "detections.csv")
         if any(reference is not None for reference in references):
             (folder / "detections.geojson").write_text(json.dumps(collection(shapes)) + "\n", encoding="utf-8")
     return len(table)
@@ -87,9 +88,7 @@ def _reference(path: Path) -> Georeference | None:
     if can_read_georeferences():
         return read_georeference(path)
     if path.suffix.lower() in (".tif", ".tiff") or path.with_suffix(".prj").is_file():
-        console.print(
-            f"{path.name}: reading its georeference needs rasterio and pyproj (pip install 'perilune-train[geo]')"
-        )
+        say(f"{path.name}: reading its georeference needs rasterio and pyproj (pip install 'perilune-train[geo]')")
     return None
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console
+from perilune_shared.terminal import console, say, say_page
 from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
@@ -92,12 +92,10 @@ def run_detect(
     start_run(run, "detect", config, inputs, state)
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
-        console.print(
-            "detect.frozen_epochs is ignored without detect.init_from: the whole network is trained from the start"
-        )
+        say("detect.frozen_epochs is ignored without detect.init_from: the whole network is trained from the start")
     # The anchors of a resumed run are in its state and may differ.
     if not resume:
-        console.print(anchor_report(network, sizes, config.anchor_ratio))
+        say_page(anchor_report(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
     task.terrain = terrain.plain()
     seconds = fit(
@@ -137,7 +135,7 @@ def run_detect(
     mark_files(run.root, WRITTEN, terrain_check.mark)
     metrics |= terrain_check.metrics()
     write_metrics(run.root, metrics)
-    console.print(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
+    say(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
     return run
 
 

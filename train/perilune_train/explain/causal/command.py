@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Preset, RunsFolder, Settings
 from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.explain.config import ExplainConfig
@@ -88,7 +88,7 @@ def causal(
         overwrite,
         allow_overlap,
     )
-    console.print(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
+    say(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
 
 
 def _chosen_gate(explained: Path) -> str:

@@ -11,7 +11,7 @@ from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.data.frames import load_images
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import Detections
@@ -100,7 +100,7 @@ def causal_run(
     start_run(run, "explain", settings, inputs, state)
     rng = np.random.default_rng([settings.seed, 3])
     versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
-    console.print(f"{len(pairs.craters)} views of {len(removed)} removed craters in {len(pairs.factual)} frames")
+    say(f"{len(pairs.craters)} views of {len(removed)} removed craters in {len(pairs.factual)} frames")
     masks = {version: detector_masks(detector.network, images, checkpoint) for version, images in versions.items()}
     moved = mask_effects(pairs, masks, shifts)
     found = detection_effects(pairs, lambda images: _detect(detector, images), versions)
@@ -126,7 +126,7 @@ def causal_run(
     write_text(run.root / "claims.json", json.dumps(claims, indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
     for claim in claims:
-        console.print(f"{claim['claim']}: {claim['figure']}: {claim['verdict']}", markup=False, soft_wrap=True)
+        say(f"{claim['claim']}: {claim['figure']}: {claim['verdict']}")
     write_metrics(run.root, metrics | {"split": split, "threshold": threshold, "detector": checkpoint.as_posix()})
     return run
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.shipped.models import shipped_run
 
@@ -28,4 +28,4 @@ def benchmark(
     run = run or shipped_run("navigate")
     folder = out or Path("runs/benchmark", f"{run.resolve().name}-navigate")
     figures = score_navigator(run, data, manifests, folder, allow_overlap)
-    console.print(f"position RMSE {figures[f'headline/{HEADLINE}']:.3f} m; {folder}: {PAGE}, {FIGURES}")
+    say(f"position RMSE {figures[f'headline/{HEADLINE}']:.3f} m; {folder}: {PAGE}, {FIGURES}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.shipped.models import shipped_run
 
@@ -32,5 +32,5 @@ def benchmark_landing(
     folder = out or Path("runs/benchmark", f"{run.resolve().name}-landing")
     figures = score_landing(run, data, manifests, folder, maps, allow_overlap)
     if f"filter/{POSITION}" in figures:
-        console.print(f"filter: position RMSE {figures[f'filter/{POSITION}']:.3f} m")
-    console.print(f"{folder}: {PAGE}, {FIGURES}, frames.parquet", soft_wrap=True)
+        say(f"filter: position RMSE {figures[f'filter/{POSITION}']:.3f} m")
+    say(f"{folder}: {PAGE}, {FIGURES}, frames.parquet")

@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 
 
 def calibrate(
@@ -41,4 +41,4 @@ def calibrate(
     check_calibration(read_provenance(load_weights(best), best), split_terrain(opened, split, "calibrated"), opened)
     network, architecture = load_navigator(best, fusion)
     fit(run, network, architecture, load_split(opened, split))
-    console.print(f"{run / FILE}", soft_wrap=True)
+    say(f"{run / FILE}")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say, say_page
 from perilune_train.cli_options import AllowOverlap
 
 
@@ -18,5 +18,5 @@ def compare(
     # matplotlib takes seconds to load.
     from perilune_train.navigate.compare_runs import compare_folders
 
-    console.print(compare_folders(folders, out, allow_overlap), markup=False, highlight=False, soft_wrap=True)
-    console.print(f"{out}: compare.md, errors.png")
+    say_page(compare_folders(folders, out, allow_overlap))
+    say(f"{out}: compare.md, errors.png")

@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.shipped.models import shipped_run
 
@@ -37,4 +37,4 @@ def evaluate(
 
     default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
     folder = evaluate_navigator(run or shipped_run("navigate"), dataset, split, out or default, allow_overlap)
-    console.print(f"{folder}: metrics.json, navigation.parquet, errors.parquet, errors.png")
+    say(f"{folder}: metrics.json, navigation.parquet, errors.parquet, errors.png")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.shipped.models import shipped_run
 
 
@@ -30,6 +30,4 @@ def export(
     from perilune_train.navigate.deploy.export import export_navigator
 
     largest = export_navigator(run or shipped_run("navigate"), out, dataset)
-    console.print(
-        f"{out}: README.md explains how to use the files; difference from torch {largest:.1e}", soft_wrap=True
-    )
+    say(f"{out}: README.md explains how to use the files; difference from torch {largest:.1e}")

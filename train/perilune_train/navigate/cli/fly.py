@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import answer_page, say
 from perilune_train.shipped.models import shipped_run
 
 
@@ -38,15 +38,15 @@ def fly(
 
     descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
     for doubt in doubts_of(descent):
-        console.print(f"warning: {imu}: {doubt}", soft_wrap=True, markup=False)
-    table = fly_descent(descent, run, out, typer.echo, live)
+        say(f"warning: {imu}: {doubt}")
+    table = fly_descent(descent, run, out, answer_page, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
-    console.print(f"{out}: {len(table)} frames ({counts}); {written}", soft_wrap=True)
+    say(f"{out}: {len(table)} frames ({counts}); {written}")
     if (table["status"] == "lost").any():
         for doubt in doubts_of(descent, is_lost=True):
-            console.print(f"a possible cause of the status lost: {imu}: {doubt}", soft_wrap=True, markup=False)
+            say(f"a possible cause of the status lost: {imu}: {doubt}")
     if "error_x_m" in table:
         length = (table[[f"error_{axis}_m" for axis in "xyz"]] ** 2).sum(axis=1)
         rms, end = length.mean() ** 0.5, length.iloc[-1] ** 0.5
-        typer.echo(f"position error: {rms:.2f} m r.m.s., {end:.2f} m at the last frame")
+        answer_page(f"position error: {rms:.2f} m r.m.s., {end:.2f} m at the last frame")

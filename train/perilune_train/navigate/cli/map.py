@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.shipped.models import shipped_run
 
@@ -27,4 +27,4 @@ def make_map(
     from perilune_train.navigate.map.run import PAGE, map_scenes
 
     map_scenes(dataset, detector or shipped_run("detect"), out, allow_overlap)
-    console.print(f"{out / PAGE}: errors and picture; one catalogue per scene beside it", soft_wrap=True)
+    say(f"{out / PAGE}: errors and picture; one catalogue per scene beside it")

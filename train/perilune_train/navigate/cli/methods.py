@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.shipped.models import shipped_run
 
@@ -42,4 +42,4 @@ def methods(
 
     networks = run or shipped_run("navigate"), detector or shipped_run("detect")
     fly_methods(dataset, split, *networks, out, allow_overlap, maps)
-    console.print(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet", soft_wrap=True)
+    say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")

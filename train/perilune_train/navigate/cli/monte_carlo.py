@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
 from perilune_train.navigate.monte_carlo.scenario import SCENARIOS
 from perilune_train.shipped.models import shipped_run
@@ -45,4 +45,4 @@ def monte_carlo(
 
     own = detector or shipped_run("detect")
     fly_draws(dataset, split, own, out, scenario, draws, attitude_deg, seed, workers, allow_overlap)
-    console.print(f"{out / PAGE}: table and pictures; draws.parquet", soft_wrap=True)
+    say(f"{out / PAGE}: table and pictures; draws.parquet")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config import resolve
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
 from perilune_train.navigate.config import NavigateConfig
 
@@ -41,4 +41,4 @@ def train(
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
     address = dataset or Path("data", preset, "nav")
     for run in navigate_run(settings, address, runs, name, detector, overwrite, allow_overlap):
-        console.print(f"{run.root}: metrics.json, navigation.parquet, errors.png")
+        say(f"{run.root}: metrics.json, navigation.parquet, errors.png")

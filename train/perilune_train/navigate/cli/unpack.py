@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.inertial_grades import GRADES
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say
 
 
 def unpack(
@@ -43,4 +43,4 @@ def unpack(
 
     count = unpack_descent(open_single(dataset), (ids[0], ids[1]), out, grade, exact, offset, seed)
     names = "frames, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml, truth.csv"
-    console.print(f"{out}: {count} frames; {names}")
+    say(f"{out}: {count} frames; {names}")

@@ -16,6 +16,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
 from perilune_shared.storage.store import Address
 from perilune_train.detect.deploy.engines import package
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.provenance import read_provenance
 from perilune_train.navigate.data.sequences import pair_sequence
 from perilune_train.navigate.data.trajectories import load_split
@@ -94,7 +95,7 @@ def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> f
         metadata["largest_difference_from_torch"] = largest
         metadata["sha256"] = sha256_of(path)
         write_text(folder / METADATA, json.dumps(metadata, indent=2) + "\n")
-        write_text(folder / README, readme(metadata))
+        write_markdown(folder / README, readme(metadata))
     return largest
 
 

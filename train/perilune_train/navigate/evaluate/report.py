@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from perilune_shared.export.foreign_text import for_markdown
 from perilune_shared.geometry.frames import Array
-from perilune_shared.storage.files import write_text, written_aside
-from perilune_train.evaluation.markdown import number, table
+from perilune_shared.storage.files import written_aside
+from perilune_train.evaluation.markdown import number, table, write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.spread import read_spread
@@ -73,7 +74,7 @@ def write_pose_evaluation(
     metrics = _metrics(own, split, errors, rows)
     worse_than = worse_than_floor(own, rows)
     page = _pose_page(own, split, metrics, list(errors), worse_than)
-    write_text(folder / POSE_PAGE, page)
+    write_markdown(folder / POSE_PAGE, page)
     mark_files(folder, (*_WRITTEN, POSE_PAGE), str(details["terrain/mark"]))
     found: Metrics = {"evaluation/target": "pose", "evaluation/worse_than": worse_than}
     write_metrics(folder, metrics | found | dict(details))
@@ -95,7 +96,7 @@ def _pose_page(own: str, split: str, metrics: Metrics, methods: list[str], worse
         name = f"**{method}, worse than {worse_than}**" if method == own and worse_than else FLOORS.get(method, method)
         cells.append([name, *[_with_interval(metrics, f"{prefix}/{key}") for key in _POSE_COLUMNS]])
     text = "In brackets: 95 % intervals over trajectories, if there are five or more."
-    lines = ["# Pose in the landing frame", "", f"Split {split}. {text}", ""]
+    lines = ["# Pose in the landing frame", "", f"Split {for_markdown(split)}. {text}", ""]
     return "\n".join([*lines, *table(["method", *_POSE_COLUMNS.values()], cells), ""])
 
 

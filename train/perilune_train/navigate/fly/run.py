@@ -9,6 +9,7 @@ import pandas as pd
 
 from perilune_shared.dataset.metadata import CameraRecord
 from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 from perilune_shared.storage.files import new_folder
@@ -91,7 +92,7 @@ def fly_descent(
                 draw_flight(live, with_errors_of(pd.DataFrame(rows), descent.truth))
         table = with_errors_of(pd.DataFrame(rows), descent.truth)
         table.to_parquet(folder / f"{ESTIMATES}.parquet", index=False)
-        table.to_csv(folder / f"{ESTIMATES}.csv", index=False)
+        write_csv(table, folder / f"{ESTIMATES}.csv")
         draw_flight(folder / PICTURE, table)
     return table
 

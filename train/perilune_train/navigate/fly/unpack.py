@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, quaternion_from_matrix
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.storage.files import new_folder
@@ -68,19 +69,18 @@ def unpack_descent(
         camera = dataset.info.camera.model_dump(mode="json")
         (folder / "camera.yaml").write_text(to_yaml_text(camera), encoding="utf-8")
         _write_catalogue(folder / "catalogue.parquet", catalogue)
-        pd.DataFrame(
-            {
-                **{name: inertial[name] for name in INERTIAL_COLUMNS[:2]},
-                **_columns(RATES, inertial["angular_rate_radps"]),
-                **_columns(FORCES, inertial["specific_force_mps2"]),
-            }
-        ).to_csv(folder / "imu.csv", index=False)
+        measured = {
+            **{name: inertial[name] for name in INERTIAL_COLUMNS[:2]},
+            **_columns(RATES, inertial["angular_rate_radps"]),
+            **_columns(FORCES, inertial["specific_force_mps2"]),
+        }
+        write_csv(pd.DataFrame(measured), folder / "imu.csv")
         ranges = dataset.table("ranges", list(RANGE_COLUMNS), *ids).to_pandas().sort_values("time_s")
-        ranges.to_csv(folder / "ranges.csv", index=False)
+        write_csv(ranges, folder / "ranges.csv")
         prior = _prior(frames, np.array(dataset.info.camera.rotation_camera_from_body), grade, catalogue, offset, rng)
         (folder / "prior.yaml").write_text(to_yaml_text(prior), encoding="utf-8")
         poses = np.column_stack([frames[name].to_pylist() for name in ("time_s", "position_m", "rotation_wxyz")])
-        pd.DataFrame(poses, columns=list(TRUTH_COLUMNS)).to_csv(folder / "truth.csv", index=False)
+        write_csv(pd.DataFrame(poses, columns=list(TRUTH_COLUMNS)), folder / "truth.csv")
     return int(frames.num_rows)
 
 
@@ -96,7 +96,7 @@ def _write_frames(dataset: Dataset, frames: pa.Table, out: Path) -> None:
     for frame_id, png in dataset.pngs(frames):
         (folder / names[frame_id]).write_bytes(png)
     rows = {FRAME_COLUMNS[0]: list(names.values()), FRAME_COLUMNS[1]: frames["time_s"].to_pylist()}
-    pd.DataFrame(rows).to_csv(folder / FRAMES_FILE, index=False)
+    write_csv(pd.DataFrame(rows), folder / FRAMES_FILE)
 
 
 def _write_catalogue(path: Path, catalogue: Catalogue) -> None:

@@ -1,6 +1,7 @@
 """The page of a map: errors by diameter, and a picture."""
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_train.evaluation.markdown import number, table
 from perilune_train.navigate.map.files import SceneMap
 
@@ -9,7 +10,7 @@ PICTURE = "map.png"
 
 def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
     """The page as Markdown."""
-    lines = ["# Crater map", "", f"Dataset `{dataset.info.name}`, {len(maps)} scenes, two images of each.", ""]
+    lines = ["# Crater map", "", f"Dataset {code_span(dataset.info.name)}, {len(maps)} scenes, two images of each.", ""]
     lines += [
         "Poses of the images are exact. A crater of the map is true if one of the terrain is near: distance in radii,",
         "plus twice the difference of the logarithms of both radii, is below 0.8. Errors are those of true craters.",
@@ -18,7 +19,7 @@ def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
     for one in maps:
         share = one.catalogue.radius_sigma_share
         stated = f"position {number(one.catalogue.position_sigma_m)} m, diameter {100 * share:.0f} %"
-        lines += [f"## {one.scene_id}: {len(one.catalogue)} craters", "", f"Stated errors: {stated}.", ""]
+        lines += [f"## {for_markdown(one.scene_id)}: {len(one.catalogue)} craters", "", f"Stated errors: {stated}.", ""]
         head = ["diameter (m)", "mapped", "true", "found", "position RMSE per axis (m)", "height RMSE (m)"]
         rows = [
             [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_quaternion
-from perilune_shared.storage.files import new_folder, write_text
+from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import progress_bar
 from perilune_train.data.frames import decode
@@ -21,6 +21,7 @@ from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.pictures import save_image
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
@@ -78,7 +79,7 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
         write_maps(folder, dataset, maps)
         errors.to_parquet(folder / ERRORS, index=False)
         save_image(folder / PICTURE, maps[0].picture)
-        write_text(folder / PAGE, page_of(dataset, maps))
+        write_markdown(folder / PAGE, page_of(dataset, maps))
         for check in checks:
             mark_files(folder, (PAGE, ERRORS, PICTURE), str(check.metrics()["terrain/mark"]))
     return errors

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from perilune_shared.storage.files import new_folder, write_text
+from perilune_shared.export.foreign_text import code_span
+from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_train.evaluation.benchmark_parts import Part, open_parts, part_names
-from perilune_train.evaluation.markdown import number, table
+from perilune_train.evaluation.markdown import number, table, write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
@@ -67,7 +68,7 @@ def score_landing(
                 figures |= {f"{method}/region/{region}/{key}": value for key, value in found.items()}
         frames.to_parquet(folder / FRAMES, index=False)
         draw_by_altitude(folder / PICTURE, {name: own for name, own in by_method.items() if "lost" not in name})
-        write_text(folder / PAGE, _page(detector, by_method, figures))
+        write_markdown(folder / PAGE, _page(detector, by_method, figures))
         mark_files(folder, [PAGE, FRAMES, PICTURE], mark)
         write_metrics(folder, figures | {"scored": f"run {detector.resolve().name}"}, FIGURES)
     return figures
@@ -96,7 +97,7 @@ def _spread(method: str, errors: pd.DataFrame) -> Spread:
 
 def _page(detector: Path, by_method: dict[str, pd.DataFrame], figures: Metrics) -> str:
     """The page as Markdown."""
-    lines = ["# Locked benchmark of landing", "", f"Craters by the detector `{detector.resolve().name}`.", ""]
+    lines = ["# Locked benchmark of landing", "", f"Craters by the detector {code_span(detector.resolve().name)}.", ""]
     for name in part_names("nav"):
         n_frames, n_locked = figures.get(f"frames/{name}"), figures.get(f"locked_frames/{name}")
         whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_train.evaluation.markdown import number, table
 from perilune_train.navigate.methods.seen import SeenDescent
 
@@ -69,7 +70,8 @@ def page_of(
     lines = [
         "# Navigation methods",
         "",
-        f"Dataset `{dataset.info.name}`, split {split}: {len(descents)} descents over {len(scenes)} scenes.",
+        f"Dataset {code_span(dataset.info.name)}, split {for_markdown(split)}: "
+        f"{len(descents)} descents over {len(scenes)} scenes.",
         f"Detection takes {detection_s:.3f} s per frame, which every absolute method needs besides its own time.",
         "",
         "## Motion between consecutive frames",

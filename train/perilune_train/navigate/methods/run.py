@@ -11,6 +11,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import new_folder, write_text
 from perilune_shared.storage.store import Address
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
@@ -82,7 +83,7 @@ def fly_methods(
             draw_flights(folder / PICTURES[1], errors["filter"])
         _draw_matches(folder, trajectories[0], descents[0], catalogues.rough[descents[0].ids[0]])
         drawn = [name for name in PICTURES if (folder / name).is_file()]
-        write_text(folder / PAGE, page_of(dataset, split, rows, descents, detection_s, drawn))
+        write_markdown(folder / PAGE, page_of(dataset, split, rows, descents, detection_s, drawn))
         for check in checks:
             mark_files(folder, (PAGE, TABLE, FRAMES, *drawn), str(check.metrics()["terrain/mark"]))
         write_text(folder / "inputs.json", json.dumps(hashes_of({"dataset": address, **best}), indent=2) + "\n")

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_train.evaluation.markdown import number, table
 from perilune_train.navigate.monte_carlo.scenario import SCENARIOS
 from perilune_train.navigate.monte_carlo.summary import by_trajectory, run_summary
@@ -35,11 +36,12 @@ def page_of(
     overall, own = run_summary(rows), by_trajectory(rows)
     n_flights = len(rows.groupby(["scene_id", "trajectory_id", "draw"]))
     cells = [["all", *_cells(overall)]]
-    cells += [["/".join(map(str, ids)), *_cells(figures)] for ids, figures in own.items()]
+    cells += [[for_markdown("/".join(map(str, ids))), *_cells(figures)] for ids, figures in own.items()]
     lines = [
         "# Monte Carlo of the navigation filter",
         "",
-        f"Dataset `{dataset}`, split {split}, scenario `{about['scenario']}`: {SCENARIOS[about['scenario']]}.",
+        f"Dataset {code_span(dataset)}, split {for_markdown(split)}, "
+        f"scenario `{about['scenario']}`: {SCENARIOS[about['scenario']]}.",
         f"Descents: {len(own)}, with {about['draws']} draws of each, {n_flights} flights, {len(rows)} frames, seed "
         f"{about['seed']}; {seconds / 60:.1f} minutes.",
         "",

@@ -17,10 +17,11 @@ from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
-from perilune_shared.storage.files import new_folder, write_text
+from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import progress_bar
 from perilune_shared.threads import usable_cores
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
 from perilune_train.navigate.craters.catalogue import (
@@ -116,7 +117,7 @@ def fly_draws(
         draw_consistency(folder / PICTURES[1], rows)
         about = {"scenario": scenario, "draws": draws, "seed": seed, "attitude_deg": attitude_deg}
         seconds = time.perf_counter() - begun
-        write_text(folder / PAGE, page_of(dataset.info.name, split, about, rows, seconds, PICTURES))
+        write_markdown(folder / PAGE, page_of(dataset.info.name, split, about, rows, seconds, PICTURES))
         mark_files(folder, (PAGE, TABLE, *PICTURES), str(check.metrics()["terrain/mark"]))
     return rows
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
-from perilune_shared.terminal import console
+from perilune_shared.terminal import say_page
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.navigate.data.trajectories import Pose, Trajectory
 from perilune_train.navigate.evaluate.floors import Known, mean_poses, ridge_poses
@@ -54,7 +54,7 @@ def evaluate_pose_run(
         "test/ms_per_single_pair": round(1e3 * seconds_by_pairs, 2),
         "network/parameters": sum(p.numel() for p in network.parameters()),
     }
-    console.print(write_pose_evaluation(run.root, "stack", "test", test, poses, own | details), markup=False)
+    say_page(write_pose_evaluation(run.root, "stack", "test", test, poses, own | details))
 
 
 def _ridge(
@@ -77,6 +77,7 @@ def _ridge(
     validation = [task.validation_trajectories[number] for number in task.validated]
     known = {}
     for split, own in (("train", training), ("val", validation)):
-        stored = [one.cpu().numpy() for one in task.stored.get(split, [])]
+        # Features of views come after those of the trajectories.
+        stored = [one[: sum(t.n_pairs for t in own)].cpu().numpy() for one in task.stored.get(split, [])]
         known[split] = Known(own, stored or features(own))
     return ridge_poses(known["train"], known["val"], features(test))

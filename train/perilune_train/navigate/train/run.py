@@ -10,7 +10,7 @@ from torch import Tensor
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console
+from perilune_shared.terminal import console, say
 from perilune_train.data.shares import Share
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import (
@@ -216,7 +216,7 @@ def _detector_backbone(
     path = settings.detector or default
     if path is None or (settings.detector is None and not path.is_file()):
         reason = "from scratch: no detect run to start from"
-        console.print(f"stack: backbone {reason}")
+        say(f"stack: backbone {reason}")
         return None, reason, []
     content = load_weights(path)
     expected = {
@@ -227,7 +227,7 @@ def _detector_backbone(
     other = [key for key, value in expected.items() if content["architecture"].get(key) != value]
     if other and settings.detector is None:
         reason = f"from scratch: {path} differs in {', '.join(other)}"
-        console.print(f"stack: backbone {reason}")
+        say(f"stack: backbone {reason}")
         return None, reason, []
     check_architecture(path, content["architecture"], expected)
     weights = content["state_dict"].items()
@@ -235,5 +235,5 @@ def _detector_backbone(
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
     own = settings.stack.stages
     source = f"stages 1 to {min(stages, own)} of {own} from {path}"
-    console.print(f"stack: backbone {source}")
+    say(f"stack: backbone {source}")
     return state, source, [read_provenance(content, path)]

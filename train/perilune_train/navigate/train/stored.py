@@ -1,5 +1,7 @@
 """Features of a frozen backbone, computed once: a coarse epoch then trains the recurrent layers only."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -7,26 +9,34 @@ from perilune_shared.terminal import progress_bar
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.navigate.data.trajectories import Trajectory
 from perilune_train.navigate.pose import pooled_features
+from perilune_train.navigate.train.views import view_homographies
 
 
 @torch.no_grad()
 def stored_features(
-    network: StackNavigator, trajectories: list[Trajectory], device: torch.device, bf16: bool
+    network: StackNavigator,
+    trajectories: list[Trajectory],
+    device: torch.device,
+    bf16: bool,
+    views: Sequence[Trajectory] = (),
 ) -> list[Tensor]:
     """Averages (pairs, inputs), float32, of the frozen backbone's features of all pairs of each trajectory.
 
-    The backbone is in evaluation mode, and frames are not augmented, so the features are those of every coarse epoch.
-    They stay on the device.
+    Those of `views`, further versions of the trajectories in the same order (`other_views`), come after them. The
+    backbone is in evaluation mode, and each frame has one warp, so the features are those of every coarse epoch. They
+    stay on the device.
     """
     modes = [(module, module.training) for module in network.backbone.modules()]
     network.backbone.eval()
     found = []
     with progress_bar() as progress, torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-        total = sum(trajectory.n_pairs for trajectory in trajectories)
+        total = sum(trajectory.n_pairs for trajectory in [*trajectories, *views])
         bar = progress.add_task("backbone", total=total, unit="pairs", note="")
-        for trajectory in trajectories:
+        warps: list[Tensor | None] = [None] * len(trajectories)
+        warps += [view_homographies(trajectories[i % len(trajectories)], view) for i, view in enumerate(views)]
+        for trajectory, warp in zip([*trajectories, *views], warps, strict=True):
             parts = []
-            for part in pooled_features(network, torch.from_numpy(trajectory.images)):
+            for part in pooled_features(network, torch.from_numpy(trajectory.images), warp):
                 parts.append(part.float())
                 progress.advance(bar, len(part))
             found.append(torch.cat(parts))

@@ -34,6 +34,7 @@ from perilune_train.navigate.network import (
 )
 from perilune_train.navigate.pose import predict_pose
 from perilune_train.navigate.train.stored import stored_features
+from perilune_train.navigate.train.views import other_views
 from perilune_train.navigate.train.windows import WindowPlaces, Windows, collated
 from perilune_train.training.runs import choose_bf16, choose_device
 
@@ -85,7 +86,8 @@ class NavigationTask(lightning.LightningModule):
     s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles, unless
     `cycles` is 5; warp's pairs are mirrored and jittered (see data/sequences.py).
 
-    In the coarse stage a stack network whose whole backbone is given computes the backbone's features once. The target
+    In the coarse stage a stack network whose whole backbone is given computes the backbone's features once, also those
+    of further views of the training trajectories (`views`). The target
     `pose` replaces the motion by the pose in O_L at the later frame; P is then the position, its axes weighted by
     `axis_weights`.
     """
@@ -129,6 +131,7 @@ class NavigationTask(lightning.LightningModule):
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.share = share
         self.training_trajectories = [one.shrunk(self.own.size_px) for one in training]
+        self.views = other_views(self.training_trajectories, self.own.views, self.own.view_spread, settings.seed)
         self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
         given = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
         self.stores = fusion == "stack" and given and self.own.coarse_epochs > 0
@@ -173,7 +176,9 @@ class NavigationTask(lightning.LightningModule):
         }
         place = self.training_trajectories, self.own.sequence_pairs
         if self.fusion == "stack":
-            return WindowPlaces(*place, **own)
+            places = WindowPlaces(*place, **own)
+            places.views = self.own.views
+            return places
         if self.stream is None:
             return TrainingSequences(*place, **own)
         return StreamedSequences(self.stream, self.own.size_px, *place, **own)
@@ -225,7 +230,7 @@ class NavigationTask(lightning.LightningModule):
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
-            self.windows = Windows(*place, self.scales, self.own.target, self.device)
+            self.windows = Windows(*place, self.scales, self.own.target, self.device, self.views)
         stores, last = self.coarse and self.stores, self.current_epoch + 1 == self.own.coarse_epochs
         if stores and not self.stored:
             self._store()
@@ -235,10 +240,15 @@ class NavigationTask(lightning.LightningModule):
 
     def _store(self) -> None:
         """Compute the features of the frozen backbone."""
-        training = [self.training_trajectories[number] for number in self.share.of(len(self.training_trajectories))]
+        count = len(self.training_trajectories)
+        training = [self.training_trajectories[number] for number in self.share.of(count)]
+        views = [self.views[v * count + number] for v in range(self.own.views) for number in self.share.of(count)]
         validation = [self.validation_trajectories[number] for number in self.validated]
         bf16 = choose_bf16(self.settings.precision, self.device.type)
-        pooled = [stored_features(self.network, own, self.device, bf16) for own in (training, validation)]
+        pooled = [
+            stored_features(self.network, own, self.device, bf16, others)
+            for own, others in ((training, views), (validation, ()))
+        ]
         if self.network.standardised:
             self.network.measure(torch.cat(pooled[0]))
         train, val = ([self.network.scaled(one) for one in own] for own in pooled)

@@ -1,6 +1,7 @@
 """Training sequences of a stack network on the training device: frames, features and truths gathered by their places.
 
-Nothing is prepared for a step but the places of its sequences, so that a GPU waits for nothing.
+Nothing is prepared for a step but the places of its sequences, so that a GPU waits for nothing. With views
+(navigate/train/views.py), version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
 """
 
 from collections.abc import Sequence
@@ -14,17 +15,28 @@ from perilune_train.navigate.data.epochs import Key, TrainingSequences
 from perilune_train.navigate.data.trajectories import Trajectory
 from perilune_train.navigate.geometry import euler_from_rotation
 from perilune_train.navigate.network import Scales
-from perilune_train.navigate.pose import normalised_frames
+from perilune_train.navigate.pose import normalised_frames, warped_frames
+from perilune_train.navigate.train.views import view_homographies
 
 _LARGEST_SHARE = 0.25
 """Share of the free memory of a GPU that frames may take; more stay in the memory of the machine."""
 
 
 class WindowPlaces(TrainingSequences):
-    """The places of training sequences: number of the trajectory and first pair."""
+    """The places of training sequences: number of the trajectory and first pair.
+
+    With `views`, each sequence is of a version of its trajectory that is drawn at random.
+    """
+
+    views: int = 0
+    """Number of versions beside the trajectories themselves."""
 
     def __getitem__(self, key: Key) -> tuple[int, int]:  # type: ignore[override]
-        return key[2:]
+        epoch, place, number, start = key
+        if not self.views:
+            return number, start
+        version = int(np.random.default_rng([self.seed, epoch, place]).integers(self.views + 1))
+        return version * len(self.trajectories) + number, start
 
 
 def collated(places: list[tuple[int, int]]) -> Tensor:
@@ -33,9 +45,10 @@ def collated(places: list[tuple[int, int]]) -> Tensor:
 
 
 class Windows:
-    """Sequences of `n_pairs` consecutive pairs of some of the trajectories, which `numbers` has.
+    """Sequences of `n_pairs` consecutive pairs of some of the trajectories, which `numbers` has, and of their views.
 
-    `places` (batch, 2) are number of the trajectory and first pair, on the device.
+    `views` are further versions of all trajectories, as `other_views` gives them. `places` (batch, 2) are number of the
+    trajectory and first pair, on the device.
     """
 
     def __init__(
@@ -46,17 +59,29 @@ class Windows:
         scales: Scales,
         target: Target,
         device: torch.device,
+        views: Sequence[Trajectory] = (),
     ):
         own = [trajectories[number] for number in numbers]
+        count, versions = len(trajectories), 1 + len(views) // len(trajectories)
         self.images, self.device = [one.images for one in own], device
         self.frames: Tensor | None = None
-        truths = [truth(one, scales, target) for one in own]
+        every = [*trajectories, *views]
+        numbers = [version * count + number for version in range(versions) for number in numbers]
+        truths = [truth(every[number], scales, target) for number in numbers]
         self.position, self.angles = (torch.cat(parts).to(device) for parts in zip(*truths, strict=True))
-        """Standardised truths (pairs of all trajectories, 3)."""
+        """Standardised truths (pairs of all versions of all trajectories, 3)."""
         self.steps = torch.arange(n_pairs + 1, device=device)
-        before = np.zeros((len(trajectories), 2), np.int64)
-        before[list(numbers)] = np.cumsum([(0, 0), *((one.n_pairs, one.n_pairs + 1) for one in own)], axis=0)[:-1]
+        before = np.zeros((len(every), 2), np.int64)
+        sizes = [(every[number].n_pairs, every[number].n_pairs + 1) for number in numbers]
+        before[numbers] = np.cumsum([(0, 0), *sizes], axis=0)[:-1]
         self.first_pair, self.first_frame = torch.from_numpy(before).to(device).unbind(1)
+        self.n_frames = sum(one.n_pairs + 1 for one in own)
+        self.homographies = (
+            torch.cat([view_homographies(trajectories[number % count], every[number]) for number in numbers]).to(device)
+            if views
+            else None
+        )
+        """From the frames of all versions (frames, 3, 3) to those of the trajectories; None without views."""
 
     def pairs(self, places: Tensor) -> Tensor:
         """Indices (batch, pairs) of the pairs of sequences among those of all trajectories."""
@@ -67,7 +92,11 @@ class Windows:
         if self.frames is None:
             self.frames = self._resident()
         index = (self.first_frame[places[:, 0]] + places[:, 1])[:, None] + self.steps
-        chosen = self.frames[index.to(self.frames.device)].to(self.device, non_blocking=True)
+        original = (index % self.n_frames).to(self.frames.device)
+        chosen = self.frames[original].to(self.device, non_blocking=True)
+        if self.homographies is not None:
+            warped = warped_frames(chosen.flatten(0, 1), self.homographies[index.flatten()])
+            chosen = warped.unflatten(0, index.shape)
         frames = normalised_frames(chosen)
         return frames[:, :-1], frames[:, 1:]
 

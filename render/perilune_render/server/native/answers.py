@@ -35,6 +35,12 @@ class SceneRequest(Section):
     request: Literal["scene"]
 
 
+class HealthRequest(Section):
+    """Do both interfaces answer?"""
+
+    request: Literal["health"]
+
+
 class GroundRequest(_OfScene):
     """Is a scene in memory, and what is it? If it is not, it is generated."""
 
@@ -72,12 +78,15 @@ class HeightsRequest(_OfScene):
 
 _REQUESTS: dict[str, type[Section]] = {
     "scene": SceneRequest,
+    "health": HealthRequest,
     "ground": GroundRequest,
     "frame": FrameRequest,
     "craters": CratersRequest,
     "heights": HeightsRequest,
 }
 _LENGTH_TOLERANCE = 0.01
+OF_CONNECTIONS: list[bytes] = []
+"""What `answer` returns for a request that the thread of the connections answers: that of health."""
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
@@ -87,6 +96,8 @@ def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
     """
     try:
         request = _parsed(content)
+        if isinstance(request, HealthRequest):
+            return OF_CONNECTIONS
         world = grounds.world(request.scene, client) if isinstance(request, _OfScene) else grounds.first
         if world is None:
             return _reply({"ready": False}, {})

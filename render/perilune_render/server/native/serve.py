@@ -1,0 +1,98 @@
+"""Serve our own interface: read each message whole, then answer it."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from perilune_render.server.grounds import Grounds
+from perilune_render.server.native import zmtp
+from perilune_render.server.native.answers import OF_CONNECTIONS, answer, refusal
+from perilune_render.server.serve import Connection, Interface, Limits, answers
+
+MOST_WITHOUT_PLACE = 256
+"""Largest number of clients that are connected without a place, to learn that the server is busy."""
+HEALTH = b'{"request": "health"}'
+"""The request for which no place is needed, as `perilune_shared.client` sends it."""
+_HEALTH_S = 5.0
+"""Time within which each interface must greet, seconds."""
+
+
+def native_address(host: str, port: int) -> str:
+    """The address for ZeroMQ; one of IPv6 is in brackets."""
+    return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+
+@dataclass
+class Native:
+    """Our own interface of a server."""
+
+    grounds: Grounds
+    """The scenes."""
+    limits: Limits
+    """What each client may ask for. Clients above their number are answered that the server is busy."""
+    note: Callable[[str], object]
+    """Called with a line on each error that is not the client's."""
+    interfaces: list[Interface] = field(default_factory=list)
+    """All interfaces of the server, for the request of its health."""
+    _places: set[Connection] = field(default_factory=set)
+    """Clients that have a place: at most `limits.clients`, from their first request until they are disconnected."""
+
+    def interface(self, host: str, port: int) -> Interface:
+        """The interface at an address."""
+        connected = replace(self.limits, clients=self.limits.clients + MOST_WITHOUT_PLACE)
+        made = Interface("perilune_shared.client", host, port, self._serve, zmtp.greets, connected)
+        self.interfaces.append(made)
+        return made
+
+    async def _serve(self, connection: Connection) -> None:
+        """One client, until it leaves."""
+        if connection.is_extra:
+            return
+        await zmtp.greet(connection)
+        try:
+            while True:
+                message = await zmtp.receive(connection, lambda: self._has_place(connection))
+                connection.has_asked = True
+                empty = [b""] if message.n_parts > 1 and message.kept[:1] == [b""] else []
+                await zmtp.send(connection, [*empty, *await self._reply(connection, message, len(empty))])
+        finally:
+            self._places.discard(connection)
+
+    def _has_place(self, connection: Connection) -> bool:
+        """Whether a client has a place; it gets one if there is one."""
+        if connection not in self._places and len(self._places) < self.limits.clients:
+            self._places.add(connection)
+        return connection in self._places
+
+    async def _reply(self, connection: Connection, message: zmtp.Message, n_empty: int) -> list[bytes]:
+        if message.n_parts != 1 + n_empty:
+            return refusal(f"message: got {message.n_parts} parts, expected an empty one and JSON")
+        # Also a server without a free place says whether it is well.
+        if not message.is_whole or (message.kept[-1] != HEALTH and not self._has_place(connection)):
+            return refusal(f"{self.limits.clients} clients are connected; try again", busy=True)
+        try:
+            reply = await connection.ask(lambda: answer(self.grounds, message.kept[-1], connection))
+        except ConnectionAbortedError:
+            raise  # the server ends
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            self.note(f"perilune_shared.client: {text}")
+            return refusal(text)
+        return await self._health() if reply is OF_CONNECTIONS else reply
+
+    async def _health(self) -> list[bytes]:
+        """The interfaces with their addresses, or an error that names the one that does not answer."""
+        for each in self.interfaces:
+            place = f"{each.name} at {each.host}:{each.port}"
+            try:
+                async with asyncio.timeout(_HEALTH_S):
+                    if not await answers(each):
+                        return refusal(f"{place}: does not answer")
+            except TimeoutError:
+                return refusal(f"{place}: does not answer in {_HEALTH_S:g} s")
+            except (OSError, asyncio.IncompleteReadError) as error:
+                return refusal(f"{place}: does not answer: {error}")
+        return [
+            json.dumps({"interfaces": {each.name: f"{each.host}:{each.port}" for each in self.interfaces}}).encode()
+        ]

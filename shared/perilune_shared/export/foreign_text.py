@@ -1,0 +1,64 @@
+"""Make text of other people safe where it is printed or written: one function each for Markdown, HTML and CSV.
+
+Names of files, runs and datasets, licences, classes and messages of other libraries are such text. On terminals it is
+`errors.one_line`, which the functions here call too; `terminal` prints nothing without it.
+"""
+
+import html
+import os
+import re
+import string
+import unicodedata
+from typing import TYPE_CHECKING, Any
+
+from perilune_shared.errors import one_line, shortened
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_MARKUP = str.maketrans({character: f"\\{character}" for character in "\\`*_[]<>#~&$!@"})
+_LINK = re.compile(r"(:(?=//)|(?<=www)\.)", re.IGNORECASE)
+"""Where GitHub finds the start of an address."""
+_IN_CODE = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "|", "%")
+"""First characters with which a cell is a formula, or a command, for a spreadsheet program."""
+
+
+def for_markdown(value: object) -> str:
+    """Return text as one line that Markdown shows as it is: no markup, HTML, link or picture.
+
+    Bars stay, since tables of pages escape those of all cells.
+    """
+    return _LINK.sub(r"\\\1", one_line(value).translate(_MARKUP))
+
+
+def code_span(value: object) -> str:
+    """Return text as a code span that is safe in Markdown, in its tables and in HTML.
+
+    Characters other than letters, digits and safe punctuation become question marks.
+    """
+    text = "".join(c if c in _IN_CODE or (c.isalnum() and c.isprintable()) else "?" for c in one_line(value))
+    return f"`{shortened(text, 200).strip() or 'none'}`"
+
+
+def for_html(value: object) -> str:
+    """Return text as one line for the content or a quoted attribute of an HTML element."""
+    return html.escape(one_line(value), quote=True)
+
+
+def for_csv(value: str) -> str:
+    """Return text as the cell of a CSV table that no spreadsheet program takes for a formula: after an apostrophe."""
+    text = one_line(value)
+    # Spreadsheet programs also take full-width signs, and skip blanks before them.
+    first = unicodedata.normalize("NFKC", text.lstrip("'\" "))[:1]
+    return f"'{text}" if first in _FORMULA and first else text
+
+
+def write_csv(table: "pd.DataFrame", path: str | os.PathLike[str], **options: Any) -> None:
+    """Write a table as CSV without its index; text, and the names of columns, by `for_csv`. `options` are pandas'."""
+    safe = table.rename(columns=for_csv)
+    for place, kind in enumerate(safe.dtypes):
+        if str(kind) in ("object", "str", "string"):
+            cells = [for_csv(cell) if isinstance(cell, str) else cell for cell in safe.iloc[:, place]]
+            safe.isetitem(place, cells)
+    safe.to_csv(path, index=False, **options)
