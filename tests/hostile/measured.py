@@ -48,14 +48,20 @@ def outcome(
     """
     sys.stdout.flush()
     sys.stderr.flush()
-    before_mb = _resident_mb()
     read, write = os.pipe()
+    read_before, write_before = os.pipe()
     started = time.monotonic()
     child = os.fork()
     if child == 0:
         os.close(read)
+        # After a fork less is resident than in the parent: pages of files are mapped again when they are used.
+        os.write(write_before, str(_resident_mb()).encode())
+        os.close(write_before)
         _run(main, [str(argument) for argument in arguments], folder, write)
     os.close(write)
+    os.close(write_before)
+    before_mb = float(os.read(read_before, 100) or 0)
+    os.close(read_before)
     text, late = bytearray(), False
     while True:
         left = started + limit_s - time.monotonic()

@@ -12,24 +12,39 @@ from perilune_render.config_cameras import CameraConfig
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.calibration import Calibration, read_camera_file
 from perilune_shared.storage.store import open_store
 from perilune_shared.terminal import answer
-from perilune_shared.yaml_text import parse_yaml
 
 Scene = Annotated[
     Path | None,
     typer.Option(help="YAML file whose section `dataset` overrides the preset; `dataset.scene` has the Sun."),
 ]
 CameraFile = Annotated[
-    Path | None, typer.Option(help="YAML file with the settings of `dataset.camera`, in place of those of --scene.")
+    Path | None,
+    typer.Option(
+        help="YAML file with the settings of `dataset.camera`, or a calibration of OpenCV, ROS or Kalibr, in place of "
+        "the camera of --scene."
+    ),
+]
+CameraAxes = Annotated[
+    str | None,
+    typer.Option(
+        help="Axes of the camera in the poses that point right, down and forward in the image: `opencv` (x,y,z), "
+        "`blender` (x,-y,-z) or three axes. [default: those that the file states, or opencv]"
+    ),
 ]
 
 
 def frames(
-    poses: Annotated[Path, typer.Option(help="Poses: .csv, .parquet or .tum, with the frame stated in its header.")],
+    poses: Annotated[
+        Path,
+        typer.Option(help="Poses: CSV, Parquet, TUM, EuRoC or KITTI, with the frame stated in its header."),
+    ],
     out: Annotated[str, typer.Option(help="Folder or address of the new dataset.")],
     scene: Scene = None,
     camera: CameraFile = None,
+    camera_axes: CameraAxes = None,
     preset: Preset = "small",
     setting: Setting = None,
     dem: Dem = None,
@@ -61,7 +76,7 @@ def frames(
         from perilune_render.provenance.recipe import recipe_of
         from perilune_render.terrain.scene import site_of
 
-        given = read_poses(poses, *site_of(config))
+        given = read_poses(poses, *site_of(config), camera_axes)
         plan, config = given_plan(given, config, kind, poses)
         begun = new_info(config, plan, recipe_of(config, kind, preset))
         made = made_or_exit(Job(plan, config, begun, str(poses)), store, how, early)
@@ -81,13 +96,17 @@ def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
 
 
 def read_camera(path: Path) -> CameraConfig:
-    """The camera of a YAML file that has the settings of `dataset.camera`. Raises UserError."""
-    if not path.is_file():
-        raise UserError(path, "camera", "no such file", "a YAML file")
-    try:
-        content = parse_yaml(path.read_text(encoding="utf-8"), path)
-    except UnicodeDecodeError:
-        raise UserError(path, "camera", "bytes that are not UTF-8", "a YAML file") from None
-    if not isinstance(content, dict):
-        raise UserError(path, "camera", type(content).__name__, "settings of dataset.camera, such as width_px")
+    """The camera of a file: settings of `dataset.camera`, or a calibration of another program. Raises UserError."""
+    content = read_camera_file(path)
+    if isinstance(content, Calibration):
+        camera = content.camera
+        content = {
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "focal_length_px": camera.fx_px,
+            "focal_length_y_px": camera.fy_px if camera.fy_px != camera.fx_px else None,
+            "principal_x_px": camera.cx_px,
+            "principal_y_px": camera.cy_px,
+            "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True)),
+        }
     return resolve_over(CameraConfig, "camera", str(path), content)

@@ -9,7 +9,7 @@ import typer
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
 from perilune_render.cli.dataset import dataset
-from perilune_render.cli.frames import frames, with_camera
+from perilune_render.cli.frames import CameraAxes, frames, with_camera
 from perilune_render.cli.options import (
     Catalogue,
     Config,
@@ -171,20 +171,21 @@ def preview(
     ] = None,
     scene: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`; the same as CONFIG.")] = None,
     camera: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`.")] = None,
+    camera_axes: CameraAxes = None,
     out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(
         "preview.png"
     ),
 ) -> None:
     """Render a contact sheet of a configuration, with and without labels, and a map of its site, in seconds."""
-    if poses is None and (scene is not None or camera is not None):
-        raise UserError("preview", "--scene or --camera", "no --poses", "--poses as well")
+    if poses is None and (scene is not None or camera is not None or camera_axes is not None):
+        raise UserError("preview", "--scene, --camera or --camera-axes", "no --poses", "--poses as well")
     if scene is not None and config is not None:
         raise UserError("preview", "--scene", f"{scene} and {config}", "one of them")
     resolved = resolved_config(
         preset, scene or config, with_unit(setting, height_unit), dem, catalogue, given_scene=poses is not None
     )
     resolved = with_camera(resolved, camera)
-    if out.suffix != ".png":
+    if out.suffix.lower() != ".png":
         raise UserError(out, "format", out.suffix or "none", ".png")
     from perilune_render.flight.plan import make_plan
     from perilune_render.poses.file import read_poses
@@ -195,7 +196,9 @@ def preview(
     if poses is None:
         plan = make_plan(resolved, first_kind(kind))
     else:
-        plan, resolved = given_plan(read_poses(poses, *site_of(resolved)), resolved, first_kind(kind), poses)
+        plan, resolved = given_plan(
+            read_poses(poses, *site_of(resolved), camera_axes), resolved, first_kind(kind), poses
+        )
     map_path = out.with_name(f"{out.stem}-map.png")
     write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
     answer(f"look at {out} and {map_path}")

@@ -44,7 +44,7 @@ def spice(
 ) -> None:
     """Write the poses of a camera and the Sun from SPICE kernels, for the site of a scene."""
     config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, None, given_scene=True)
-    if out.suffix != ".csv":
+    if out.suffix.lower() != ".csv":
         raise UserError(out, "format", out.suffix or "none", ".csv")
     from perilune_render.poses.spice import SpiceSource, poses_csv, read_spice
     from perilune_render.terrain.elevation.model import height_of_site_m

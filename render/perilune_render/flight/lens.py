@@ -22,7 +22,7 @@ def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
         width,
         height,
         float(focal),
-        float(focal),
+        float(config.focal_length_y_px or focal),
         width / 2 if config.principal_x_px is None else config.principal_x_px,
         height / 2 if config.principal_y_px is None else config.principal_y_px,
         (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),

@@ -189,11 +189,16 @@ def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> No
 
 def _check_not_only_sky(poses: Poses, camera: Camera, matrices: Array, where: object) -> None:
     """Check that some ground is in view of each pose: not only sky."""
+    in_view = ground_in_view(poses.position_m, matrices, camera)
+    _refuse(~in_view, poses, where, lambda n: "a view of the sky alone", lambda n: "some ground in view")
+
+
+def ground_in_view(position_m: Array, matrices: Array, camera: Camera) -> np.ndarray:
+    """Whether each view (N,) shows ground, curved as the Moon; `matrices` are rotation_camera_from_site (N, 3, 3)."""
     share = (np.arange(2 * _POINTS_PER_SIDE) + 0.5) / (2 * _POINTS_PER_SIDE)
     u, v = share * camera.width_px, share * camera.height_px
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    in_view = hits_sphere(poses.position_m, np.einsum("nji,sj->nsi", matrices, camera.rays(points))).any(axis=1)
-    _refuse(~in_view, poses, where, lambda n: "a view of the sky alone", lambda n: "some ground in view")
+    return hits_sphere(position_m, np.einsum("nji,sj->nsi", matrices, camera.rays(points))).any(axis=1)
 
 
 def _edge_points(camera: Camera) -> Array:

@@ -1,5 +1,6 @@
 """The plan of given poses: one ground, a trajectory for each of the user's, the views that the ground is made for."""
 
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
@@ -8,6 +9,7 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.config_scene import HIGHEST_M, SceneConfig, ViewConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, seen_by
+from perilune_render.flight.pose_checks import ground_in_view
 from perilune_render.flight.rig import MountedCamera, Rig, rig_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import scene_view
@@ -15,6 +17,7 @@ from perilune_render.poses.file import GivenPoses
 from perilune_render.streams import derived_seed
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
@@ -26,6 +29,8 @@ _LOWER = 0.9
 """Ground may rise towards a camera by a tenth of its height: the share of the height that the views allow for."""
 _WIDER = 1.05
 _SPLIT = "test"
+_N_CHECKED = 1000
+"""Number of poses, evenly spread, whose attitudes are checked for another reading of the file."""
 
 
 def scene_seed(config: DatasetConfig) -> int:
@@ -93,6 +98,56 @@ def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tu
     return mounted.poses(poses.position_m, poses.rotation_wxyz)
 
 
+def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: bool) -> None:
+    """Refuse attitudes that leave the ground if other readings of the file show it in all frames, and name those.
+
+    Checks up to _N_CHECKED poses. Others that leave the ground are refused later.
+    """
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _N_CHECKED)).round().astype(int))
+    place = poses.position_m[chosen]
+    if poses.attitudes is None or (place[:, 2] <= 0).any():
+        return
+    stated = replace(poses.attitudes, quaternion_wxyz=poses.attitudes.quaternion_wxyz[chosen])
+    shown = _is_ground_shown(place, stated.rotation_wxyz, rig, horizon=horizon)
+    if shown.all():
+        return
+    single, double = stated.alternatives()
+    for readings in (single, [] if shown.any() else double):
+        fitting = [
+            what for what, other in readings if _is_ground_shown(place, other.rotation_wxyz, rig, horizon=horizon).all()
+        ]
+        if fitting:
+            n = int(chosen[np.argmin(shown)])
+            share = "all frames" if not shown.any() else f"{(~shown).mean():.0%} of the frames"
+            view, ground, sky = (
+                ("a view of the sky alone", "some ground in view", "")
+                if horizon
+                else ("a view with the horizon", "a view of the ground alone", "; or dataset.scene.horizon=true")
+            )
+            found = f"{view}, as in {share}"
+            expected = f"{ground}, as in all frames by {', or by '.join(fitting)}{sky}"
+            raise UserError(where, f"{poses.origin(n)}: pose at {poses.time_s[n]:g} s", found, expected)
+
+
+def _is_ground_shown(position_m: Array, rotation_wxyz: Array, rig: Rig, *, horizon: bool) -> np.ndarray:
+    """Whether each pose of the body (N,) shows nothing but ground in all cameras, or with `horizon` some ground."""
+    shown = np.ones(len(position_m), bool)
+    for name, mounted in rig.items():
+        seen = (position_m, rotation_wxyz) if name is None else mounted.poses(position_m, rotation_wxyz)
+        camera, matrices = mounted.exr_camera, matrix_from_quaternion(seen[1])
+        if horizon:
+            shown &= ground_in_view(seen[0], matrices, camera)
+        else:
+            shown &= (_corner_rays(camera, matrices)[..., 2] < 0).all(axis=1)
+    return shown
+
+
+def _corner_rays(camera: Camera, matrices: Array) -> Array:
+    """Rays (N, 4, 3), O_L, through the corners of the image; `matrices` are rotation_camera_from_site (N, 3, 3)."""
+    corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
+    return np.einsum("nji,sj->nsi", matrices, corners)
+
+
 def _reach(poses: GivenPoses, mounted: MountedCamera, name: str | None, where: object) -> tuple[Array, Array]:
     """Height of a camera and largest |x| or |y| of the ground that it sees, metres, (N,) each, for poses of the body.
 
@@ -101,8 +156,7 @@ def _reach(poses: GivenPoses, mounted: MountedCamera, name: str | None, where: o
     camera, (position, rotation) = mounted.exr_camera, _poses_of(poses, mounted, name)
     height = position[:, 2]
     _check_above(height, poses, where)
-    corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
-    rays = np.einsum("nji,sj->nsi", matrix_from_quaternion(rotation), corners)
+    rays = _corner_rays(camera, matrix_from_quaternion(rotation))
     _refuse(
         (rays[..., 2] > -0.01 * np.linalg.norm(rays, axis=-1)).any(axis=1),
         poses,
@@ -131,6 +185,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     """
     scene = config.scene or SceneConfig()
     rig = rig_of(config)
+    _check_attitudes(poses, rig, where, horizon=scene.horizon)
     views = scene.views or (horizon_views_of(poses, rig, where) if scene.horizon else views_of(poses, rig, where))
     scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
     suns, lit_by = _suns(poses, scene)

@@ -4,22 +4,24 @@ O_L is taken as a rigid frame fixed to the Moon: its origin is the site, its axe
 velocity and attitude are converted by the same rotation. Deviation: the rendered ground is a plane, and the Moon falls
 away from the plane by d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
 
-Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are read too.
+Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are checked
+before SPICE opens them, and read too.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+import signal
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from perilune_render.poses.axes import camera_axes
+from perilune_render.poses.kernels import library, loaded, reported
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, quaternion_from_matrix
 
@@ -27,9 +29,9 @@ _MOON = "MOON"
 _FIXED_FRAMES = ("MOON_ME", "IAU_MOON")
 """Frames fixed to the Moon in order of preference: the first that the kernels define is used."""
 _MOST_FRAMES = 100_000
-_AXES = {
-    sign + name: (-1 if sign == "-" else 1) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "+", "-")
-}
+_LOADING_LIMIT_S = 60.0
+"""Maximum time of opening all kernels: a file that was replaced by a pipe after its check would block for ever."""
+_LOADED = "loaded"
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,29 +98,62 @@ def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, s
     spiceypy is not installed, for an unreadable kernel, an unknown body or frame, a time without data, or a Sun below
     the plane.
     """
-    _library()
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        try:
-            return process.submit(_read, source, latitude_deg, longitude_deg, site_height_m).result()
-        except BrokenProcessPool:
-            names = ", ".join(path.name for path in source.kernels)
-            raise UserError("SPICE", "kernels", f"a crash while reading {names}", "undamaged kernels") from None
+    library()
+    context = get_context("spawn")
+    receiving, sending = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(sending, source, latitude_deg, longitude_deg, site_height_m))
+    process.start()
+    sending.close()
+    names = ", ".join(path.name for path in source.kernels)
+    try:
+        if not receiving.poll(_LOADING_LIMIT_S):
+            found = f"no end after {_LOADING_LIMIT_S:g} s of reading {names}"
+            raise UserError("SPICE", "kernels", found, "kernels that are local files")
+        result = receiving.recv()
+        if result == _LOADED:
+            result = receiving.recv()
+    except EOFError:
+        raise UserError("SPICE", "kernels", f"a crash while reading {names}", "undamaged kernels") from None
+    finally:
+        process.kill()
+        process.join()
+        receiving.close()
+    if isinstance(result, SpicePoses):
+        return result
+    raise result
 
 
-def _read(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_height_m: float) -> SpicePoses:
-    """See `read_spice`; in this process."""
-    spice = _library()
-    axes = camera_axes(source.camera_axes)
+def _send(sending: Connection, source: SpiceSource, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
+    """Send _LOADED, then the poses or the error; in a process of its own."""
+    # The parent ends this process after Ctrl-C.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        sending.send(_read(source, latitude_deg, longitude_deg, height_m, lambda: sending.send(_LOADED)))
+    except Exception as error:
+        sending.send(error)
+
+
+def _read(
+    source: SpiceSource,
+    latitude_deg: float,
+    longitude_deg: float,
+    site_height_m: float,
+    tell_loaded: Callable[[], None],
+) -> SpicePoses:
+    """See `read_spice`; in this process. Calls `tell_loaded` after all kernels are open."""
+    spice = library()
+    axes = camera_axes(source.camera_axes, "--camera-axes")
     site_from_fixed = rotation_site_from_fixed(latitude_deg, longitude_deg)
     site_km = (MOON_RADIUS_M + site_height_m) / 1000 * site_from_fixed[2]
-    with _loaded(spice, source.kernels):
+    with loaded(spice, source.kernels):
+        tell_loaded()
         times = _times(spice, source)
         fixed = _fixed_frame(spice, source.fixed_frame)
         _check_frame(spice, "--camera-frame", source.camera_frame)
         spacecraft = _body(spice, source.spacecraft)
         rows, turns = [], []
         for et in times:
-            with _reported(spice, f"at {_utc(spice, et)}"):
+            with reported(spice, f"at {_utc(spice, et)}"):
                 state = spice.spkezr(spacecraft, et, fixed, "NONE", _MOON)[0]
                 turned = axes @ spice.pxform(fixed, source.camera_frame, et) @ site_from_fixed.T
                 sun = spice.spkcpo("SUN", et, fixed, "OBSERVER", "LT+S", site_km, _MOON, fixed)[0][:3]
@@ -151,15 +186,6 @@ def _turn_radps(spice: Any, fixed: str, camera_frame: str, et: float, axes: Arra
     return axes @ rotation @ turn
 
 
-def camera_axes(text: str) -> Array:
-    """The rotation (3, 3) of `right,down,forward` axes, such as `x,y,z`, from a SPICE frame. Raises UserError."""
-    names = [name.strip().lower() for name in text.split(",")]
-    rows = np.array([_AXES[name] for name in names]) if all(name in _AXES for name in names) else np.zeros((1, 1))
-    if rows.shape != (3, 3) or round(float(np.linalg.det(rows))) != 1:
-        raise UserError("--camera-axes", "axes", text, "three axes of a right-handed frame, such as x,y,z or -y,x,z")
-    return rows
-
-
 def poses_csv(
     poses: SpicePoses, source: SpiceSource, latitude_deg: float, longitude_deg: float, height_m: float
 ) -> str:
@@ -183,53 +209,6 @@ def poses_csv(
     return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
 
 
-def _library() -> Any:
-    try:
-        import spiceypy
-    except ImportError:
-        raise UserError("spice", "spiceypy", "not installed", "pip install 'perilune-render[spice]'") from None
-    return spiceypy
-
-
-@contextlib.contextmanager
-def _loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
-    """Load kernels into an empty pool, and clear it at the end."""
-    spice.kclear()
-    try:
-        for path in kernels:
-            if not path.is_file():
-                raise UserError(path, "kernel", "no such file", "a SPICE kernel or meta-kernel")
-            with _reported(spice, str(path)):
-                spice.furnsh(str(path))
-        yield
-    finally:
-        spice.kclear()
-
-
-@contextlib.contextmanager
-def _reported(spice: Any, where: str) -> Iterator[None]:
-    """Turn an error of SPICE into a UserError with its text."""
-    try:
-        yield
-    except spice.exceptions.SpiceyError as error:
-        short, text = (" ".join(str(part).split()) for part in (error.short, error.long))
-        raise UserError(
-            f"SPICE: {where}", short or "error", text or error, _EXPECTED.get(short, "valid kernels")
-        ) from None
-
-
-_EXPECTED = {
-    "SPICE(SPKINSUFFDATA)": "kernels (SPK) that cover this time and body, and Moon and Sun",
-    "SPICE(NOFRAMECONNECT)": "kernels (FK, CK with SCLK, PCK) that cover this time and frame",
-    "SPICE(CKINSUFFDATA)": "kernels (CK) that cover this time",
-    "SPICE(FRAMEDATANOTFOUND)": "kernels (PCK, or CK) of this frame",
-    "SPICE(KERNELVARNOTFOUND)": "kernels (PCK, SCLK) with these values",
-    "SPICE(NOLEAPSECONDS)": "a kernel of leap seconds (LSK)",
-    "SPICE(NOSUCHFILE)": "a file that exists; paths in a meta-kernel are relative to the current folder",
-}
-"""What is needed, by SPICE's short message."""
-
-
 def _times(spice: Any, source: SpiceSource) -> Array:
     """Ephemeris times (N,), seconds past J2000 TDB, evenly spaced."""
     if (source.n_frames is None) == (source.step_s is None):
@@ -246,12 +225,12 @@ def _times(spice: Any, source: SpiceSource) -> Array:
 
 
 def _time(spice: Any, option: str, text: str) -> float:
-    with _reported(spice, option):
+    with reported(spice, option):
         return float(spice.str2et(text))
 
 
 def _utc(spice: Any, et: float) -> str:
-    with _reported(spice, "time"):
+    with reported(spice, "time"):
         return str(spice.et2utc(et, "ISOC", 6))
 
 

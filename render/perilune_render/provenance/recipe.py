@@ -53,6 +53,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for name in _OPTIONAL:
         if not plain[name]:
             del plain[name]
+    for camera in (plain["camera"], *plain.get("cameras", {}).values()):
+        if camera["focal_length_y_px"] is None:
+            del camera["focal_length_y_px"]
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:
             del plain["terrain"]["elevation"][name]

@@ -24,6 +24,7 @@ from perilune_shared.storage.store import Address
 _TUM_HEADER = (
     "# camera poses of one trajectory: centre of projection in O_L (X west, Y south, Z up), metres;\n"
     "# rotation_site_from_camera (camera: x right, y down, z forward); seconds since the first frame\n"
+    "# frame: O_L\n"
     "# timestamp tx ty tz qx qy qz qw\n"
 )
 

@@ -1,6 +1,8 @@
 """Poses and Sun from SPICE kernels, against the truth by hand, and frames rendered from them."""
 
+import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +23,10 @@ from tests.render.poses.spice_kernels import (
 )
 
 from perilune_render.cli.main import main
+from perilune_render.poses import spice as spice_module
+from perilune_render.poses.axes import camera_axes
 from perilune_render.poses.file import read_poses
-from perilune_render.poses.spice import camera_axes
+from perilune_render.poses.spice import SpiceSource
 from perilune_render.sub_poses import moved
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
@@ -121,7 +125,7 @@ def test_steps_axes_and_frames_of_fixed_orientation(folder, tmp_path):
     assert np.allclose(matrix_from_quaternion(turned.rotation_wxyz[0]), [[0, 1, 0], [1, 0, 0], [0, 0, -1]], atol=1e-9)
     for wrong in ("x,y,-z", "x,y", "x,x,z", "a,b,c", ""):
         with pytest.raises(UserError, match="three axes of a right-handed frame"):
-            camera_axes(wrong)
+            camera_axes(wrong, "--camera-axes")
 
 
 def test_frames_are_rendered_from_kernels(folder, tmp_path):
@@ -175,9 +179,78 @@ def test_missing_attitude_and_time_kernels_are_named(folder, tmp_path):
     assert done.returncode == 2 and "SPICE(NOFRAMECONNECT)" in done.stderr and "CK" in done.stderr
     done = spice(folder, tmp_path / "poses.csv", kernels=folder / "a.bsp")
     assert done.returncode == 2 and "expected a kernel of leap seconds (LSK)" in done.stderr
-    (tmp_path / "bad.tm").write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '/none/a.bsp' )\n")
-    done = spice(folder, tmp_path / "poses.csv", kernels=tmp_path / "bad.tm")
-    assert done.returncode == 2 and "SPICE(NOSUCHFILE)" in done.stderr
+
+
+def meta_kernel(path, *names, more=""):
+    listed = ", ".join(f"'{name}'" for name in names)
+    path.write_text(f"KPL/MK\n\\begindata\n{more}KERNELS_TO_LOAD = ( {listed} )\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("none.bsp", "none.bsp: no such file"),
+        ("pipe.bsp", "pipe.bsp: a pipe or a device"),
+        ("/dev/zero", "/dev/zero: a pipe or a device"),
+        ("linked", "linked: a pipe or a device"),
+        ("", "a quoted string with no characters"),
+        (".", ".: a folder"),
+        ("other.tm", "KERNELS_TO_LOAD: got the meta-kernel other.tm, expected a kernel that names no others"),
+        ("http://localhost/a.bsp", "http:/localhost/a.bsp: no such file"),
+    ],
+)
+def test_every_file_of_a_meta_kernel_is_checked_before_it_is_opened(folder, tmp_path, monkeypatch, name, message):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe.bsp")
+    Path("linked").symlink_to("/dev/random")
+    meta_kernel(Path("other.tm"), "pipe.bsp")
+    path = meta_kernel(tmp_path / "all.tm", folder / "a.tls", name)
+    done = spice(folder, tmp_path / "poses.csv", kernels=path)
+    (line,) = done.stderr.strip().splitlines()
+    assert done.returncode == 2 and message in line and "all.tm" in line
+    assert not (tmp_path / "poses.csv").exists()
+
+
+def test_a_pipe_as_kernel_and_a_file_without_content_are_refused(folder, tmp_path):
+    os.mkfifo(tmp_path / "pipe.tm")
+    (tmp_path / "empty.tm").write_bytes(b"")
+    for name, message in (("pipe.tm", "a pipe or a device"), ("empty.tm", "SPICE")):
+        done = spice(folder, tmp_path / "poses.csv", kernels=tmp_path / name)
+        assert done.returncode == 2 and message in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_symbols_of_paths_and_continued_paths_name_the_files_that_are_loaded(folder, tmp_path, monkeypatch):
+    """AB is not A with a B behind; a path goes on in the next text after a +."""
+    monkeypatch.chdir(tmp_path)
+    assert spice(folder, tmp_path / "plain.csv").returncode == 0
+    names = [f"$AB/{name}" for name in ("a.tls", "a.tpc", "a.tf", "a.tsc", "a.bsp")]
+    more = f"PATH_VALUES = ( '/none', '{folder}' )\nPATH_SYMBOLS = ( 'A', 'AB' )\n"
+    path = meta_kernel(tmp_path / "all.tm", *names, "$AB/+", "a.bc", more=more)
+    done = spice(folder, tmp_path / "poses.csv", kernels=path)
+    assert done.returncode == 0, done.stderr
+    plain, given = (read_poses(tmp_path / name, LATITUDE, LONGITUDE) for name in ("plain.csv", "poses.csv"))
+    assert plain.sha256 == given.sha256
+    meta_kernel(path, *names, more="PATH_VALUES = ( '/none' )\nPATH_SYMBOLS = ( 'A', 'AB' )\n")
+    done = spice(folder, tmp_path / "b.csv", kernels=path)
+    assert done.returncode == 2 and "1 values for 2 symbols" in done.stderr
+
+
+def test_a_kernel_that_becomes_a_pipe_after_its_check_ends_at_the_limit_of_time(folder, tmp_path, monkeypatch):
+    """SPICE waits for a writer of the pipe; the process is ended."""
+    os.mkfifo(tmp_path / "pipe.tls")
+    source = SpiceSource(
+        (tmp_path / "pipe.tls",), "-99", "TEST_CAM", "x,y,z", None, "2017-01-01", "2017-01-02", 2, None
+    )
+    monkeypatch.setattr(spice_module, "_LOADING_LIMIT_S", 3.0)
+    monkeypatch.setattr(spice_module, "_send", unchecked)
+    with pytest.raises(UserError, match=r"got no end after 3 s of reading pipe.tls"):
+        spice_module.read_spice(source, LATITUDE, LONGITUDE, HEIGHT_M)
+
+
+def unchecked(sending, source, *site):
+    """Load a kernel without a check, as after a change of the file."""
+    spiceypy.furnsh(str(source.kernels[0]))
 
 
 def test_a_sun_below_the_horizon_is_refused(tmp_path):

@@ -27,7 +27,7 @@ class TableLimits:
 
 
 CATALOGUE = TableLimits("crater catalogue", 5_000_000, 2 * 10**9)
-POSES = TableLimits("poses", 5_000_000, 2 * 10**9)
+POSES = TableLimits("poses", 1_000_000, 500_000_000)
 INERTIAL = TableLimits("inertial measurements", 20_000_000, 4 * 10**9)
 RANGES = TableLimits("ranges", 20_000_000, 4 * 10**9)
 FRAMES = TableLimits("frames", 1_000_000, 500_000_000)

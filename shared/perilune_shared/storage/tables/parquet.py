@@ -74,6 +74,9 @@ class ParquetTable:
         """Number of rows."""
         return self._file.metadata.num_rows
 
+    def peek(self) -> None:
+        """Return None: a Parquet file has a header. For text, return the next row."""
+
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
         """Read those of these columns that the table has. Raises UserError on a column of another type."""
         check_present(self.path, self.names, required)

@@ -61,6 +61,13 @@ class TextTable:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._stream.close()
 
+    def peek(self) -> Row | None:
+        """Return the next row without taking it; None at the end."""
+        first = next(self._rows, None)
+        if first is not None:
+            self._rows = itertools.chain([first], self._rows)
+        return first
+
     def rows(self) -> Iterator[Row]:
         """Yield the rows that have not been read yet, each with as many values as the table has names.
 

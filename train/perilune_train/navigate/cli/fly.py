@@ -34,13 +34,18 @@ def fly(
         raise UserError("--live", "name", live, "a name that ends in .png")
     run = run or shipped_run("detect")
     # torch takes seconds to load.
-    from perilune_train.navigate.fly.run import fly_descent, read_descent
+    from perilune_train.navigate.fly.run import doubts_of, fly_descent, read_descent
 
     descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
+    for doubt in doubts_of(descent):
+        say(f"warning: {imu}: {doubt}")
     table = fly_descent(descent, run, out, answer_page, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
+    if (table["status"] == "lost").any():
+        for doubt in doubts_of(descent, is_lost=True):
+            say(f"a possible cause of the status lost: {imu}: {doubt}")
     if "error_x_m" in table:
         length = (table[[f"error_{axis}_m" for axis in "xyz"]] ** 2).sum(axis=1)
         rms, end = length.mean() ** 0.5, length.iloc[-1] ** 0.5

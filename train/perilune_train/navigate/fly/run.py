@@ -25,12 +25,14 @@ from perilune_train.navigate.craters.sightings import Sightings
 from perilune_train.navigate.filter.flight import Estimate, Instruments, fly
 from perilune_train.navigate.filter.lander import Lander, Surroundings
 from perilune_train.navigate.filter.propagate import InertialNoise
-from perilune_train.navigate.filter.state import ATTITUDE, POSITION
+from perilune_train.navigate.filter.state import ATTITUDE, POSITION, State
 from perilune_train.navigate.fly.catalogue import read_catalogue
+from perilune_train.navigate.fly.clocks import check_clocks
 from perilune_train.navigate.fly.picture import draw_flight
 from perilune_train.navigate.fly.settings import FlightPrior, read_camera, read_prior
 from perilune_train.navigate.fly.tables import FrameFiles, read_frame_files, read_instruments
 from perilune_train.navigate.fly.truth import Truth, read_truth, with_errors_of
+from perilune_train.navigate.fly.units import Prior, doubts
 from perilune_train.training.runs import RunFolder
 
 ESTIMATES, PICTURE = "estimates", "flight.png"
@@ -62,8 +64,10 @@ def read_descent(
     record, expected = read_camera(camera), read_prior(prior)
     craters = read_catalogue(catalogue, expected.catalogue_use)
     files = read_frame_files(frames, record.intrinsics())
-    true = read_truth(truth, files.time_s) if truth else None
-    return Descent(record, expected, files, read_instruments(imu, ranges), craters, true)
+    true = read_truth(truth, files.time_s, np.array(record.rotation_camera_from_body)) if truth else None
+    instruments = read_instruments(imu, ranges)
+    check_clocks(frames, files.time_s, imu, ranges, instruments)
+    return Descent(record, expected, files, instruments, craters, true)
 
 
 def fly_descent(
@@ -93,9 +97,23 @@ def fly_descent(
     return table
 
 
+def doubts_of(descent: Descent, *, is_lost: bool = False) -> list[str]:
+    """Reasons to doubt the units of the inertial measurements; more of them after a flight that lost its position."""
+    mounting, expected = np.array(descent.camera.rotation_camera_from_body), descent.prior
+    sigmas = expected.position_sigma_m, expected.velocity_sigma_mps
+    prior = Prior(_start(descent), *sigmas, mounting[2], float(descent.frames.time_s[-1]))
+    return doubts(descent.instruments.inertial, prior, is_lost=is_lost)
+
+
+def _start(descent: Descent) -> State:
+    """The expected state at the first frame."""
+    mounting = np.array(descent.camera.rotation_camera_from_body)
+    return replace(descent.prior.state(mounting), time_s=float(descent.frames.time_s[0]))
+
+
 def _lander(descent: Descent) -> Lander:
     mounting, prior = np.array(descent.camera.rotation_camera_from_body), descent.prior
-    state = replace(prior.state(mounting), time_s=float(descent.frames.time_s[0]))
+    state = _start(descent)
     camera = descent.camera.intrinsics().covering_pinhole()
     around = Surroundings(camera, mounting, descent.catalogue, prior.range_sigma_m, prior.relief_m)
     return Lander(state, InertialNoise.of(prior.unit), around)

@@ -1,6 +1,7 @@
 """camera.yaml and prior.yaml of a descent: what is known before the flight. Both are untrusted input."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -11,6 +12,7 @@ from perilune_shared.config import Section
 from perilune_shared.config_errors import user_error_of
 from perilune_shared.dataset.metadata import CameraRecord
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.calibration import Calibration, read_camera_file
 from perilune_shared.geometry.camera import NO_DISTORTION, ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.inertial_grades import GRADES, InertialErrors, InertialGrade
@@ -121,19 +123,33 @@ class FlightPrior(Section):
 
 
 def read_camera(path: Path) -> CameraRecord:
-    """camera.yaml: the fields of `camera` in dataset.json; distortion and mounting may be absent.
+    """camera.yaml: the fields of `camera` in dataset.json, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
 
-    Raises UserError on a missing file, a wrong value, or a camera that is not at the body's origin.
+    Distortion and mounting may be absent. Raises UserError on a missing file, a wrong value, or a camera that is not at
+    the body's origin.
     """
-    content = _read_yaml(path, "camera")
+    content = read_camera_file(path)
+    if isinstance(content, Calibration):
+        rotation, content = content.rotation_camera_from_body, _fields_of(content)
+        if rotation is not None:
+            # Calibrations have few digits.
+            u, _, v = np.linalg.svd(rotation)
+            content["rotation_camera_from_body"] = (
+                u @ v if np.abs(u @ v - rotation).max() < 1e-3 else rotation
+            ).tolist()
     rows = ROTATION_CAMERA_FROM_BODY.tolist()
     defaults = {"distortion": NO_DISTORTION, "rotation_camera_from_body": rows, "position_in_body_m": [0.0, 0.0, 0.0]}
     camera = _validated(CameraRecord, defaults | content, path, "camera")
     if any(camera.position_in_body_m):
-        raise UserError(path, "camera.position_in_body_m", list(camera.position_in_body_m), "[0, 0, 0]")
+        expected = "[0, 0, 0]: the filter takes the camera to be at the inertial unit; remove a negligible distance"
+        raise UserError(path, "camera.position_in_body_m", list(camera.position_in_body_m), expected)
     if camera.intrinsics().folds_back():
         raise UserError(path, "camera.distortion", list(camera.distortion), "a distortion that does not fold back")
     return camera
+
+
+def _fields_of(calibration: Calibration) -> dict[str, Any]:
+    return asdict(calibration.camera) | {"position_in_body_m": list(calibration.position_in_body_m)}
 
 
 def read_prior(path: Path) -> FlightPrior:

@@ -1,0 +1,238 @@
+"""Read a camera from a YAML file: perilune's own settings, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
+
+These programs put the centre of the top-left pixel at (0, 0), perilune puts it at (0.5, 0.5): half a pixel is added to
+the principal point. Distortion is Brown-Conrady's (`plumb_bob`, `radtan`). The equidistant model (Kannala and Brandt
+2006, doi 10.1109/TPAMI.2006.153) is replaced by the Brown-Conrady distortion that fits best, if it fits within 0.05 px.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import NO_DISTORTION, Camera, Distortion
+from perilune_shared.geometry.frames import Array
+from perilune_shared.yaml_text import parse_yaml
+
+_LARGEST_FILE_BYTES = 100_000
+_MATRIX = ("camera_matrix", "k", "cameramatrix", "intrinsic_matrix", "m1", "mtx")
+_COEFFICIENTS = ("distortion_coefficients", "distortion_coeffs", "d", "dist_coeffs", "distcoeffs", "d1", "dist")
+_WIDTH, _HEIGHT = ("image_width", "width"), ("image_height", "height")
+_SIZE = ("resolution", "image_size", "imagesize")
+_BROWN = ("plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "brown_conrady", "none")
+_EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
+_LARGEST_SIDE_PX = 100_000
+_LARGEST_FIT_PX = 0.05
+"""Largest error of a Brown-Conrady distortion that replaces an equidistant one."""
+_WIDEST_RAD = np.radians(80)
+_HALF_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A camera from another program's file."""
+
+    camera: Camera
+    """Intrinsics."""
+    rotation_camera_from_body: Array | None
+    """Rotation (3, 3) from the inertial unit's axes; None if the file has none."""
+    position_in_body_m: tuple[float, float, float]
+    """Centre of projection in the inertial unit's frame, metres; 0 if the file has none."""
+
+
+def read_camera_file(path: Path) -> Calibration | dict[str, Any]:
+    """The calibration in a file, or the mapping of a file with perilune's own settings. Raises UserError."""
+    content = _mapping(path)
+    keys = {key.lower(): key for key in content}
+    cameras = [key for key in content if re.fullmatch(r"cam\d+", key)]
+    if len(cameras) > 1:
+        raise UserError(path, "camera", f"several of Kalibr: {', '.join(cameras)}", "a file with one of these sections")
+    if cameras:
+        section = content[cameras[0]]
+        if not isinstance(section, dict):
+            raise UserError(path, cameras[0], type(section).__name__, "a mapping")
+        return _kalibr(path, section)
+    if any(re.match(r"camera\d?\.(fx|type|name)", key) for key in keys):
+        raise UserError(path, "camera", "settings of ORB-SLAM", "a calibration of OpenCV, ROS or Kalibr, or fx_px ...")
+    if "intrinsics" in keys and not isinstance(content[keys["intrinsics"]], dict):
+        return _kalibr(path, content)
+    if any(name in keys for name in _MATRIX):
+        return _opencv(path, {key.lower(): value for key, value in content.items()})
+    return content
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise UserError(path, "camera", "a folder" if path.is_dir() else "no such file", "a YAML file")
+    if path.stat().st_size > _LARGEST_FILE_BYTES:
+        expected = f"at most {_LARGEST_FILE_BYTES}; keep intrinsics and distortion alone"
+        raise UserError(path, "camera", f"{path.stat().st_size} bytes", expected)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise UserError(path, "camera", "bytes that are not UTF-8", "a YAML file") from None
+    if text.lstrip().startswith("<"):
+        raise UserError(path, "camera", "XML, as of OpenCV", "YAML: give cv::FileStorage a name that ends in .yaml")
+    if "CAMERA_ID" in text and text.lstrip().startswith("#"):
+        raise UserError(path, "camera", "COLMAP's cameras.txt", "a calibration of OpenCV, ROS or Kalibr, or fx_px ...")
+    content = parse_yaml(_plain(text), path)
+    if not isinstance(content, dict):
+        raise UserError(path, "camera", type(content).__name__, "a mapping with the settings of a camera")
+    return content
+
+
+def _plain(text: str) -> str:
+    """The text of a YAML file without OpenCV's directive and tags, and without marks of its start and end."""
+    lines = text.replace("!!opencv-matrix", "").splitlines()
+    while lines and (not lines[0].strip() or re.match(r"%YAML|---\s*$", lines[0])):
+        del lines[0]
+    while lines and (not lines[-1].strip() or re.match(r"(---|\.\.\.)\s*$", lines[-1])):
+        del lines[-1]
+    return "\n".join(lines)
+
+
+def _kalibr(path: Path, content: dict[str, Any]) -> Calibration:
+    """A camera of Kalibr's camchain, or of EuRoC's sensor.yaml."""
+    model = str(content.get("camera_model", "pinhole"))
+    if model != "pinhole":
+        raise UserError(path, "camera_model", model, "pinhole")
+    fx, fy, cx, cy = _numbers(path, "intrinsics", content.get("intrinsics"), (4,))
+    size = _numbers(path, "resolution", content.get("resolution"), (2,))
+    name = "distortion_coeffs" if "distortion_coeffs" in content else "distortion_coefficients"
+    coefficients = _numbers(path, name, content.get(name, []), (0, 4, 5, 8))
+    stated = str(content.get("distortion_model", "none" if not any(coefficients) else ""))
+    camera = _camera(path, size, (fx, fy, cx, cy), stated, coefficients)
+    rotation, place = None, np.zeros(3)
+    for name, is_inverse in (("T_cam_imu", False), ("T_BS", True)):
+        if content.get(name) is not None:
+            matrix = _numbers(path, name, content[name], (16,))
+            pose = np.array(matrix).reshape(4, 4)
+            rotation = pose[:3, :3].T if is_inverse else pose[:3, :3]
+            place = pose[:3, 3] if is_inverse else -pose[:3, :3].T @ pose[:3, 3]
+    x, y, z = place.tolist()
+    return Calibration(camera, rotation, (x, y, z))
+
+
+def _opencv(path: Path, content: dict[str, Any]) -> Calibration:
+    """A camera of OpenCV's FileStorage, of ROS's camera_calibration, or a message camera_info; keys in lower case."""
+    name = next(name for name in _MATRIX if name in content)
+    fx, skew, cx, zero, fy, cy, *last = _numbers(path, name, content[name], (9,))
+    if skew or zero or last != [0, 0, 1]:
+        raise UserError(path, name, f"{[fx, skew, cx, zero, fy, cy, *last]}", "fx, 0, cx, 0, fy, cy, 0, 0, 1")
+    size = next((content[key] for key in _SIZE if key in content), None)
+    if size is None:
+        size = [next((content[key] for key in keys if key in content), None) for keys in (_WIDTH, _HEIGHT)]
+        if None in size:
+            missing = "image_width" if size[0] is None else "image_height"
+            raise UserError(path, missing, "nothing", "the size of the image, image_width and image_height")
+    coefficients = _coefficients(path, content)
+    stated = str(content.get("distortion_model", ""))
+    if content.get("fisheye_model") == 1:
+        stated = stated or "equidistant"
+    region = content.get("roi")
+    changes = [content.get("binning_x"), content.get("binning_y")]
+    if any(value not in (None, 0, 1) for value in changes):
+        raise UserError(path, "binning_x", changes[0], "0 or 1: the camera of the whole image")
+    if isinstance(region, dict) and any(region.get(key) for key in ("x_offset", "y_offset", "width", "height")):
+        raise UserError(path, "roi", region, "zeros: the camera of the whole image")
+    pair = _numbers(path, "image size", size, (2,))
+    return Calibration(_camera(path, pair, (fx, fy, cx, cy), stated, coefficients), None, (0.0, 0.0, 0.0))
+
+
+def _coefficients(path: Path, content: dict[str, Any]) -> list[float]:
+    name = next((name for name in _COEFFICIENTS if name in content), None)
+    return [] if name is None else _numbers(path, name, content[name], (0, 4, 5, 8, 12, 14))
+
+
+def _camera(
+    path: Path, size: Sequence[float], intrinsics: Sequence[float], model: str, coefficients: list[float]
+) -> Camera:
+    """The camera of a pinhole with a distortion model by name; without one by the number of coefficients."""
+    width, height = (int(value) for value in size)
+    if [width, height] != list(size) or not 1 <= min(size) <= max(size) <= _LARGEST_SIDE_PX:
+        raise UserError(path, "image size", list(size), f"two whole numbers from 1 to {_LARGEST_SIDE_PX}")
+    fx, fy, cx, cy = intrinsics
+    if min(fx, fy) <= 0:
+        raise UserError(path, "focal length", min(fx, fy), "above 0, pixels")
+    pinhole = Camera(width, height, fx, fy, cx + _HALF_PX, cy + _HALF_PX)
+    if not model and len(coefficients) == 4 and any(coefficients):
+        expected = "distortion_model: plumb_bob or equidistant; both may have four"
+        raise UserError(path, "distortion_model", "nothing, with four coefficients", expected)
+    name = model.strip().lower() or _BROWN[0]
+    if name in _EQUIDISTANT:
+        return _fitted(path, pinhole, coefficients or [0.0] * 4)
+    if name not in _BROWN:
+        raise UserError(path, "distortion_model", model, f"one of {', '.join((*_BROWN, *_EQUIDISTANT))}")
+    if any(coefficients[5:]):
+        found = f"coefficients beyond k3 ({', '.join(f'{value:g}' for value in coefficients[5:])})"
+        raise UserError(path, f"distortion_model {name}", found, "k1, k2, p1, p2, k3 alone; calibrate without others")
+    return Camera(*_fields(pinhole), distortion=_five(coefficients) if name != "none" else NO_DISTORTION)
+
+
+def _five(coefficients: Sequence[float]) -> Distortion:
+    k1, k2, p1, p2, k3 = (*coefficients[:5], *[0.0] * (5 - len(coefficients[:5])))
+    return k1, k2, p1, p2, k3
+
+
+def _fields(camera: Camera) -> tuple[int, int, float, float, float, float]:
+    return camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+
+
+def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camera:
+    """The camera with the Brown-Conrady distortion nearest to an equidistant one. Raises UserError if none is near."""
+    field = "distortion_model equidistant"
+    if len(coefficients) != 4:
+        raise UserError(path, field, f"{len(coefficients)} coefficients", "4")
+    angle = np.linspace(0, _WIDEST_RAD, 4001)
+    square = angle**2
+    factor = np.ones_like(angle)
+    for power, each in enumerate(coefficients, 1):
+        factor = factor + each * square**power
+    distorted = angle * factor
+    far = pinhole.rays(pinhole.outline())[:, :2]
+    largest = float(np.hypot(*far.T).max())
+    inside = int(np.argmax(distorted >= largest)) if (distorted >= largest).any() else 0
+    if not inside or (np.diff(distorted[: inside + 1]) <= 0).any():
+        expected = "a view of at most 80 degrees from the axis, without a fold"
+        raise UserError(path, field, f"an image whose edge is {largest:.3g} focal lengths from the centre", expected)
+    radius, target = np.tan(angle[1 : inside + 1]), distorted[1 : inside + 1]
+    powers = np.stack([radius**3, radius**5, radius**7], axis=1)
+    weight = np.ones_like(radius)
+    # Raise the weights of large errors until the largest is least (Lawson's algorithm).
+    for _ in range(60):
+        fit = np.linalg.lstsq(powers * weight[:, None], (target - radius) * weight, rcond=None)[0]
+        error = np.abs(powers @ fit - (target - radius))
+        weight = np.sqrt(weight**2 * (error + 1e-12))
+        weight = weight / weight.mean()
+    worst_px = float(error.max()) * max(pinhole.fx_px, pinhole.fy_px)
+    if not worst_px <= _LARGEST_FIT_PX:
+        found = f"a view of {np.degrees(angle[inside]):.0f} degrees from the axis, {worst_px:.2g} px off the nearest"
+        raise UserError(
+            path, field, found, f"one within {_LARGEST_FIT_PX} px of radial-tangential: undistort the images"
+        )
+    k1, k2, k3 = fit.tolist()
+    return Camera(*_fields(pinhole), distortion=(k1, k2, 0.0, 0.0, k3))
+
+
+def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:
+    """Finite numbers from a list, a list of lists, or a mapping with `data`. Raises UserError."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    flat: list[object] = []
+    for each in value if isinstance(value, list) else [value]:
+        flat += each if isinstance(each, list) else [each]
+    are_numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for each in flat)
+    if value is None or not are_numbers or len(flat) not in lengths:
+        found = "nothing" if value is None else f"{len(flat)} values" if are_numbers else value
+        raise UserError(path, field, found, f"{' or '.join(str(length) for length in lengths)} numbers")
+    try:
+        numbers = [float(each) for each in flat]  # type: ignore[arg-type]
+    except OverflowError:
+        numbers = [np.inf]
+    if not np.isfinite(numbers).all():
+        raise UserError(path, field, flat, "finite numbers")
+    return numbers
