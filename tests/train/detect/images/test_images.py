@@ -225,7 +225,7 @@ def test_pictures_that_are_damaged_or_none(tmp_path):
     with pytest.raises(UserError, match=r"cut\.png: image"):
         read_grey(cut)
     (tmp_path / "text.tif").write_text("<VRTDataset/>")
-    with pytest.raises(UserError, match="cannot be decoded"):
+    with pytest.raises(UserError, match="XML text, which can refer to other files"):
         read_grey(tmp_path / "text.tif")
     with pytest.raises(UserError, match="no such file"):
         read_grey(tmp_path / "absent.png")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
-from perilune_train.detect.images.read import SUFFIXES, picture_size
+from perilune_train.detect.images.read import SUFFIXES, picture_size, stored_size
 
 Array = NDArray[np.float64]
 _COLUMNS = ("X", "Y", "W", "H")
@@ -164,9 +164,7 @@ def _read_coco(path: Path) -> ImageSet:
         size = picture_size(picture)
         stated = image.get("width", size[0]), image.get("height", size[1])
         if stated != size:
-            raise UserError(
-                picture, "size", f"{size[0]} x {size[1]}", f"{stated[0]} x {stated[1]}, as stated in {path.name}"
-            )
+            raise _other_size(picture, size, stated, path)
         own = np.array(boxes[k], np.float64).reshape(-1, 4)
         result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(not_ignored[k], bool)))
     if n_empty:
@@ -174,6 +172,13 @@ def _read_coco(path: Path) -> ImageSet:
     if chosen:
         console.print(f"{path.name}: {chosen}", markup=False)
     return ImageSet(result, clipped=True, categories=chosen)
+
+
+def _other_size(picture: Path, size: tuple[int, int], stated: tuple[int, int], labels: Path) -> UserError:
+    expected = f"{stated[0]} x {stated[1]}, as stated in {labels.name}"
+    if stated == size[::-1] == stored_size(picture):
+        expected += "; the picture's EXIF orientation turns it, and labels must be those of the upright picture"
+    return UserError(picture, "size", f"{size[0]} x {size[1]}", expected)
 
 
 def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
