@@ -166,7 +166,7 @@ def test_coco_boxes_without_an_area_are_left_out_and_told(tmp_path, capsys):
     path = coco(tmp_path, annotations=[{"image_id": 7, "category_id": 1, "bbox": [2, 3, *size]} for size in sizes])
     (image,) = read_images(path).images
     assert image.boxes.tolist() == [[2, 3, 11, 13]] and image.not_ignored.tolist() == [True]
-    assert "annotations.json: 3 boxes without width or height are left out" in capsys.readouterr().err
+    assert "annotations.json: 3 boxes without width or height in the picture are left out" in capsys.readouterr().err
 
 
 def test_coco_as_roboflow_exports_it(tmp_path, capsys):

@@ -102,7 +102,8 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
     centre, half = (image.boxes[:, :2] + image.boxes[:, 2:]) / 2, (image.boxes[:, 2:] - image.boxes[:, :2]) / 2
     ellipses = np.column_stack([centre, half, np.zeros(len(half))])
     every = np.ones(len(half), bool)
-    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.selected(min_size_px), every)
+    selected = image.selected(min_size_px)
+    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, selected, every, crowd=image.crowd)
 
 
 def evaluate_detections_in_images(
