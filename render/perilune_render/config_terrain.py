@@ -75,6 +75,39 @@ SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "sit
 """Settings of the site in an elevation model: one pair of them, or none."""
 
 
+Rims = Literal["catalogue", "measured"]
+
+
+class CatalogueColumnsConfig(Section):
+    """Columns of a crater catalogue; null for all of them recognises the columns of known catalogues."""
+
+    longitude_deg: str | None = None
+    """Column of the longitude, east positive, degrees."""
+    latitude_deg: str | None = None
+    """Column of the latitude, degrees."""
+    diameter_m: str | None = None
+    """Column of the diameter, metres; one size is stated."""
+    diameter_km: str | None = None
+    """Column of the diameter, kilometres."""
+    radius_m: str | None = None
+    """Column of the radius, metres."""
+    radius_km: str | None = None
+    """Column of the radius, kilometres."""
+
+    @model_validator(mode="after")
+    def _places_and_one_size(self) -> "CatalogueColumnsConfig":
+        sizes = [name for name in self.stated if not name.endswith("_deg")]
+        if self.stated and (len(self.stated) != 3 or len(sizes) != 1):
+            raise ValueError("longitude_deg, latitude_deg and one of diameter_m, diameter_km, radius_m, radius_km")
+        return self
+
+    @property
+    def stated(self) -> dict[str, str]:
+        """The columns that are stated, by what they contain."""
+        values = {name: getattr(self, name) for name in CatalogueColumnsConfig.model_fields}
+        return {name: value for name, value in values.items() if value is not None}
+
+
 class ElevationConfig(Section):
     """Use of an elevation model."""
 
@@ -88,6 +121,8 @@ class ElevationConfig(Section):
     """Column of the landing site, in place of latitude and longitude, pixels from the left edge of the model."""
     site_row_px: NotNegative | None = None
     """Row of the landing site, pixels from the top edge of the model."""
+    catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
+    """Columns of the catalogue."""
 
     @model_validator(mode="after")
     def _one_pair(self) -> "ElevationConfig":
@@ -136,4 +171,4 @@ class TerrainConfig(Section):
     elevation: ElevationConfig = ElevationConfig()
     """Use of the elevation model."""
     catalogue: str | None = None
-    """CSV of the model's craters (longitude_deg, latitude_deg, diameter_m), which become labels, or null."""
+    """CSV or Parquet catalogue of the model's craters, which become labels, or null."""

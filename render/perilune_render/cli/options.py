@@ -31,7 +31,7 @@ Dem = Annotated[
 ]
 Catalogue = Annotated[
     Path | None,
-    typer.Option(help="CSV of the elevation model's own craters (longitude_deg, latitude_deg, diameter_m)."),
+    typer.Option(help="Catalogue of the elevation model's own craters, CSV or Parquet."),
 ]
 
 

@@ -41,8 +41,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, and a site in an
-    elevation model if there is none.
+    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, a site in an
+    elevation model if there is none, and columns of a catalogue if none are stated.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -56,6 +56,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:
             del plain["terrain"]["elevation"][name]
+    if not config.terrain.elevation.catalogue_columns.stated:
+        del plain["terrain"]["elevation"]["catalogue_columns"]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
     for name in _SINCE:

@@ -14,8 +14,8 @@ from perilune_render.terrain.craters.population import Craters, draw_craters
 from perilune_render.terrain.craters.removal import indices_of, near
 from perilune_render.terrain.craters.rims import Rims, measure_rims
 from perilune_render.terrain.craters.stamp import Stamped, stamp_craters
-from perilune_render.terrain.elevation.catalogue import read_catalogue
-from perilune_render.terrain.elevation.model import ElevationModel, read_elevation, refuse_beyond, remarks, resolved_m
+from perilune_render.terrain.elevation.catalogue import read_catalogue, remark
+from perilune_render.terrain.elevation.model import ElevationModel, read_elevation, refuse_beyond, remarks
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
@@ -97,7 +97,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     craters, sag = drawn.chosen(visible), stamped.sag_m[visible]
     n_real = 0
     if model is not None and terrain.catalogue is not None:
-        real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters, resolved_m(model))
+        real = read_catalogue(Path(terrain.catalogue), model, grid, terrain).craters
         craters, sag, n_real = real.joined(craters), np.concatenate([np.zeros(len(real)), sag]), len(real)
     removed = indices_of(wanted, n_real, len(craters), seed)
     raised_m = 0.0
@@ -174,7 +174,8 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
         for line in remarks(model, grid, config.terrain.elevation.outside):
             say(line, style="yellow")
         if config.terrain.catalogue is not None:
-            read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
+            path = Path(config.terrain.catalogue)
+            say(remark(path, read_catalogue(path, model, grid, config.terrain)), style="yellow")
 
 
 def site_of(config: DatasetConfig) -> tuple[float, float]:

@@ -1,35 +1,53 @@
 """Check the sizes in the footer of a Parquet file, before anything is decompressed. The footer is untrusted."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from perilune_shared.errors import UserError
 
-_MAX_ROWS = 50_000_000
-_MAX_GROUP_ROWS = 2**21
 _MAX_BYTES = 8 * 2**30
-# Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.
-_SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
+"""Bound on compression: no data compresses by a larger factor."""
 _NESTED_ROWS = "labels."
 """Start of the columns of a shard that contain rows of another table, any number for each frame."""
 
 
-def check_footer(footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, address: str) -> None:
+@dataclass(frozen=True, slots=True)
+class FooterLimits:
+    """Limits on the number of rows; the defaults are for the tables of a dataset."""
+
+    rows: int = 50_000_000
+    """Maximum number of rows of a file."""
+    group_rows: int = 2**21
+    """Maximum number of rows of a row group."""
+    spare_rows: int = 10_000
+    """Rows that a file of any size may have."""
+    bytes_per_row: int = 4
+    """Bytes that each other row takes at least, compressed."""
+
+
+_OF_DATASET = FooterLimits()
+
+
+def check_footer(
+    footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, address: str, limits: FooterLimits = _OF_DATASET
+) -> None:
     """Check the numbers of rows and values, and the bytes after decompression, of a file of `n_bytes` bytes.
 
     `footer` is pyarrow's metadata of the file, `columns` has place and path of each column that will be read. Raises
     UserError about `address` if a number exceeds its limit, ValueError if a row group has other columns than the file.
     """
-    most_rows = min(_MAX_ROWS, _SPARE_ROWS + n_bytes // _BYTES_PER_ROW)
+    most_rows = min(limits.rows, limits.spare_rows + n_bytes // limits.bytes_per_row)
+    most_group_rows = min(limits.group_rows, most_rows)
     n_uncompressed, n_rows = 0, 0
     n_nested: dict[str, int] = {}
     for group in range(footer.num_row_groups):
         rows = footer.row_group(group)
         in_group = rows.num_rows
         n_rows += in_group
-        if not 0 <= in_group <= min(_MAX_GROUP_ROWS, most_rows):
-            expected = f"at most {min(_MAX_GROUP_ROWS, most_rows)} for {n_bytes} bytes"
+        if not 0 <= in_group <= most_group_rows:
+            expected = f"at most {most_group_rows} for {n_bytes} bytes"
             raise UserError(address, "rows", f"{in_group} in a row group", expected)
         if rows.num_columns != footer.num_columns:
             raise ValueError(f"a row group of {rows.num_columns} columns, expected {footer.num_columns}")
@@ -40,7 +58,7 @@ def check_footer(footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, 
             if path.startswith(_NESTED_ROWS):
                 # Each is a row of a table, so the limit is that of rows.
                 n_nested[path] = n_nested.get(path, 0) + n_values
-                if n_values > _MAX_GROUP_ROWS or n_nested[path] > most_rows:
+                if n_values > limits.group_rows or n_nested[path] > most_rows:
                     raise UserError(address, path, f"{n_values} values", f"at most {most_rows} for {n_bytes} bytes")
             # The longest other list is a quaternion.
             elif n_values > 4 * in_group:

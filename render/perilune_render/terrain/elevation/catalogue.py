@@ -1,62 +1,128 @@
-"""Craters of a real elevation model, read from a CSV catalogue; they become labels like generated craters."""
+"""Craters of a real elevation model, read from a catalogue; they become labels like generated craters."""
 
-import csv
+import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from perilune_render.config_terrain import CratersConfig
+from perilune_render.config_terrain import CatalogueColumnsConfig, TerrainConfig
 from perilune_render.terrain.craters.population import Craters
-from perilune_render.terrain.elevation.model import ElevationModel, raster_places
+from perilune_render.terrain.elevation.model import ElevationModel, raster_places, resolved_m
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, site_from_selenographic
+from perilune_shared.storage.tables.catalogues import SurfaceCraters, duplicates, read_craters
 
-_LARGEST_BYTES = 500_000_000
-_COLUMNS = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0), "diameter_m": (0.0, 1e7)}
+_SETTING = "dataset.terrain.elevation.catalogue_columns"
+_LIKELY_KM = 10.0
+"""Diameter in metres below which all craters of a catalogue are probably in kilometres."""
 
 
-def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: CratersConfig, smallest_m: float) -> Craters:
-    """The catalogue's craters that the model shows, largest first, with origin 'elevation model'.
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What becomes of the craters of a catalogue."""
 
-    These are the craters larger than `smallest_m` with centre and rim on the grid and on measured pixels of the model;
-    smaller craters are generated.
+    used: int
+    """They become labels."""
+    outside: int
+    """Their centre or rim is outside the ground."""
+    unmeasured: int
+    """Their centre or rim is outside the model or in one of its holes."""
+    too_small: int
+    """They are inside, but too small for the model to show."""
+    duplicate: int
+    """They repeat another crater."""
 
-    The file needs a header with longitude_deg (east), latitude_deg (north) and diameter_m; other columns are ignored.
-    Age and fresh depth are unknown (NaN), wear is 0. Raises UserError with the line of an error.
+    def __str__(self) -> str:
+        """Return the counts as text, those of craters that are not used only where there are some."""
+        others = {
+            "outside the ground": self.outside,
+            "outside the model or in its holes": self.unmeasured,
+            "too small for the model": self.too_small,
+            "listed twice": self.duplicate,
+        }
+        return ", ".join([f"{self.used} used", *(f"{count} {name}" for name, count in others.items() if count)])
+
+
+@dataclass(frozen=True, slots=True)
+class RealCraters:
+    """The craters of a catalogue that the model shows."""
+
+    craters: Craters
+    """Largest first, with origin 'elevation model'."""
+    counts: Counts
+    """Numbers of craters that are used and that are not."""
+
+
+def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: TerrainConfig) -> RealCraters:
+    """The catalogue's craters that the model shows.
+
+    These are the craters larger than `resolved_m` with centre and rim on the grid and on measured pixels of the model;
+    smaller craters are generated. Age and fresh depth are unknown (NaN), wear is 0.
+
+    The columns are recognised (`perilune_shared.storage.tables.catalogues`) or stated in the configuration. Raises
+    UserError with the line of an error, and if no crater can be used.
     """
-    if not path.is_file():
-        raise UserError(path, "catalogue", "no such file", "a CSV file of craters")
-    if path.stat().st_size > _LARGEST_BYTES:
-        raise UserError(path, "catalogue", f"{path.stat().st_size} bytes", f"at most {_LARGEST_BYTES}")
-    rows = []
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as text:
-            reader = csv.DictReader(text, skipinitialspace=True)
-            names = reader.fieldnames or []
-            for name in _COLUMNS:
-                if name not in names:
-                    raise UserError(path, name, f"columns {', '.join(names) or 'none'}", "a column of this name")
-            for row in reader:
-                rows.append([_number(path, reader.line_num, name, row[name]) for name in _COLUMNS])
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(path, "catalogue", error, "a CSV file in UTF-8") from None
-    longitude, latitude, diameter = np.array(rows, np.float64).reshape(-1, 3).T
-    x, y = site_from_selenographic(latitude, longitude, model.latitude_deg, model.longitude_deg)
-    shown = (np.maximum(np.abs(x), np.abs(y)) + diameter / 2 < grid.extent_m / 2) & (diameter > smallest_m)
+    listed = _listed(path, config.elevation.catalogue_columns)
+    smallest_m = resolved_m(model)
+    diameter = listed.diameter_m
+    x, y = site_from_selenographic(listed.latitude_deg, listed.longitude_deg, model.latitude_deg, model.longitude_deg)
+    inside = np.maximum(np.abs(x), np.abs(y)) + diameter / 2 < grid.extent_m / 2
+    large = inside & (diameter > smallest_m)
+    shown = large.copy()
     shown[shown] = _measured(model, x[shown], y[shown], diameter[shown])
-    chosen = np.flatnonzero(shown)[np.argsort(-diameter[shown], kind="stable")]
+    chosen = np.flatnonzero(shown)
+    chosen = chosen[~duplicates(x[chosen], y[chosen], diameter[chosen])]
+    counts = Counts(
+        len(chosen),
+        int((~inside).sum()),
+        int((large & ~shown).sum()),
+        int((inside & ~large).sum()),
+        int(shown.sum()) - len(chosen),
+    )
+    if not len(chosen):
+        raise _nothing_used(path, listed, counts, smallest_m)
+    chosen = chosen[np.argsort(-diameter[chosen], kind="stable")]
     unknown = np.full(len(chosen), np.nan)
-    return Craters.round(
+    craters = Craters.round(
         x[chosen],
         y[chosen],
         diameter[chosen],
         unknown,
         unknown,
         np.zeros(len(chosen)),
-        config.profile,
+        config.craters.profile,
         "elevation model",
     )
+    return RealCraters(craters, counts)
+
+
+def remark(path: Path, real: RealCraters) -> str:
+    """Message to the user about a catalogue, shown before its ground is generated."""
+    return f"{path.name}: {real.counts}"
+
+
+def _listed(path: Path, columns: CatalogueColumnsConfig) -> SurfaceCraters:
+    """Read a catalogue once for all scenes: a global one takes seconds."""
+    try:
+        state = path.stat()
+    except (OSError, ValueError):
+        raise UserError(path, "catalogue", "no such file", "a CSV or Parquet file of craters") from None
+    return _read(path, state.st_mtime_ns, state.st_size, tuple(columns.stated.items()))
+
+
+@functools.lru_cache(maxsize=1)
+def _read(path: Path, time_ns: int, n_bytes: int, stated: tuple[tuple[str, str], ...]) -> SurfaceCraters:
+    return read_craters(path, _SETTING, dict(stated))
+
+
+def _nothing_used(path: Path, listed: SurfaceCraters, counts: Counts, smallest_m: float) -> UserError:
+    expected = f"at least one crater of more than {smallest_m:.3g} m with its rim on the ground"
+    if len(listed.diameter_m) and listed.size.endswith("_m") and listed.diameter_m.max() < _LIKELY_KM:
+        largest, column = listed.diameter_m.max(), listed.names[listed.size]
+        expected += f"; the largest of {column} is {largest:.3g} m: state kilometres with {_SETTING}"
+    return UserError(path, "craters", counts if len(listed.diameter_m) else "no row", expected)
 
 
 def _measured(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> np.ndarray:
@@ -68,14 +134,3 @@ def _measured(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) 
     inside = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
     known = model.known[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
     return (inside & known).all(axis=1)
-
-
-def _number(path: Path, line: int, name: str, text: str | None) -> float:
-    low, high = _COLUMNS[name]
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = np.nan
-    if not low <= value <= high or (name == "diameter_m" and value == 0):
-        raise UserError(f"{path}:{line}", name, text or "nothing", f"a number from {low:g} to {high:g}")
-    return value

@@ -7,7 +7,7 @@ from tests.helpers import in_process
 from tests.helpers.elevation_models import POLAR, write
 
 from perilune_render.cli.main import main
-from perilune_render.config_terrain import CratersConfig, ElevationConfig
+from perilune_render.config_terrain import ElevationConfig, TerrainConfig
 from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import base_heights, raster_places, read_elevation
 from perilune_render.terrain.grid import Grid
@@ -58,7 +58,7 @@ def test_a_catalogue_is_placed_about_the_site(path, tmp_path):
     model = read_elevation(path, at(*CRATER))
     row = f"{model.longitude_deg!r},{model.latitude_deg!r},300"
     (tmp_path / "craters.csv").write_text(f"longitude_deg,latitude_deg,diameter_m\n{row}\n")
-    found = read_catalogue(tmp_path / "craters.csv", model, Grid.even(300, 30), CratersConfig(), 40.0)
+    found = read_catalogue(tmp_path / "craters.csv", model, Grid.even(300, 30), TerrainConfig()).craters
     assert len(found) == 1 and np.hypot(found.x_m[0], found.y_m[0]) < 1e-6
 
 

@@ -81,8 +81,8 @@ def missing(file):
         (text("ranges.csv", "5.5,", "4.5,"), ["ranges.csv", "time_s: row 1", "above 5.0"]),
         (text("frames/frames.csv", "11.0", "9.0"), ["frames.csv", "time_s: row 1", "9.0", "above 10.0"]),
         (text("frames/frames.csv", "1.png", "../camera.yaml"), ["frames.csv", "file: row 1", "a file of this folder"]),
-        (text("catalogue.csv", ",30.0", ",-30.0"), ["catalogue.csv", "diameter_m: row 0", "above 0"]),
-        (text("catalogue.csv", ",30.0", ","), ["catalogue.csv", "diameter_m: row 0", "a finite number"]),
+        (text("catalogue.csv", ",30.0", ",-30.0"), ["catalogue.csv:2", "diameter_m", "-30.0", "above 0"]),
+        (text("catalogue.csv", ",30.0", ","), ["catalogue.csv:2", "diameter_m", "nothing", "a finite number"]),
         (text("truth.csv", "11.0", "11.5"), ["truth.csv", "time_s", "the times of the 3 frames"]),
     ],
 )

@@ -25,9 +25,10 @@ from perilune_train.navigate.filter.flight import Estimate, Instruments, fly
 from perilune_train.navigate.filter.lander import Lander, Surroundings
 from perilune_train.navigate.filter.propagate import InertialNoise
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION
+from perilune_train.navigate.fly.catalogue import read_catalogue
 from perilune_train.navigate.fly.picture import draw_flight
 from perilune_train.navigate.fly.settings import FlightPrior, read_camera, read_prior
-from perilune_train.navigate.fly.tables import FrameFiles, read_catalogue, read_frame_files, read_instruments
+from perilune_train.navigate.fly.tables import FrameFiles, read_frame_files, read_instruments
 from perilune_train.navigate.fly.truth import Truth, read_truth, with_errors_of
 from perilune_train.training.runs import RunFolder
 
@@ -58,7 +59,7 @@ def read_descent(
 ) -> Descent:
     """Read all files of a descent. Raises UserError on the first that is missing or wrong."""
     record, expected = read_camera(camera), read_prior(prior)
-    craters = read_catalogue(catalogue, expected.catalogue_position_sigma_m, expected.catalogue_diameter_sigma_share)
+    craters = read_catalogue(catalogue, expected.catalogue_use)
     files = read_frame_files(frames, record.intrinsics())
     true = read_truth(truth, files.time_s) if truth else None
     return Descent(record, expected, files, read_instruments(imu, ranges), craters, true)

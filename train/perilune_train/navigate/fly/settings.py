@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
@@ -14,10 +14,12 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import NO_DISTORTION, ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.inertial_grades import GRADES, InertialErrors, InertialGrade
+from perilune_shared.storage.tables.catalogues import METRES
 from perilune_shared.yaml_text import parse_yaml
 from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M
 from perilune_train.navigate.filter.propagate import start_sigmas
 from perilune_train.navigate.filter.state import State
+from perilune_train.navigate.fly.catalogue import CatalogueUse
 
 _LARGEST_FILE_BYTES = 100_000
 _UNIT_TOLERANCE = 1e-3
@@ -25,6 +27,8 @@ _Far = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Deviation = Annotated[float, Field(gt=0, le=1e5)]
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Positive = Annotated[float, Field(gt=0, le=1e6)]
+CatalogueColumn = Literal["longitude_deg", "latitude_deg", "diameter_m", "diameter_km", "radius_m", "radius_km"]
+"""What a column of a catalogue contains."""
 
 
 class UnitErrors(Section):
@@ -69,12 +73,35 @@ class FlightPrior(Section):
     """Standard deviation of a crater's position in the catalogue on each axis."""
     catalogue_diameter_sigma_share: _Share = 0.03
     """Standard deviation of a crater's diameter in the catalogue, divided by it."""
+    site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    """Latitude of the origin of O_L, degrees, for a catalogue by latitude and longitude."""
+    site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
+    """Longitude of the origin of O_L, east positive, degrees."""
+    catalogue_columns: dict[CatalogueColumn, str] = Field(default_factory=dict)
+    """Columns of a catalogue by latitude and longitude; without them known catalogues are recognised."""
 
     @model_validator(mode="after")
     def _unit_quaternion(self) -> "FlightPrior":
         if abs(np.linalg.norm(self.rotation_wxyz) - 1) > _UNIT_TOLERANCE:
             raise ValueError("rotation_wxyz should be a unit quaternion")
         return self
+
+    @model_validator(mode="after")
+    def _site_and_columns(self) -> "FlightPrior":
+        if (self.site_latitude_deg is None) != (self.site_longitude_deg is None):
+            raise ValueError("site_latitude_deg and site_longitude_deg, or none of them")
+        sizes = set(self.catalogue_columns) & set(METRES)
+        if self.catalogue_columns and (len(self.catalogue_columns) != 3 or len(sizes) != 1):
+            raise ValueError("catalogue_columns with longitude_deg, latitude_deg and one size")
+        return self
+
+    @property
+    def catalogue_use(self) -> CatalogueUse:
+        """How the catalogue is read."""
+        latitude, longitude = self.site_latitude_deg, self.site_longitude_deg
+        site = None if latitude is None or longitude is None else (latitude, longitude)
+        sigmas = self.catalogue_position_sigma_m, self.catalogue_diameter_sigma_share
+        return CatalogueUse(*sigmas, site, {str(name): column for name, column in self.catalogue_columns.items()})
 
     @property
     def unit(self) -> InertialErrors:

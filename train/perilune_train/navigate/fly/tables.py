@@ -1,4 +1,4 @@
-"""Tables of a descent: frames.csv, imu.csv, ranges.csv and the catalogue. All are untrusted input."""
+"""Tables of a descent: frames.csv, imu.csv and ranges.csv. All are untrusted input."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,13 +6,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-import pyarrow.parquet as pq
 
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_train.detect.images.read import picture_size
-from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.filter.flight import Instruments
 from perilune_train.navigate.filter.propagate import Increments
 
@@ -24,7 +22,6 @@ INERTIAL_COLUMNS = ("time_s", "interval_s", *RATES, *FORCES)
 RANGE_COLUMNS = ("time_s", "range_m")
 CRATER_COLUMNS = ("x_m", "y_m", "z_m", "diameter_m")
 NORMAL_COLUMNS = ("normal_x", "normal_y", "normal_z")
-_MOST_ROWS = 20_000_000
 _LARGEST_FILE_BYTES = 4 * 2**30
 
 
@@ -88,30 +85,6 @@ def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
     return Instruments(inertial, _increasing(ranges, _numbers(ranges, lengths, "time_s")), _values(lengths, "range_m"))
 
 
-def read_catalogue(path: Path, position_sigma_m: float, diameter_sigma_share: float) -> Catalogue:
-    """Read a crater catalogue, Parquet or CSV: x_m, y_m, z_m, diameter_m and, optional, normal_x, normal_y, normal_z.
-
-    Without normals the rims are level. Raises UserError on a missing column or a value that is no crater.
-    """
-    table = _read_csv(path, CRATER_COLUMNS) if path.suffix.lower() == ".csv" else _read_parquet(path)
-    centre = np.column_stack([_numbers(path, table, name) for name in CRATER_COLUMNS[:3]])
-    diameter = _numbers(path, table, "diameter_m")
-    if not len(diameter):
-        raise UserError(path, "rows", 0, "at least one crater")
-    if (diameter <= 0).any():
-        row = int((diameter <= 0).argmax())
-        raise UserError(path, f"diameter_m: row {row}", diameter[row], "above 0")
-    normal = np.tile([0.0, 0.0, 1.0], (len(diameter), 1))
-    if all(name in table.column_names for name in NORMAL_COLUMNS):
-        normal = np.column_stack([_numbers(path, table, name) for name in NORMAL_COLUMNS])
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        if (length == 0).any():
-            raise UserError(path, f"normal_x: row {int((length == 0).argmax())}", 0.0, "a normal that is not zero")
-        normal = normal / length
-    order = np.argsort(-diameter, kind="stable")
-    return Catalogue(centre[order], normal[order], diameter[order] / 2, position_sigma_m, diameter_sigma_share)
-
-
 def _read_csv(path: Path, columns: tuple[str, ...], text: tuple[str, ...] = ()) -> pa.Table:
     _check_file(path, "a CSV file")
     types = {name: pa.string() if name in text else pa.float64() for name in (*columns, *NORMAL_COLUMNS)}
@@ -121,20 +94,6 @@ def _read_csv(path: Path, columns: tuple[str, ...], text: tuple[str, ...] = ()) 
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise UserError(path, "table", error, f"CSV with a header and the columns {', '.join(columns)}") from None
     return _with_columns(path, table, columns)
-
-
-def _read_parquet(path: Path) -> pa.Table:
-    _check_file(path, "a Parquet file, or a file named *.csv")
-    try:
-        file = pq.ParquetFile(path)
-        if file.metadata.num_rows > _MOST_ROWS:
-            raise UserError(path, "rows", file.metadata.num_rows, f"at most {_MOST_ROWS}")
-        names = [name for name in (*CRATER_COLUMNS, *NORMAL_COLUMNS) if name in file.schema_arrow.names]
-        table = file.read(columns=names)
-        table = table.cast(pa.schema([(name, pa.float64()) for name in table.column_names]))
-    except (pa.ArrowException, OSError) as error:
-        raise UserError(path, "catalogue", error, "a Parquet file with numbers") from None
-    return _with_columns(path, table, CRATER_COLUMNS)
 
 
 def _check_file(path: Path, expected: str) -> None:

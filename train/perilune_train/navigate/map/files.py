@@ -13,7 +13,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 from perilune_shared.storage.files import write_text
 from perilune_train.navigate.craters.catalogue import Catalogue
-from perilune_train.navigate.fly.tables import read_catalogue
+from perilune_train.navigate.fly.catalogue import CatalogueUse, read_catalogue
 
 SETTINGS = "map.json"
 
@@ -75,7 +75,7 @@ def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
         if hashes[name] != own[name]:
             raise UserError(path, f"{name}: content_sha256", hashes[name], f"{own[name]}, the ground of the dataset")
     # Only names of scenes of the dataset become names of files.
-    return {name: read_catalogue(folder / f"{name}.parquet", *sigmas[name]) for name in shared}
+    return {name: read_catalogue(folder / f"{name}.parquet", CatalogueUse(*sigmas[name])) for name in shared}
 
 
 def _sigmas(one: dict[str, float]) -> tuple[float, float]:

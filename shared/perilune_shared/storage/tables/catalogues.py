@@ -1,0 +1,155 @@
+"""Read crater catalogues: longitude, latitude and diameter, from the columns that a file has.
+
+Recognised by their columns: Robbins 2018 (doi 10.1029/2018JE005592), Head et al. 2010, Povilaitis et al. 2018 (also as
+LROCCraters.csv of DeepMoon), the gazetteer of the IAU, and every table with latitude, longitude and a diameter or
+radius whose name states its unit, as craterpy's.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.tables.columns import Columns
+from perilune_shared.storage.tables.limits import CATALOGUE
+from perilune_shared.storage.tables.read import open_table
+
+Array = NDArray[np.float64]
+PLACES = ("longitude_deg", "latitude_deg")
+"""Names of the places of craters in a statement of columns; east and north are positive."""
+METRES = {"diameter_m": 1.0, "diameter_km": 1000.0, "radius_m": 2.0, "radius_km": 2000.0}
+"""Names of a size in a statement of columns, with the diameter in metres that one unit means."""
+_KNOWN: dict[str, Mapping[str, str]] = {
+    "Robbins 2018": {
+        "longitude_deg": "LON_CIRC_IMG",
+        "latitude_deg": "LAT_CIRC_IMG",
+        "diameter_km": "DIAM_CIRC_IMG",
+    },
+    "Head et al. 2010 or Povilaitis et al. 2018": {
+        "longitude_deg": "x_coord",
+        "latitude_deg": "y_coord",
+        "diameter_km": "Diam_km",
+    },
+    "gazetteer of the IAU": {
+        "longitude_deg": "Center_Longitude",
+        "latitude_deg": "Center_Latitude",
+        "diameter_km": "Diameter",
+    },
+}
+"""Catalogues whose columns the patterns do not recognise."""
+_UNIT = r"[ _]?[(\[]?{}[)\]]?"
+_DEGREES = r"[ _]?[(\[]?(?:deg(?:rees)?)?[ _]?{}[)\]]?"
+_PATTERNS = {
+    "longitude_deg": re.compile(r"(?:lon|long|longitude)" + _DEGREES.format("(?:e|east)?"), re.IGNORECASE),
+    "latitude_deg": re.compile(r"(?:lat|latitude)" + _DEGREES.format("(?:n|north)?"), re.IGNORECASE),
+    "diameter_m": re.compile(r"(?:d|diam|diameter)" + _UNIT.format("(?:m|meters|metres)"), re.IGNORECASE),
+    "diameter_km": re.compile(r"(?:d|diam|diameter)" + _UNIT.format("(?:km|kilometers|kilometres)"), re.IGNORECASE),
+    "radius_m": re.compile(r"(?:r|rad|radius)" + _UNIT.format("(?:m|meters|metres)"), re.IGNORECASE),
+    "radius_km": re.compile(r"(?:r|rad|radius)" + _UNIT.format("(?:km|kilometers|kilometres)"), re.IGNORECASE),
+}
+_MOST_NEIGHBOURS = 100
+"""Craters from west to east with which each is compared; bounds the time that a hostile catalogue takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceCraters:
+    """N craters of a catalogue, in the order of the file."""
+
+    longitude_deg: Array
+    """Longitudes of the centres, east positive, -180 to 360 degrees (N,)."""
+    latitude_deg: Array
+    """Latitudes of the centres, north positive, degrees (N,)."""
+    diameter_m: Array
+    """Diameters, metres (N,)."""
+    names: Mapping[str, str]
+    """Columns of the file by what they contain: PLACES and one of METRES."""
+    columns: Columns
+    """The columns that were read, also the requested others."""
+
+    @property
+    def size(self) -> str:
+        """What the column of sizes contains: one of METRES."""
+        return next(name for name in self.names if name in METRES)
+
+
+def read_craters(
+    path: Path, setting: str, names: Mapping[str, str] | None = None, others: Sequence[str] = ()
+) -> SurfaceCraters:
+    """Read a catalogue, CSV or Parquet. `names` states its columns; without it they are recognised.
+
+    `setting` is the setting of `names`, for messages. `others` are optional columns of numbers. Raises UserError on a
+    file without such columns, and on the first value that is no place on the Moon or no size.
+    """
+    with open_table(path, CATALOGUE) as table:
+        chosen = _stated(path, setting, table.names, names) if names else recognised(path, setting, table.names)
+        wanted = {name: "number" for name in (*chosen.values(), *others)}
+        columns = table.read(wanted, list(chosen.values()))  # type: ignore[arg-type]
+    longitude = columns.finite(chosen["longitude_deg"], -180, 360)
+    latitude = columns.finite(chosen["latitude_deg"], -90, 90)
+    size = next(name for name in chosen if name in METRES)
+    largest = 1e7 / METRES[size]
+    values = columns.finite(chosen[size], 0, largest)
+    columns.check(chosen[size], values > 0, f"a number above 0, at most {largest:g}")
+    return SurfaceCraters(longitude, latitude, values * METRES[size], chosen, columns)
+
+
+def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]:
+    """Return the columns of a catalogue by what they contain. Raises UserError if they cannot be recognised."""
+    for known in _KNOWN.values():
+        if set(known.values()) <= set(names):
+            return dict(known)
+    found = {key: [name for name in names if pattern.fullmatch(name)] for key, pattern in _PATTERNS.items()}
+    exact = {key: [key] if key in names else matches for key, matches in found.items()}
+    sizes = [(key, name) for key in METRES for name in exact[key]]
+    diameters = [size for size in sizes if size[0].startswith("diameter")]
+    sizes = [("diameter_m", "diameter_m")] if "diameter_m" in names else diameters or sizes
+    places = [exact[key] for key in PLACES]
+    if all(len(matches) == 1 for matches in places) and len(sizes) == 1:
+        return {"longitude_deg": places[0][0], "latitude_deg": places[1][0], sizes[0][0]: sizes[0][1]}
+    several = [name for matches in (*places, [name for _, name in sizes]) if len(matches) > 1 for name in matches]
+    got = (
+        f"columns {', '.join(several)}" if several else f"columns {', '.join(name for name in names if name) or 'none'}"
+    )
+    expected = "longitude_deg, latitude_deg and diameter_m or diameter_km"
+    if not several and all(places) and not sizes:
+        expected = "a diameter or radius with its unit, as diameter_m or Diameter (km)"
+    raise UserError(path, "columns", got, f"{expected}; {setting} can state which columns these are")
+
+
+def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
+    """Whether each crater (N,) repeats an earlier one: centre within a tenth of the radius, size within a tenth.
+
+    Catalogues that were joined from several sources contain craters twice, with slightly different values.
+    """
+    repeats = np.zeros(len(x_m), bool)
+    by_size = np.argsort(diameter_m, kind="stable")
+    sizes = diameter_m[by_size]
+    for low in np.unique(np.floor(np.log2(sizes))):
+        # The window is wider than the octave, so that craters on both sides of its end are compared.
+        high = 1.1 * 2 ** (low + 1)
+        own = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
+        order = own[np.argsort(x_m[own], kind="stable")]
+        for step in range(1, min(len(order), _MOST_NEIGHBOURS)):
+            first, second = np.sort([order[:-step], order[step:]], axis=0)
+            apart = np.abs(x_m[second] - x_m[first])
+            if apart.min() > 0.05 * high:
+                break
+            larger = np.maximum(diameter_m[first], diameter_m[second])
+            near = np.hypot(apart, y_m[second] - y_m[first]) <= 0.05 * larger
+            alike = np.abs(diameter_m[second] - diameter_m[first]) <= 0.1 * larger
+            repeats[second[near & alike]] = True
+    return repeats
+
+
+def _stated(path: Path, setting: str, names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
+    """Return stated columns. Raises UserError if the file lacks one."""
+    missing = [name for name in stated.values() if name not in names]
+    if missing:
+        raise UserError(
+            path, setting, f"no column {', '.join(missing)}", f"columns of {', '.join(names[:20]) or 'none'}"
+        )
+    return dict(stated)

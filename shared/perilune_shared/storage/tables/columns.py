@@ -1,0 +1,120 @@
+"""Columns that were read from a table: numbers and texts with the place of each row for messages."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+
+Kind = Literal["number", "integer", "text"]
+"""How a column is read: float64, NaN where it has no value; int64; or text."""
+
+
+@dataclass(frozen=True, slots=True)
+class Texts:
+    """A column of texts. Equal texts are stored once, so that memory stays small."""
+
+    words: list[str]
+    """The different texts (m,)."""
+    codes: NDArray[np.int32]
+    """Place of each row's text in `words` (n,); -1 where the row has no value."""
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    def __getitem__(self, row: int) -> str:
+        """Return the text of a row, or "" where it has no value."""
+        code = self.codes[row]
+        return self.words[code] if code >= 0 else ""
+
+    def to_list(self) -> list[str]:
+        """Return the texts of all rows."""
+        words = [*self.words, ""]
+        return [words[code] for code in self.codes]
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """The rows of a table, restricted to the requested columns that it has."""
+
+    path: Path
+    """The file."""
+    arrays: dict[str, NDArray[np.float64] | NDArray[np.int64] | Texts]
+    """Columns by name, each (n,)."""
+    n_rows: int
+    """Number of rows n."""
+    lines: NDArray[np.int64] | None
+    """Line of each row in the file (n,), from 1; None for Parquet."""
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.arrays
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """Return a column that was read as "number" (n,); NaN where a row has no value."""
+        found = self.arrays[name]
+        assert isinstance(found, np.ndarray)
+        return found.astype(np.float64, copy=False)
+
+    def integers(self, name: str) -> NDArray[np.int64]:
+        """Return a column that was read as "integer" (n,)."""
+        found = self.arrays[name]
+        assert isinstance(found, np.ndarray)
+        return found.astype(np.int64, copy=False)
+
+    def texts(self, name: str) -> Texts:
+        """Return a column that was read as "text"."""
+        found = self.arrays[name]
+        assert isinstance(found, Texts)
+        return found
+
+    def finite(self, name: str, low: float = -np.inf, high: float = np.inf) -> NDArray[np.float64]:
+        """Return a column of finite numbers from `low` to `high` (n,). Raises UserError that names the first other."""
+        values = self.numbers(name)
+        self.check(name, np.isfinite(values) & (values >= low) & (values <= high), _range_text(low, high))
+        return values
+
+    def check(self, name: str, fits: NDArray[np.bool_], expected: str) -> None:
+        """Raise UserError about the first row (n,) that does not fit."""
+        if not fits.all():
+            raise self.fault(int(fits.argmin()), name, expected)
+
+    def fault(self, row: int, name: str, expected: str) -> UserError:
+        """Return the error about the value of a column in a row, counted from 0."""
+        found = self.arrays[name]
+        value: object = found[row]
+        if isinstance(found, Texts):
+            value = repr(value) if value else "nothing"
+        elif isinstance(value, np.floating):
+            value = "nothing" if np.isnan(value) else float(value)
+        return UserError(*self.at(row, name), value, expected)
+
+    def at(self, row: int, name: str) -> tuple[str, str]:
+        """Return where a value stands: file with line, and column; for Parquet file, and column with row, from 0."""
+        if self.lines is None:
+            return str(self.path), f"{name}: row {row}"
+        return f"{self.path}:{self.lines[row]}", name
+
+
+def check_unique(path: Path, names: Sequence[str], wanted: Sequence[str]) -> None:
+    """Raise UserError if a wanted column occurs more than once."""
+    for name in wanted:
+        if (number := names.count(name)) > 1:
+            raise UserError(path, "columns", f"{number} times {name}", f"{name} once")
+
+
+def check_present(path: Path, names: Sequence[str], required: Sequence[str]) -> None:
+    """Raise UserError if a required column is missing."""
+    missing = [name for name in required if name not in names]
+    if missing:
+        found = ", ".join(names[:20]) or "none"
+        raise UserError(path, "columns", f"no {', '.join(missing)}; columns {found}", ", ".join(required))
+
+
+def _range_text(low: float, high: float) -> str:
+    if np.isfinite(low) and np.isfinite(high):
+        return f"a number from {low:g} to {high:g}"
+    return "a finite number" + (f", at least {low:g}" if np.isfinite(low) else "")
