@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.errors import UserError
 
 _LARGEST_TEXT, _LARGEST_XML, _LARGEST_JSON = 2**26, 2**26, 2**29
@@ -69,12 +70,15 @@ def find_picture(path: Path, name: Any, field: str, image_folder: Path | None) -
     """Path of the picture that a label file names, in the first possible folder that contains it.
 
     These are `image_folder` alone if it is given, else the file's folder, ../images, ../images/NAME and ../NAME, where
-    NAME is the last part of the file's name (train2017 for instances_train2017.json).
+    NAME is the last part of the file's name (train2017 for instances_train2017.json). An export in the folder of its
+    perilune dataset names frames of that dataset.
     """
     root = path.resolve().parent
     ending = path.stem.rpartition("_")[2]
     images = root.parent / "images"
     folders = [root, root / "images", images, images / ending, root.parent / ending]
+    if (root.parent / INFO_NAME).is_file():
+        folders.append(root.parent)
     for folder in folders if image_folder is None else [image_folder.resolve()]:
         picture = below(folder, name, path, field)
         if picture.is_file():
