@@ -276,7 +276,8 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
         found = all(colour in kinds for colour in colours)
         indexes = [kinds.index(colour) + 1 for colour in colours] if found else [1]
         width, height = raster.width, raster.height
-        _check_size(path, width, height, 1)
+        # OpenJPEG decodes whole tiles, of which there may be one, to 4 bytes.
+        _check_size(path, width, height, 4 if driver == "JP2OpenJPEG" else 1)
         block_rows = raster.block_shapes[0][0]
         some = max(_STRIP_PIXELS // width, 1)
         rows = max(some // block_rows, 1) * block_rows
