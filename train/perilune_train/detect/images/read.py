@@ -141,10 +141,10 @@ def _stretch(picture: _Picture, nodata: float | None) -> Stretch:
     step = max(picture.width_px * picture.height_px // SAMPLE, 1)
     sample, start = [], 0
     for bands in picture.strips():
-        values = _values(bands, picture, nodata).ravel()
-        some = values[-start % step :: step]
-        sample.append(some[np.isfinite(some)])
-        start += len(values)
+        every = bands.reshape(len(bands), 1, -1)
+        values = _values(every[..., -start % step :: step], picture, nodata).ravel()
+        sample.append(values[np.isfinite(values)])
+        start += every.shape[-1]
     declared = nodata is not None or picture.nodata is not None
     return stretch_of(np.concatenate(sample), find_fills=not declared)
 
