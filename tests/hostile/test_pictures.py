@@ -60,7 +60,7 @@ TILED = {"tiled": True, "blockxsize": 512, "blockysize": 512, "compress": "defla
 
 @pytest.mark.parametrize(
     ("dtype", "count", "options"),
-    [("float64", 1, {}), ("uint16", 3, {"photometric": "RGB"}), ("uint32", 1, {"photometric": "MINISWHITE"})],
+    [("float64", 1, {}), ("uint16", 3, {"photometric": "RGB"})],
 )
 def test_a_small_file_of_many_deep_pixels_is_read_in_strips(tmp_path, dtype, count, options):
     path = tiff(tmp_path / "deep.tif", SIDE, count, dtype, **TILED, **options)
@@ -76,16 +76,16 @@ def test_larger_pictures_and_blocks_are_refused(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["block.tif", "large.tif"]
 
 
-def png(path, width, height, kind, more=b""):
-    """A PNG of zeros, whose header states any size."""
+def png(path, width, height, kind, more=b"", rows=10):
+    """A PNG of some rows of zeros, whose header states any size."""
 
     def chunk(name, content):
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
     depth, colour = kind
     row = 1 + width * (depth // 8) * {0: 1, 2: 3}[colour]
-    packer = zlib.compressobj(9)
-    pixels = b"".join(packer.compress(bytes(row)) for _ in range(height)) + packer.flush()
+    packer = zlib.compressobj(1)
+    pixels = b"".join(packer.compress(bytes(row)) for _ in range(rows)) + packer.flush()
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + more + chunk(b"IDAT", pixels) + chunk(b"IEND", b""))
     return path
@@ -96,14 +96,14 @@ def test_pictures_that_pillow_decodes_as_a_whole(tmp_path):
     for name, kind in {"8-bit colours": (8, 2), "16-bit colours": (16, 2), "16 bits": (16, 0)}.items():
         path = png(tmp_path / "a.png", 60_000, 10_000, kind)
         refused(name, main, "detect", "predict", path, naming="a.png: size", folder=tmp_path)
-    path = png(tmp_path / "b.png", 15_000, 10_000, (8, 2))
+    path = png(tmp_path / "b.png", 15_000, 10_000, (8, 2), rows=10_000)
     accepted("150 million colours", partial(reads, path), memory_mb=READ_MB)
 
 
 def test_text_of_100_mb_is_not_read_as_orientation(tmp_path):
     text = b"zTXt" + b"Raw profile type exif\0\0" + zlib.compress(b"\nexif\n 9\n" + b"00" * 50_000_000)
     more = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
-    path = png(tmp_path / "t.png", 64, 64, (8, 0), more)
+    path = png(tmp_path / "t.png", 64, 64, (8, 0), more, rows=64)
     accepted("100 MB of EXIF", partial(reads, path), memory_mb=300)
 
 
@@ -225,7 +225,7 @@ def test_a_submission_that_states_many_rows_is_refused(tmp_path, n_rows):
     columns |= {name: pa.array(np.zeros(n_rows)) for name in ("x0_px", "y0_px", "x1_px", "y1_px", "score")}
     path = tmp_path / "mine.parquet"
     pq.write_table(pa.table(columns), path, compression="zstd")
-    assert path.stat().st_size < 500_000
+    assert path.stat().st_size < 3_000_000
     read = partial(ended, lambda each: read_submission(each, {"f": ["f"]}), path)
     refused(f"{n_rows} rows", read, naming="rows")
 
