@@ -174,5 +174,5 @@ def test_places_on_the_moon_follow_the_stored_pixels(tmp_path, kind, orientation
     (row,), (column,) = np.nonzero(upright)
     a, b, c, d, e, f = reference.transform
     x, y = a * (column + 0.5) + b * (row + 0.5) + c, d * (column + 0.5) + e * (row + 0.5) + f
-    assert (x, y) == pytest.approx(place * (5.5, 3.5))
+    assert (x, y) == pytest.approx((1000 + 2 * 5.5, 3000 - 2 * 3.5))
     assert np.isfinite(reference.lon_lat_deg(np.array([[column + 0.5, row + 0.5]]))).all()

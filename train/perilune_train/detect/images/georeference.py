@@ -72,7 +72,6 @@ def read_georeference(path: Path) -> Georeference | None:
     """
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
-    from rasterio.transform import Affine
 
     beside = path.with_suffix(".prj")
     with opened_raster(raster_files(path, PICTURE_DRIVERS, "image"), "image") as image:
@@ -85,9 +84,10 @@ def read_georeference(path: Path) -> Georeference | None:
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
     # A georeference places the stored pixels, and detections are in pixels of the upright picture.
-    transform *= Affine(*stored_from_upright(path).ravel())
+    stored, place = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
+    a, b, c, d, e, f = (place[:, :2] @ stored + place * [0, 0, 1]).ravel().tolist()
     size = picture_size(path)
-    found = Georeference(tuple(transform)[:6], projection.to_wkt(), path)
+    found = Georeference((a, b, c, d, e, f), projection.to_wkt(), path)
     grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in size)), axis=-1).reshape(-1, 2)
     if not np.isfinite(found.lon_lat_deg(grid)).all(axis=1).any():
         raise UserError(path, "projection", "none of its pixels on the map", "an image of a place on the Moon")

@@ -16,7 +16,6 @@ from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
-
 _REACH = 4
 """Pixels beyond a slice that its cubic interpolation needs."""
 
