@@ -139,11 +139,11 @@ def with_value(name, value):
     ("change", "message"),
     [
         (without("score"), "columns: got no score"),
-        (with_value("dataset", "large"), "dataset: got 'large'"),
-        (with_value("frame_id", "s000/t000/999999"), "frame_id: got 's000/t000/999999'"),
+        (with_value("dataset", "large"), "dataset: row 0: got 'large'"),
+        (with_value("frame_id", "s000/t000/999999"), "frame_id: row 0: got 's000/t000/999999'"),
         (with_value("score", 1.5), "score: row 0: got 1.5"),
-        (with_value("score", None), "score: got null"),
-        (with_value("x0_px", float("nan")), "x0_px: row 0: got nan"),
+        (with_value("score", None), "score: row 0: got nothing"),
+        (with_value("x0_px", float("nan")), "x0_px: row 0: got nothing"),
         (with_value("x1_px", -1e9), "x1_px: row 0: got -1000000000.0, expected a finite number above x0_px"),
     ],
 )
@@ -158,7 +158,7 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(content, places, tmp_pat
     if content is not None:
         (tmp_path / "mine.parquet").write_bytes(content)
     done = call(places, "--detections", tmp_path / "mine.parquet", "--threshold", "0.5", "--out", tmp_path / "out")
-    assert done.returncode == 2 and "mine.parquet: detections: got" in done.stderr and not (tmp_path / "out").exists()
+    assert done.returncode == 2 and "mine.parquet: " in done.stderr and not (tmp_path / "out").exists()
 
 
 def test_detections_come_back_by_frame_and_score(places, tmp_path, no_pictures):

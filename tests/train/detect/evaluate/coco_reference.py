@@ -21,13 +21,13 @@ def coco_evaluation(found, labels, copies=1):
     for frame, (ours, truth) in enumerate(zip(found, labels, strict=True), start=1):
         images.append({"id": frame})
         repeats = _matchable(ours.boxes, truth.boxes) if copies is None else np.full(len(truth.boxes), copies)
-        for (x0, y0, x1, y1), is_selected, repeat in zip(truth.boxes.tolist(), truth.selected, repeats, strict=True):
-            for _ in range(1 if is_selected else repeat):
-                box, area = [x0, y0, x1 - x0, y1 - y0], (x1 - x0) * (y1 - y0) if is_selected else IGNORED_AREA
-                number = len(annotations) + 1
-                annotations.append(
-                    {"id": number, "image_id": frame, "category_id": 1, "bbox": box, "area": area, "iscrowd": 0}
-                )
+        crowds = np.zeros(len(truth.boxes), bool) if truth.crowd is None else truth.crowd
+        rows = zip(truth.boxes.tolist(), truth.selected, crowds, repeats, strict=True)
+        for (x0, y0, x1, y1), is_selected, is_crowd, repeat in rows:
+            for _ in range(1 if is_selected or is_crowd else repeat):
+                one = {"id": len(annotations) + 1, "image_id": frame, "category_id": 1, "iscrowd": int(is_crowd)}
+                area = (x1 - x0) * (y1 - y0) if is_selected or is_crowd else IGNORED_AREA
+                annotations.append({**one, "bbox": [x0, y0, x1 - x0, y1 - y0], "area": area})
         for (x0, y0, x1, y1), score in zip(ours.boxes.tolist(), ours.scores.tolist(), strict=True):
             results.append({"image_id": frame, "category_id": 1, "bbox": [x0, y0, x1 - x0, y1 - y0], "score": score})
     with contextlib.redirect_stdout(io.StringIO()):

@@ -76,6 +76,51 @@ def test_ignored_labels_that_absorb_any_number(seed, crowd_px, score_levels):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
 
+def with_crowds(labels, rng):
+    """The same labels, with regions that hold any number of craters."""
+    made = []
+    for one in labels:
+        count = int(rng.integers(0, 4))
+        corner = rng.uniform(0, 80, (count, 2))
+        boxes = np.concatenate([one.boxes, np.concatenate([corner, corner + rng.uniform(20, 80, (count, 2))], axis=1)])
+        is_crowd = np.arange(len(boxes)) >= len(one.boxes)
+        selected = np.append(one.selected, np.zeros(count, bool))
+        radius = np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)) / 2
+        made.append(FrameLabels(boxes, radius, np.zeros((len(boxes), 5)), selected, selected, crowd=is_crowd))
+    return made
+
+
+@settings(max_examples=40, deadline=None, phases=QUICK)
+@given(
+    seed=st.integers(0, 2**32),
+    crowd_px=st.sampled_from([100, 500]),
+    on_grid=st.booleans(),
+    ignored_share=st.sampled_from([0.0, 0.3]),
+    score_levels=st.sampled_from([3, 10**6]),
+)
+def test_crowds_ignore_the_detections_inside_them(seed, crowd_px, on_grid, ignored_share, score_levels):
+    found, labels = random_frames(seed, 3, crowd_px, on_grid, ignored_share, score_levels)
+    labels = with_crowds(labels, np.random.default_rng(seed))
+    if not any(part.selected.any() for part in labels):
+        return
+    copies = 1 if ignored_share == 0 else None
+    for ours, theirs in zip(our_average_precisions(found, labels), coco_evaluation(found, labels, copies), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+def test_small_detections_in_a_large_crowd_are_ignored():
+    boxes = [[0.0, 0, 10, 10], [200, 200, 400, 400]]
+    crowd = np.array([False, True])
+    label = FrameLabels(np.array(boxes), np.array([5.0, 100.0]), np.zeros((2, 5)), ~crowd, ~crowd, crowd=crowd)
+    inside = [[220.0, 220, 230, 230], [300, 300, 310, 310], [395, 300, 405, 310]]
+    found = [Detections(np.array([*inside, [0, 0, 10, 10]]), np.array([0.9, 0.8, 0.7, 0.6]))]
+    # Half of the third is inside.
+    for average in (our_average_precisions(found, [label]), coco_evaluation(found, [label])):
+        assert average[1][0] == pytest.approx(1)
+    whole = FrameLabels(np.array(boxes), np.array([5.0, 100.0]), np.zeros((2, 5)), ~crowd, ~crowd)
+    assert our_average_precisions(found, [whole])[1][0] == pytest.approx(0.25)
+
+
 def test_where_ours_and_cocos_ignored_labels_differ():
     """A selected label found, and two better detections on an ignored one: COCO counts the second of these as false."""
     square = [0.0, 0.0, 10.0, 10.0]

@@ -13,7 +13,7 @@ from perilune_shared.errors import UserError
 from perilune_train.cli import app
 from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.images.evaluate import evaluate_detections_in_images, evaluate_images
+from perilune_train.detect.images.evaluate import ImageSettings, evaluate_detections_in_images, evaluate_images
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
 from perilune_train.detect.inference.tiling import Tiling
 
@@ -71,7 +71,7 @@ def folder(tmp_path):
 
 def test_a_folder_is_evaluated(run, folder, tmp_path):
     out = tmp_path / "out"
-    figures = evaluate_images(run, settings_of(run), folder, out, Tiling(tile_px=96, overlap_px=32))
+    figures = evaluate_images(run, settings_of(run), folder, out, ImageSettings(Tiling(tile_px=96, overlap_px=32)))
     written = json.loads((out / "metrics.json").read_text())
     assert written["threshold"] == THRESHOLD and written["frames"] == 2
     expected = [image.selected(8.0).sum() for image in read_images(folder).images]
@@ -83,7 +83,7 @@ def test_a_folder_is_evaluated(run, folder, tmp_path):
     assert "oracle" in (out / "report.md").read_text()
     # What is found does not hang on the least size, what is expected does.
     larger = evaluate_images(
-        run, settings_of(run), folder, tmp_path / "larger", Tiling(tile_px=96, overlap_px=32), 30.0, 0.5
+        run, settings_of(run), folder, tmp_path / "larger", ImageSettings(Tiling(tile_px=96, overlap_px=32), 30.0, 0.5)
     )
     assert 0 < larger["labels"] < figures["labels"] and larger["threshold"] == 0.5
 
@@ -91,10 +91,10 @@ def test_a_folder_is_evaluated(run, folder, tmp_path):
 def test_nothing_is_written_for_a_fault(run, folder, tmp_path):
     for arguments in ((Tiling(), 0.0), (Tiling(), 1000.0), (Tiling(tile_px=5), 8.0)):
         with pytest.raises(UserError):
-            evaluate_images(run, settings_of(run), folder, tmp_path / "out", *arguments)
+            evaluate_images(run, settings_of(run), folder, tmp_path / "out", ImageSettings(*arguments))
     (folder / "b.txt").write_text("X,Y,W,H\n1,2,3\n")
     with pytest.raises(UserError, match=r"b\.txt: line 2"):
-        evaluate_images(run, settings_of(run), folder, tmp_path / "out", Tiling())
+        evaluate_images(run, settings_of(run), folder, tmp_path / "out", ImageSettings(Tiling()))
     assert not (tmp_path / "out").exists()
 
 
@@ -107,7 +107,7 @@ def test_the_command(run, folder, tmp_path):
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
     for option, value, message in (
         ("--dataset", "data", "--dataset: options: got together with --images, expected only one of them"),
-        ("--split", "test", "--split: options: got together with --images, expected only one of them"),
+        ("--split", "test", "--split: split: got test, expected a source with splits; images has none"),
         ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: got together with --images"),
         ("--scale", "9", "--scale: factor: got [9.0]"),
     ):
@@ -127,7 +127,9 @@ def test_the_runs_own_folder_keeps_its_figures(run, folder):
 
 @pytest.mark.usefixtures("no_pictures")
 def test_compare_shows_images(run, folder, tmp_path):
-    figures = evaluate_images(run, settings_of(run), folder, tmp_path / "a", Tiling(96, 32, (0.5, 1.0)), 12.0)
+    figures = evaluate_images(
+        run, settings_of(run), folder, tmp_path / "a", ImageSettings(Tiling(96, 32, (0.5, 1.0)), 12.0)
+    )
     text = compare_folders([tmp_path / "a"], tmp_path / "both")
     cells = [cell.strip() for cell in text.splitlines()[-1].strip("| ").split("|")]
     expected = ["images", "images", "-", "real images", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]

@@ -17,7 +17,7 @@ from perilune_shared.geometry.frames import MOON_RADIUS_M
 from perilune_train.cli import app
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference
-from perilune_train.detect.images.predict import predict_images
+from perilune_train.detect.images.predict import PredictSettings, predict_images
 from perilune_train.detect.inference.tiling import Tiling
 
 EARTH = CRS.from_epsg(4326)
@@ -47,7 +47,9 @@ def test_everything_is_written(run, tmp_path):
     paths = [geotiff(tmp_path / "g.tif", POLAR, from_origin(1000, 3000, 2, 2)), tmp_path / "a.png", tmp_path / "b.jpg"]
     for path in paths[1:]:
         assert cv2.imwrite(str(path), noise(70, 300))
-    count = predict_images(paths, run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=96, overlap_px=32))
+    count = predict_images(
+        paths, run, settings_of(run), tmp_path / "out", PredictSettings(Tiling(tile_px=96, overlap_px=32))
+    )
     names = ["a.png.overlay.png", "b.jpg.overlay.png", "detections.csv", "detections.geojson", "detections.parquet"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [*names, "g.tif.overlay.png"]
     table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
@@ -125,7 +127,7 @@ def test_what_lies_off_the_map_is_left_out_and_told(run, tmp_path, capsys):
     # The middle of the image and one well inside the disc; at 119 the ellipse reaches over the limb.
     assert [feature["properties"]["score"] for feature in kept] == [0.8, 0.5]
     assert kept[0]["properties"]["longitude_deg"] == pytest.approx(0, abs=1e-6)
-    count = predict_images([path], run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=128))
+    count = predict_images([path], run, settings_of(run), tmp_path / "out", PredictSettings(Tiling(tile_px=128)))
     shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())["features"]
     assert 0 < len(shapes) < count == len(pd.read_parquet(tmp_path / "out" / "detections.parquet"))
     assert f"disc[b].tif: {count - len(shapes)} craters are off the map" in " ".join(capsys.readouterr().err.split())
@@ -142,21 +144,29 @@ def test_one_faulty_image_among_several_leaves_nothing(run, tmp_path):
     assert cv2.imwrite(str(good), noise(64, 64))
     bad.write_bytes(good.read_bytes()[:2000])
     with pytest.raises(UserError, match=r"bad\.png: image"):
-        predict_images([good, bad], run, settings_of(run), tmp_path / "out", None, Tiling())
+        predict_images([good, bad], run, settings_of(run), tmp_path / "out", PredictSettings(Tiling()))
     (tmp_path / "more").mkdir()
     twin = tmp_path / "more" / "good.png"
     twin.write_bytes(good.read_bytes())
     with pytest.raises(UserError, match=r"more/good\.png: name: got a second image"):
-        predict_images([good, twin], run, settings_of(run), tmp_path / "out", None, Tiling())
+        predict_images([good, twin], run, settings_of(run), tmp_path / "out", PredictSettings(Tiling()))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.png", "good.png", "more"]
 
 
 def test_a_run_that_is_not_finished(run, tmp_path):
     assert cv2.imwrite(str(tmp_path / "a.png"), noise(64, 64))
     with pytest.raises(UserError, match=r"metrics\.json: metrics: got no such file"):
-        predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", None, Tiling())
+        predict_images(
+            [tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", PredictSettings(Tiling())
+        )
     with pytest.raises(UserError, match=r"best\.ckpt: checkpoint: got no such file"):
-        predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", 0.5, Tiling())
+        predict_images(
+            [tmp_path / "a.png"],
+            tmp_path / "absent",
+            settings_of(run),
+            tmp_path / "out",
+            PredictSettings(Tiling(), 0.5),
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
@@ -176,3 +186,65 @@ def test_the_command(run, tmp_path):
     for options in (["--threshold", "2"], ["--scale", "0"], ["--tile", "100"], ["--overlap", "-1"], []):
         refused = CliRunner().invoke(app, [*arguments, *options])
         assert isinstance(refused.exception, UserError), options
+
+
+@pytest.mark.parametrize(
+    ("crs", "said"),
+    [
+        (EARTH, "a coordinate reference system of the Moon"),
+        (CRS.from_proj4("+proj=longlat +R=3396190 +no_defs"), "a coordinate reference system of the Moon"),
+        (CRS.from_wkt(EARTH.to_wkt().replace("4326", "1")), "a coordinate reference system of the Moon"),
+    ],
+)
+def test_an_image_of_another_body_is_detected_in_pixels(run, tmp_path, capsys, crs, said):
+    paths = [geotiff(tmp_path / "e.tif", crs, from_origin(10, 50, 0.1, 0.1))]
+    paths.append(geotiff(tmp_path / "m.tif", POLAR, from_origin(1000, 3000, 2, 2)))
+    out = tmp_path / "out"
+    count = predict_images(paths, run, settings_of(run), out, PredictSettings(Tiling(tile_px=96, overlap_px=32)))
+    table = pd.read_parquet(out / "detections.parquet")
+    of_earth = int((table["image"] == "e.tif").sum())
+    assert len(table) == count > of_earth > 0
+    shapes = json.loads((out / "detections.geojson").read_text())["features"]
+    assert len(shapes) == count - of_earth
+    text = " ".join(capsys.readouterr().err.split())
+    assert "e.tif: not in detections.geojson, since its map cannot be used" in text and said in text
+
+
+def test_a_broken_projection_or_a_place_off_the_map_leaves_pixels(run, tmp_path, capsys):
+    sky = geotiff(tmp_path / "sky.tif", ORTHOGRAPHIC, from_origin(5e6, 5e6, 1000, 1000))
+    odd = tmp_path / "w.png"
+    assert cv2.imwrite(str(odd), noise(90, 130))
+    (tmp_path / "w.pgw").write_text("2\n0\n0\n-2\n561\n39\n")
+    (tmp_path / "w.prj").write_bytes(b"\xff nonsense")
+    assert predict_images([sky, odd], run, settings_of(run), tmp_path / "out", PredictSettings(Tiling(tile_px=96))) > 0
+    text = " ".join(capsys.readouterr().err.split())
+    assert "sky.tif: not in detections.geojson" in text and "w.png: not in detections.geojson" in text
+    assert not (tmp_path / "out" / "detections.geojson").exists()
+
+
+def test_a_folder_and_a_least_size(run, tmp_path):
+    root = tmp_path / "pictures"
+    root.mkdir()
+    for name in ("a.png", "b.jpg", "a_mask.png"):
+        assert cv2.imwrite(str(root / name), noise(70, 96))
+    (root / "._a.png").write_bytes(b"\0")
+    (root / "notes.txt").write_text("x")
+    command = ["detect", "predict", str(root), "--run", str(run), "--tile", "96", "--out"]
+    result = CliRunner().invoke(app, [*command, str(tmp_path / "all")])
+    assert result.exit_code == 0, result.output
+    assert "craters in 2 images" in " ".join(result.output.split())
+    every = pd.read_parquet(tmp_path / "all" / "detections.parquet")
+    assert set(every["image"]) == {"a.png", "b.jpg"}
+    least = float(every["radius_px"].median() * 2)
+    result = CliRunner().invoke(app, [*command, str(tmp_path / "large"), "--min-size", str(least)])
+    large = pd.read_parquet(tmp_path / "large" / "detections.parquet")
+    assert len(large) == (2 * every["radius_px"] >= least).sum() < len(every)
+    (tmp_path / "none").mkdir()
+    for arguments, message in (
+        ([str(tmp_path / "none"), "--out", str(tmp_path / "x")], "none: images: got a folder without images"),
+        ([str(root), str(root / "a.png"), "--out", str(tmp_path / "x")], "a.png: name: got a second image"),
+        ([str(root), "--min-size", "-1"], "--min-size: pixels: got -1.0"),
+        ([str(root), "--nodata", "inf"], "--nodata: value: got inf"),
+    ):
+        refused = CliRunner().invoke(app, ["detect", "predict", *arguments])
+        assert isinstance(refused.exception, UserError) and message in str(refused.exception)

@@ -9,7 +9,7 @@ from tests.helpers.stored_run import settings_of, store_run
 from perilune_shared.errors import UserError
 from perilune_train.detect.evaluate.boxes import iou_matrix, suppress
 from perilune_train.detect.inference.detector import Detector, open_detector
-from perilune_train.detect.inference.scales import detect_at_scales
+from perilune_train.detect.inference.scales import Enlarged, detect_at_scales, resized
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.inference.tiles import (
     Tiling,
@@ -72,6 +72,29 @@ def test_each_crater_is_found_once_and_whole(detector, scales, least, size, radi
     assert len(found.boxes) == len(truth)
     assert (overlap.max(axis=0) >= least).all()
     assert (np.diff(found.scores) <= 0).all()
+
+
+def test_large_images_are_enlarged_tile_by_tile(detector, monkeypatch):
+    """The same craters as of the image that is enlarged as a whole."""
+    blobs = Detector(Blobs(), detector.config, "cpu", False)
+    image, truth = discs(301, 411, 60, 14)
+    tiling = Tiling(scales=(2.5,), overlap_px=128)
+    whole = detect_image(blobs, image, tiling)
+    monkeypatch.setattr("perilune_train.detect.inference.tiles._MOST_ENLARGED_PIXELS", 1000)
+    parts = detect_image(blobs, image, tiling)
+    assert len(parts.boxes) == len(whole.boxes) == len(truth)
+    assert np.abs(np.sort(parts.boxes, axis=0) - np.sort(whole.boxes, axis=0)).max() <= 0.5
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.37, 2.0, 3.3])
+def test_a_part_of_an_enlarged_image_has_the_pixels_of_the_whole(factor):
+    image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (80, 101), np.uint8), (0, 0), 2)
+    size = round(101 * factor), round(80 * factor)
+    whole, lazily = resized(image, *size), Enlarged(image, *size)
+    assert lazily.shape == whole.shape
+    for rows, columns in (((0, 40), (0, 50)), ((33, 80), (20, 101)), ((size[1] - 9, size[1]), (0, size[0]))):
+        place = slice(*rows), slice(*columns)
+        assert np.abs(lazily[place].astype(int) - whole[place]).max() <= 4
 
 
 def test_boxes_can_get_a_margin(detector):

@@ -17,7 +17,7 @@ def benchmark(
         Path | None, typer.Option(help="Folder of a finished detect run. [default: the detector that is installed]")
     ] = None,
     detections: Annotated[
-        Path | None, typer.Option(help="Parquet table of another detector's detections, in place of --run.")
+        Path | None, typer.Option(help="Parquet or CSV table of another detector's detections, in place of --run.")
     ] = None,
     threshold: Annotated[
         float | None, typer.Option(help="With --detections: score threshold of precision, recall and F1.")

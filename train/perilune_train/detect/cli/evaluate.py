@@ -9,14 +9,14 @@ from perilune_shared.config import parse_setting, resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import say
 from perilune_train.cli_options import AllowOverlap
-from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
+from perilune_train.detect.cli.tiling_options import BoxMargin, NoData, Overlap, Scales, TileSide, check_nodata
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.shipped.models import shipped_run
 
-_FOR_DATASETS = ("dataset", "split", "allow_overlap")
-_FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
+_FOR_DATASETS = ("dataset", "allow_overlap")
+_FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin", "category", "image_folder", "nodata")
 
 
 def evaluate(
@@ -31,7 +31,7 @@ def evaluate(
             help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<name of the run>/detect]"
         ),
     ] = None,
-    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    split: Annotated[str, typer.Option(help="train, val or test; with --images of a source that has splits.")] = "test",
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -57,8 +57,22 @@ def evaluate(
     allow_overlap: AllowOverlap = False,
     images: Annotated[
         Path | None,
-        typer.Option(help="Real images with boxes in place of a dataset: a folder of pictures and tables, or COCO."),
+        typer.Option(
+            help="Labelled images in place of a dataset: a folder or a label file of COCO, YOLO, CVAT, Pascal VOC,"
+            " LabelMe or tables of boxes."
+        ),
     ] = None,
+    category: Annotated[
+        list[str] | None,
+        typer.Option(help="With --images: name of a category that is craters. Repeatable. [default: crater, craters]"),
+    ] = None,
+    image_folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --images: folder of the images that a label file names. [default: those near the file]"
+        ),
+    ] = None,
+    nodata: NoData = None,
     min_size: Annotated[
         float, typer.Option(help="With --images: minimum size sqrt(w h) of a crater to find, pixels.")
     ] = 8.0,
@@ -100,11 +114,17 @@ def evaluate(
             keys, _ = parse_setting(text)
             if keys[1] == "labels":
                 raise UserError("--set", ".".join(keys), "together with --images", "--min-size instead")
-        from perilune_train.detect.images.evaluate import evaluate_images
+        from perilune_train.detect.images.evaluate import ImageSettings, evaluate_images
+        from perilune_train.detect.images.labelled import Request
 
         folder = out or run / "images"
         tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
-        evaluate_images(run, config, images, folder, tiling, min_size, threshold)
+        source = context.get_parameter_source("split")
+        chosen = split if source is not None and source.name == "COMMANDLINE" else None
+        check_nodata(nodata)
+        request = Request(chosen, tuple(category or ()), image_folder)
+        settings = ImageSettings(tiling, min_size, threshold, nodata, request)
+        evaluate_images(run, config, images, folder, settings)
         say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return
     if scale:

@@ -4,6 +4,8 @@ from typing import Annotated
 
 import typer
 
+from perilune_shared.errors import UserError
+
 Scales = Annotated[
     list[float] | None,
     typer.Option(
@@ -22,4 +24,16 @@ BoxMargin = Annotated[
         " compare them with labels that are boxes of whole pixels around a crater."
     ),
 ]
+NoData = Annotated[
+    float | None,
+    typer.Option(
+        help="Value of pixels without data, if the files do not declare it. [default: found where it stands apart]"
+    ),
+]
 Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels.")]
+
+
+def check_nodata(value: float | None) -> None:
+    """Raise UserError if it is not a finite number."""
+    if value is not None and not abs(value) < float("inf"):
+        raise UserError("--nodata", "value", value, "a finite number; others are always taken as no data")

@@ -42,6 +42,8 @@ class FrameLabels:
     """False for a crater that is not in the manifest's labels: slightly too small, too large, or off the image (M,)."""
     depth_ratio: Array | None = None
     """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
+    crowd: NDArray[np.bool_] | None = None
+    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if none is."""
 
 
 @dataclass(frozen=True)

@@ -10,15 +10,26 @@ Array = NDArray[np.float64]
 
 def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
     """Intersection over union (N, M) of boxes (N, 4) and (M, 4); 0 where both are empty."""
+    overlap, area = _intersections(first, second)
+    other = np.asarray(second, np.float64).reshape(-1, 4)
+    union = area[:, None] + (other[:, 2] - other[:, 0]) * (other[:, 3] - other[:, 1]) - overlap
+    return np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
+
+
+def coverage_matrix(first: ArrayLike, second: ArrayLike) -> Array:
+    """Share (N, M) of each box (N, 4) that lies inside each region (M, 4); 0 for empty boxes."""
+    overlap, area = _intersections(first, second)
+    return np.divide(overlap, area[:, None], out=np.zeros_like(overlap), where=area[:, None] > 0)
+
+
+def _intersections(first: ArrayLike, second: ArrayLike) -> tuple[Array, Array]:
+    """Areas (N, M) that boxes (N, 4) and (M, 4) have in common, and the areas (N,) of the first."""
     a, b = (np.asarray(boxes, np.float64).reshape(-1, 4).T for boxes in (first, second))
     # One matrix per side, because a last axis of length two takes twice as long.
     width, height = (
         np.maximum(np.minimum(a[i + 2, :, None], b[i + 2]) - np.maximum(a[i, :, None], b[i]), 0) for i in (0, 1)
     )
-    overlap = width * height
-    area_a, area_b = ((c[2] - c[0]) * (c[3] - c[1]) for c in (a, b))
-    union = area_a[:, None] + area_b - overlap
-    return np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
+    return width * height, (a[2] - a[0]) * (a[3] - a[1])
 
 
 def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_count: int) -> NDArray[np.intp]:

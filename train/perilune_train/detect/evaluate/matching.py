@@ -18,10 +18,13 @@ positives:
   some of them match a label and count, and the others are ignored.
 - Strict: every unmatched detection is a false positive.
 
-There are two differences from COCO (COCOeval without crowds). In COCO an ignored label takes only one detection; here
-it takes any number, since detections on an ignored crater cannot be evaluated. COCO gives the same metrics if each
-ignored label is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the
-image as a false positive, because its labels have no such centres.
+A crowd (`FrameLabels.crowd`, COCO's `iscrowd`) is a region with any number of craters that are not labelled one by one.
+As in COCO a detection lies on it by the share of the detection inside the region, in place of IoU, and is ignored.
+
+There are two differences from COCO. In COCO an ignored label that is no crowd takes only one detection; here it takes
+any number, since detections on an ignored crater cannot be evaluated. COCO gives the same metrics if each ignored label
+is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the image as a
+false positive, because its labels have no such centres.
 """
 
 from collections.abc import Sequence
@@ -31,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.data.labels import FrameLabels
-from perilune_train.detect.evaluate.boxes import iou_matrix
+from perilune_train.detect.evaluate.boxes import coverage_matrix, iou_matrix
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -118,7 +121,7 @@ class Overlaps:
     """Label of each pair; for one detection by decreasing IoU, and for equal IoU the later label first, as in
     COCO (P,)."""
     pair_iou: Array
-    """IoU of each pair (P,)."""
+    """IoU of each pair; for a crowd the share of the detection inside it (P,)."""
 
     def radius_px(self) -> Array:
         """Radius sqrt(w h) / 2 of every detection, pixels (D,)."""
@@ -158,6 +161,8 @@ def find_overlaps(
         boxes.append(ours.boxes[order].reshape(-1, 4))
         scores.append(ours.scores[order])
         overlap = iou_matrix(boxes[-1], truth.boxes)
+        if truth.crowd is not None:
+            overlap[:, truth.crowd] = coverage_matrix(boxes[-1], truth.boxes[truth.crowd])
         row, column = np.nonzero(overlap >= min_iou)
         iou = overlap[row, column]
         sort = np.lexsort((-column, -iou, row))

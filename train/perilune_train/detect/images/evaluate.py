@@ -6,7 +6,10 @@ The threshold is the run's own, from its validation split. The metrics at the be
 reported, as an oracle: choosing it needs labels.
 """
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import overload
 
 import cv2
 import numpy as np
@@ -25,7 +28,7 @@ from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import check_output, chosen_threshold
-from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
+from perilune_train.detect.images.labelled import ImageSet, LabelledImage, Request, read_images
 from perilune_train.detect.images.predict import draw_boxes, table_of
 from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import Detector, open_detector
@@ -41,33 +44,68 @@ _LABEL, _SMALL = (64, 64, 255), (48, 192, 224)
 _COLOURS = {FOUND: (224, 211, 25), FALSE: (255, 64, 255)}
 
 
-def evaluate_images(
-    run: Path,
-    config: DetectConfig,
-    source: Path,
-    out: Path,
-    tiling: Tiling,
-    min_size_px: float = 8.0,
-    threshold: float | None = None,
-) -> Metrics:
-    """Evaluate a run on labelled images (a folder or a COCO file); returns the metrics written to `out`/metrics.json.
+@dataclass(frozen=True)
+class ImageSettings:
+    """How to read and evaluate labelled images."""
+
+    tiling: Tiling
+    """How to cut images."""
+    min_size_px: float = 8.0
+    """Minimum size of a crater to find, sqrt(w h), pixels."""
+    threshold: float | None = None
+    """Score threshold; None for that of the run."""
+    nodata: float | None = None
+    """Value of pixels without data."""
+    request: Request = field(default_factory=Request)
+    """What to read of the source."""
+
+
+class _Pictures(Sequence[NDArray[np.uint8]]):
+    """Pictures that are read when they are needed: together they may not fit into memory."""
+
+    def __init__(self, images: Sequence[LabelledImage], nodata: float | None):
+        self._images, self._nodata, self._told = images, nodata, set[int]()
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @overload
+    def __getitem__(self, place: int) -> NDArray[np.uint8]: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[NDArray[np.uint8]]: ...
+    def __getitem__(self, place: int | slice) -> NDArray[np.uint8] | list[NDArray[np.uint8]]:
+        if isinstance(place, slice):
+            return [self[k] for k in range(*place.indices(len(self)))]
+        quiet = place in self._told
+        self._told.add(place)
+        return read_grey(self._images[place].path, self._nodata, quiet)
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return (self[k] for k in range(len(self)))
+
+
+def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, settings: ImageSettings) -> Metrics:
+    """Evaluate a run on labelled images (labelled.py); returns the metrics written to `out`/metrics.json.
 
     Also writes report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png into `out`.
     Raises UserError if any input cannot be read; then nothing is written.
     """
     check_output(out, run)
+    tiling, min_size_px, threshold = settings.tiling, settings.min_size_px, settings.threshold
     tiling.check()
     if not 0 < min_size_px < np.inf:
         raise UserError("--min-size", "pixels", min_size_px, "above 0")
-    given = read_images(source)
+    given = read_images(source, settings.request)
     if not any(image.selected(min_size_px).any() for image in given.images):
         raise UserError(source, "boxes", f"none of {min_size_px:g} px or more", "at least one")
     threshold_source = (
         "of the run, chosen on its validation split" if threshold is None else "given on the command line"
     )
     threshold = chosen_threshold(run) if threshold is None else threshold
-    images = [read_grey(image.path) for image in given.images]
-    found = _detect(open_detector(runs.RunFolder(run).best, config), images, tiling)
+    images = _Pictures(given.images, settings.nodata)
+    for _ in images:
+        pass  # a damaged image is refused before hours of detection
+    found = _detect(open_detector(runs.RunFolder(run).best, config), given, images, tiling)
     evaluation = evaluate_detections_in_images(given, found, threshold, min_size_px, config.evaluation.match_iou)
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
@@ -80,13 +118,14 @@ def evaluate_images(
         f"oracle: with the threshold of highest F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
-    about += [for_markdown(given.categories)] * bool(given.categories)
+    about += [for_markdown(text) for text in (given.split, given.categories) if text]
     write_evaluation(out, evaluation, images, about)
     table = pd.concat(table_of(image.name, part) for image, part in zip(given.images, found, strict=True))
     with written_aside(out / "detections.parquet") as aside:
         table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
-    figures = {"images/name": source.resolve().name, "images/categories": given.categories} | evaluation.figures()
+    figures: Metrics = {"images/name": source.resolve().name, "images/categories": given.categories}
+    figures |= {"images/split": given.split} | evaluation.figures()
     figures |= {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
     figures |= {
@@ -103,7 +142,8 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
     centre, half = (image.boxes[:, :2] + image.boxes[:, 2:]) / 2, (image.boxes[:, 2:] - image.boxes[:, :2]) / 2
     ellipses = np.column_stack([centre, half, np.zeros(len(half))])
     every = np.ones(len(half), bool)
-    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.selected(min_size_px), every)
+    selected = image.selected(min_size_px)
+    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, selected, every, crowd=image.crowd)
 
 
 def evaluate_detections_in_images(
@@ -126,17 +166,17 @@ def evaluate_detections_in_images(
     )
 
 
-def _detect(detector: Detector, images: list[NDArray[np.uint8]], tiling: Tiling) -> list[Detections]:
+def _detect(detector: Detector, given: ImageSet, images: _Pictures, tiling: Tiling) -> list[Detections]:
     found = []
     with progress_bar() as progress:
-        total = sum(count_tiles(image.shape[0], image.shape[1], tiling) for image in images)
+        total = sum(count_tiles(image.height_px, image.width_px, tiling) for image in given.images)
         bar = progress.add_task("detect", total=total, unit="tiles", note="")
         for image in images:
             found.append(detect_image(detector, image, tiling, lambda n: progress.advance(bar, n)))
     return found
 
 
-def write_crops(path: Path, images: list[NDArray[np.uint8]], evaluation: Evaluation) -> None:
+def write_crops(path: Path, images: Sequence[NDArray[np.uint8]], evaluation: Evaluation) -> None:
     """Draw the centres of at most 12 images, enlarged twice, with labels and detections side by side.
 
     Left: labels (selected red, others orange). Right: detections above the threshold (matched cyan, false positives

@@ -6,7 +6,6 @@ Reading it needs rasterio and pyproj (the extra `geo`).
 
 import functools
 import importlib.util
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,15 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M
+from perilune_shared.storage.rasters import PICTURE_DRIVERS, opened_raster, raster_files
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.images.read import picture_format
+from perilune_train.detect.images.read import picture_size, stored_from_upright
 
 Array = NDArray[np.float64]
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 """Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
+_LARGEST_PRJ = 2**16
 _CORNERS = 32
 _GRID = 17
 """Number of sample points per side, to test whether an image is on its map; a full disc's corners are not."""
@@ -65,31 +66,37 @@ def _lon_lat_from_map(projection: str) -> Any:
 
 
 def read_georeference(path: Path) -> Georeference | None:
-    """Read the georeference of an image; None if its transform or projection is missing. Needs rasterio."""
-    import rasterio
+    """Read the georeference of an image; None if its transform or projection is missing. Needs rasterio.
+
+    Raises UserError if it is not one of the Moon.
+    """
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
 
     beside = path.with_suffix(".prj")
-    # By default GDAL opens text files named .tif that refer to other files. PAM files can also refer to them.
-    driver = {"TIFF": "GTiff"}.get(kind := picture_format(path), kind)
-    with warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
-        warnings.simplefilter("ignore")
+    with opened_raster(raster_files(path, PICTURE_DRIVERS, "image"), "image") as image:
+        transform, projection = image.transform, image.crs
+    if projection is None and beside.is_file():
         try:
-            with rasterio.open(path.resolve(), driver=driver) as image:
-                transform, projection, size = image.transform, image.crs, (image.width, image.height)
-            if projection is None and beside.is_file():
-                projection = CRS.from_wkt(beside.read_text(encoding="utf-8"), morph_from_esri_dialect=True)
+            projection = CRS.from_wkt(_prj_text(beside), morph_from_esri_dialect=True)
         except (RasterioError, ValueError) as error:
-            where = beside if beside.is_file() else path
-            raise UserError(where, "georeference", error, "a GeoTIFF, or a world file and a .prj") from None
+            raise UserError(beside, "georeference", error, "a projection as text (.prj)") from None
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
-    found = Georeference(tuple(transform)[:6], projection.to_wkt(), path)
+    # A georeference places the stored pixels, and detections are in pixels of the upright picture.
+    stored, place = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
+    a, b, c, d, e, f = (place[:, :2] @ stored + place * [0, 0, 1]).ravel().tolist()
+    size = picture_size(path)
+    found = Georeference((a, b, c, d, e, f), projection.to_wkt(), path)
     grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in size)), axis=-1).reshape(-1, 2)
     if not np.isfinite(found.lon_lat_deg(grid)).all(axis=1).any():
         raise UserError(path, "projection", "none of its pixels on the map", "an image of a place on the Moon")
     return found
+
+
+def _prj_text(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(_LARGEST_PRJ).decode("utf-8")
 
 
 def can_read_georeferences() -> bool:

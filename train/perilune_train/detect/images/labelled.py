@@ -1,235 +1,255 @@
-"""Labelled images from other sources: a folder of images with tables of boxes, or COCO.
+"""Read labelled images from other sources, in the layouts in which people have them.
 
-A table (`<name>.txt` beside `<name>.png`) has a header with X, Y, W and H: left, top, width and height of a box in
-pixels, separated by commas or tabs. COCO is read from annotations.json in the folder, or from a given file. Its images
-are searched in the file's folder, ../images, ../images/NAME and ../NAME, where NAME is the last part of the file's name
-(train2017 for instances_train2017.json). Coordinates are assumed to begin at the outer corner of the top-left pixel.
+| Source | Layout |
+|---|---|
+| COCO | a JSON file, or a folder that holds one, or one for each split |
+| YOLO | a data.yaml or its folder, a list of images (.txt), or folders images/ and labels/ |
+| CVAT for images | an XML file, or a folder that holds annotations.xml |
+| Pascal VOC, LabelMe, YOLO, tables of boxes | a file beside each image, or in labels/, Annotations/ or annotations/ |
+
+Of a folder with splits (train, val or valid, test) one is read. Coordinates begin at the outer corner of the top-left
+pixel of the upright picture.
 """
 
-import json
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import say
-from perilune_train.detect.images.read import SUFFIXES, picture_size
+from perilune_train.detect.images.labels import yolo
+from perilune_train.detect.images.labels.coco import is_coco, read_coco, read_content
+from perilune_train.detect.images.labels.image_set import (
+    Entry,
+    ImageSet,
+    LabelFile,
+    LabelledImage,
+    LabelledObject,
+    image_set,
+)
+from perilune_train.detect.images.labels.labelme import read_labelme
+from perilune_train.detect.images.labels.tables import read_table
+from perilune_train.detect.images.labels.texts import read_text
+from perilune_train.detect.images.labels.xml_files import read_cvat, read_voc
+from perilune_train.detect.images.pictures import pictures_of
 
-Array = NDArray[np.float64]
-_COLUMNS = ("X", "Y", "W", "H")
-_CRATER_NAMES = ("crater", "craters")
-_LARGEST_PX = 1e6
-
-
-@dataclass(frozen=True)
-class LabelledImage:
-    """One image and its labels; the pixels stay in the file."""
-
-    name: str
-    """Path within the folder, for tables and pictures."""
-    path: Path
-    """The image file."""
-    width_px: int
-    """Width, pixels."""
-    height_px: int
-    """Height, pixels."""
-    boxes: Array
-    """x0, y0, x1, y1 in pixels (M, 4); they may extend beyond the image."""
-    not_ignored: NDArray[np.bool_]
-    """False for a box that its source marks as ignored (M,)."""
-
-    @property
-    def sizes_px(self) -> Array:
-        """Side of the square of equal area, sqrt(w h), pixels (M,): the size of a crater here."""
-        return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
-
-    def selected(self, min_size_px: float) -> NDArray[np.bool_]:
-        """Which boxes are ground truth (M,): not ignored, centred in the image, and of at least this size."""
-        centre = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
-        inside = ((centre >= 0) & (centre < [self.width_px, self.height_px])).all(axis=1)
-        return self.not_ignored & inside & (self.sizes_px >= min_size_px)
+__all__ = ["ImageSet", "LabelledImage", "Request", "read_images", "read_table"]
+_COCO_NAMES = ("annotations.json", "_annotations.coco.json")
+_YAML = (".yaml", ".yml")
+_PICTURE_FOLDERS = ("images", "Images", "JPEGImages", "imgs")
+_LABEL_FOLDERS = ("labels", "Annotations", "annotations", "xmls")
+_LABEL_SUFFIXES = (".txt", ".xml", ".json")
+_DEFAULT_SPLIT = "test"
 
 
 @dataclass(frozen=True)
-class ImageSet:
-    """All labelled images of a folder or a COCO file."""
+class Request:
+    """What to read of a source."""
 
-    images: list[LabelledImage]
-    """Sorted by name, or in the order of the COCO file."""
-    clipped: bool
-    """Whether boxes are clipped at the image's edge (as in COCO), so that detections must be clipped before
-    matching."""
-    categories: str = ""
-    """Text that names the categories of a COCO file taken as craters; "" if there was no choice."""
-
-
-def read_images(source: Path) -> ImageSet:
-    """Read the labelled images of a folder or a COCO file. Raises UserError, naming file and line, on invalid input."""
-    if source.is_file():
-        return _read_coco(source)
-    if not source.is_dir():
-        raise UserError(source, "--images", "no such folder", "a folder of images with boxes, or a COCO file")
-    if (source / "annotations.json").is_file():
-        return _read_coco(source / "annotations.json")
-    paths = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise UserError(source, "--images", "no PNG, TIFF or JPEG", "images with boxes beside them")
-    images = []
-    for path in paths:
-        if not path.name.isascii() and any("\ud800" <= sign <= "\udfff" for sign in path.name):
-            raise UserError(source, "image", path.name, "file names in UTF-8")
-        boxes = read_table(path.with_suffix(".txt"))
-        images.append(LabelledImage(path.name, path, *picture_size(path), boxes, np.ones(len(boxes), bool)))
-    return ImageSet(images, clipped=False)
+    split: str | None = None
+    """train, val or test; None for test, or the only one."""
+    categories: tuple[str, ...] = ()
+    """Names of the categories that are craters; () for crater and craters."""
+    image_folder: Path | None = None
+    """Folder of the images that a COCO or CVAT file names; None for the folders near the file."""
 
 
-def read_table(path: Path) -> Array:
-    """Boxes (M, 4) of a table with a header. Raises UserError on an invalid row."""
-    rows = _lines(path)
-    header = next(rows, (1, ""))[1]
-    separator = "\t" if "\t" in header else ","
-    names = [name.strip().upper() for name in header.split(separator)]
-    for column in _COLUMNS:
-        if column not in names:
-            raise UserError(path, "line 1", header or "no header", f"a column {column}, as in ID,X,Y,W,H,C_X,CY")
-    places = [names.index(column) for column in _COLUMNS]
-    boxes = []
-    for number, line in rows:
-        cells = line.split(separator)
-        if len(cells) != len(names):
-            raise UserError(path, f"line {number}", f"{len(cells)} values", f"{len(names)}, as in the header")
-        boxes.append(_box([cells[place] for place in places], path, f"line {number}"))
-    return np.array(boxes, np.float64).reshape(-1, 4)
+def read_images(source: Path, request: Request = Request()) -> ImageSet:
+    """Read the labelled images of a folder or a label file. Raises UserError, naming file and line."""
+    if source.is_dir():
+        found, split = _of_folder(source, request)
+    elif source.is_file():
+        found, split = _of_file(source, request)
+    else:
+        raise UserError(source, "--images", "no such folder", "a folder of images with labels, or a label file")
+    if request.split is not None and not split:
+        raise UserError("--split", "split", request.split, f"a source with splits; {source.name} has none")
+    if split:
+        say(f"{source.name}: {split}")
+    return replace(image_set(found, request.categories), split=split)
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines that are not empty, numbered from 1."""
-    if not path.is_file():
-        raise UserError(path, "boxes", "no such file", "a text file of boxes (ID,X,Y,W,H,C_X,CY) beside each image")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise UserError(path, "boxes", "bytes that are not UTF-8 text", "rows of ID,X,Y,W,H,C_X,CY") from None
-    return ((n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip())
+def _of_file(path: Path, request: Request) -> tuple[LabelFile, str]:
+    suffix = path.suffix.lower()
+    if suffix in _YAML:
+        return _of_yaml(path, request)
+    if suffix == ".xml":
+        return read_cvat(path, request.image_folder), ""
+    if suffix == ".txt":
+        return _yolo(path, yolo.listed_pictures(path), {}), ""
+    return read_coco(path, read_content(path), request.image_folder), ""
 
 
-def _box(values: Any, path: Path, field: str, may_be_empty: bool = False) -> tuple[float, float, float, float]:
-    """A box from left, top, width and height."""
-    try:
-        x, y, w, h = (float(value) for value in values)
-    except (TypeError, ValueError, OverflowError):
-        raise UserError(path, field, values, "four numbers: left, top, width, height") from None
-    shorter = min(w, h)
-    if not all(math.isfinite(v) and abs(v) <= _LARGEST_PX for v in (x, y, w, h)) or not (
-        shorter > 0 or (may_be_empty and shorter == 0)
-    ):
-        raise UserError(path, field, values, f"a width and height above 0, and no number beyond {_LARGEST_PX:.0f} px")
-    return x, y, x + w, y + h
+def _of_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
+    for name in _COCO_NAMES:
+        if (folder / name).is_file():
+            return _of_file(folder / name, request)
+    yamls = sorted(path for path in folder.iterdir() if path.suffix.lower() in _YAML and "names" in _head(path))
+    if yamls:
+        return _of_yaml(yamls[0], request)
+    if (folder / "annotations.xml").is_file():
+        return _of_file(folder / "annotations.xml", request)
+    jsons = _coco_files(folder)
+    if jsons:
+        key, text = _split({_split_of(path.stem.rpartition("_")[2]): path for path in jsons}, jsons, request, folder)
+        return _of_file(key, request)[0], text
+    splits = {_split_of(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
+    splits.pop("", None)
+    if splits:
+        part, text = _split(splits, list(splits.values()), request, folder)
+        return _of_folder(part, replace(request, split=None))[0], text
+    return _beside(folder, request)
 
 
-def _read_coco(path: Path) -> ImageSet:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise UserError(path, "JSON", error, "a COCO file") from None
-    if not isinstance(content, dict):
-        raise UserError(path, "JSON", type(content).__name__, "an object with images and annotations")
-    craters, chosen = _crater_categories(_records(content, "categories", path), path)
-    images = _records(content, "images", path)
-    row_of = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
-    if not images or len(row_of) < len(images):
-        raise UserError(path, "images", "none" if not images else "duplicate ids", "images with an id each")
-    boxes: list[list] = [[] for _ in images]
-    not_ignored: list[list[bool]] = [[] for _ in images]
-    n_empty = 0
-    for n, annotation in enumerate(_records(content, "annotations", path)):
-        field = f"annotations[{n}]"
-        if craters is not None and annotation.get("category_id") not in craters:
-            continue
-        row = row_of.get(_identity(annotation, "image_id", field, path))
-        if row is None:
-            raise UserError(path, f"{field}.image_id", annotation["image_id"], "the id of one of the images")
-        box = _box(annotation.get("bbox"), path, f"{field}.bbox", may_be_empty=True)
-        if box[0] == box[2] or box[1] == box[3]:
-            n_empty += 1
-            continue
-        boxes[row].append(box)
-        not_ignored[row].append(not annotation.get("iscrowd") and not annotation.get("ignore"))
-    result = []
-    for k, image in enumerate(images):
-        picture = _picture(path, image.get("file_name"), f"images[{k}].file_name")
-        size = picture_size(picture)
-        stated = image.get("width", size[0]), image.get("height", size[1])
-        if stated != size:
-            raise UserError(
-                picture, "size", f"{size[0]} x {size[1]}", f"{stated[0]} x {stated[1]}, as stated in {path.name}"
-            )
-        own = np.array(boxes[k], np.float64).reshape(-1, 4)
-        result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(not_ignored[k], bool)))
-    if n_empty:
-        say(f"{path.name}: {n_empty} boxes without width or height are left out")
-    if chosen:
-        say(f"{path.name}: {chosen}")
-    return ImageSet(result, clipped=True, categories=chosen)
+def _split(by_split: dict[str, Path], paths: list[Path], request: Request, source: Path) -> tuple[Path, str]:
+    """One of several splits, and a text that names it; "" if there is only one part without a split's name."""
+    named = {split: path for split, path in by_split.items() if split}
+    if len(paths) == 1 and not (named and request.split):
+        return paths[0], ""
+    wanted = request.split or (_DEFAULT_SPLIT if _DEFAULT_SPLIT in named else None)
+    if wanted is None or wanted not in named:
+        names = ", ".join(named) or ", ".join(path.name for path in paths)
+        raise UserError(source, "splits", names, f"{wanted or 'test'} among them, or --split, or the path of one")
+    return named[wanted], f"split {wanted} of {', '.join(named)}"
 
 
-def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
-    """A list of objects; a missing list of categories counts as an empty one."""
-    found = content.get(name, [] if name == "categories" else None)
-    if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
-        raise UserError(path, name, type(found).__name__, "a list of objects, as in COCO")
-    return found
+def _split_of(name: str) -> str:
+    """train, val or test for the name of a folder or the ending of a file's; "" for others."""
+    return next((split for split, names in yolo.SPLIT_KEYS.items() if name.lower().rstrip("0123456789") in names), "")
 
 
-def _identity(record: dict[str, Any], name: str, field: str, path: Path) -> int | str:
-    value = record.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | str):
-        raise UserError(path, f"{field}.{name}", value, "a number or a name")
-    return value
+def _coco_files(folder: Path) -> list[Path]:
+    """The JSON files of a folder, or of its folder annotations, that hold COCO; not those of LabelMe."""
+    for place in (folder, folder / "annotations"):
+        paths = sorted(place.glob("*.json")) if place.is_dir() else []
+        stems = {path.stem for path in pictures_of(place)} if paths else set()
+        found = [path for path in paths if path.stem not in stems and not path.name.startswith(".")]
+        found = [path for path in found if '"shapes"' not in (head := _head(path)) and "{" in head]
+        # Beside them COCO has files of captions and key points.
+        found = [path for path in found if path.stem.startswith("instances")] or found
+        if len(found) == 1:
+            return found if is_coco(read_content(found[0])) else []
+        if found and all(_split_of(path.stem.rpartition("_")[2]) for path in found):
+            return found
+    return []
 
 
-def _crater_categories(categories: list[dict[str, Any]], path: Path) -> tuple[list[int | str] | None, str]:
-    """The ids of all categories named crater or craters, in upper or lower case, and a text that names them.
-
-    There may be several, since exports of Roboflow also have a placeholder category. With fewer than two categories in
-    the file every object is a crater: None and "".
-    """
-    if len(categories) < 2:
-        return None, ""
-    craters = [one for one in categories if str(one.get("name", "")).strip().lower() in _CRATER_NAMES]
-    names = [str(one.get("name")) for one in categories]
-    if not craters:
-        raise UserError(path, "categories", ", ".join(names), "one category, or one named crater or craters")
-    ids = [_identity(one, "id", "categories", path) for one in craters]
-    taken = ", ".join(f"{one.get('name')} ({number})" for one, number in zip(craters, ids, strict=True))
-    others = ", ".join(str(one.get("name")) for one in categories if one not in craters)
-    return ids, f"categories taken as craters: {taken}" + (f"; left out: {others}" if others else "")
+def _head(path: Path) -> str:
+    with path.open("rb") as file:
+        return file.read(2**16).decode("utf-8", "replace")
 
 
-def _picture(path: Path, name: Any, field: str) -> Path:
-    """Path of the image that a COCO file names, in the first possible folder that contains it."""
-    root = path.resolve().parent
-    ending = path.stem.rpartition("_")[2]
-    images = root.parent / "images"
-    for folder in (root, images, images / ending, root.parent / ending):
-        picture = _below(folder, name, path, field)
-        if picture.is_file():
-            return picture
-    return _below(root, name, path, field)
+def _of_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
+    content = yolo.read_data_yaml(path)
+    values = {split: content[key] for split, keys in yolo.SPLIT_KEYS.items() for key in keys if content.get(key)}
+    if not values:
+        raise UserError(path, "splits", "none", "train, val or test, each with a folder or a list of images")
+    wanted = request.split or (_DEFAULT_SPLIT if _DEFAULT_SPLIT in values or len(values) > 1 else next(iter(values)))
+    if wanted not in values:
+        raise UserError(path, "splits", ", ".join(values), f"{wanted} among them, or --split")
+    text = f"split {wanted} of {', '.join(values)}"
+    return _yolo(path, yolo.pictures_of_split(path, values[wanted]), yolo.class_names(content)), text
 
 
-def _below(folder: Path, name: Any, path: Path, field: str) -> Path:
-    """A path in a folder or below it. Raises UserError on a path that leads outside."""
-    if isinstance(name, str) and name and "\0" not in name:
-        try:
-            picture = folder.joinpath(name).resolve()
-        except (OSError, RuntimeError):  # circular links
-            picture = folder
-        if picture != folder and picture.is_relative_to(folder):
-            return picture
-    raise UserError(path, field, name, "a path of an image below the COCO file's folder, or below images next to it")
+def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFile:
+    """Pictures with the texts that the layout of YOLO gives them; without a text a picture has no objects."""
+    root = source.resolve().parent if source.is_file() else source.resolve()
+    entries, n_absent = [], 0
+    for picture in pictures:
+        text = yolo.label_of(picture)
+        present = text.is_file()
+        n_absent += not present
+        objects = yolo.read_yolo_text(text, picture) if present else []
+        name = (
+            picture.resolve().relative_to(root).as_posix() if picture.resolve().is_relative_to(root) else picture.name
+        )
+        entries.append(Entry(name, picture, objects, text))
+    if not entries or n_absent == len(entries):
+        raise UserError(source, "labels", "no image with a text of labels", "labels/a.txt for images/a.png")
+    notes = (f"{n_absent} images without a text of labels are taken as images without craters",) if n_absent else ()
+    return LabelFile(source, entries, names or _numbers_as_names(entries), notes=notes)
+
+
+def _numbers_as_names(entries: Sequence[Entry]) -> dict[str, str]:
+    return {one.category: one.category for entry in entries for one in entry.objects}
+
+
+def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
+    """Images with a label file each, beside them or in another folder."""
+    own = pictures_of(folder)
+    root = folder
+    if not own:
+        places = [folder / name for name in _PICTURE_FOLDERS if (folder / name).is_dir()]
+        root = places[0] if places else folder
+        own = pictures_of(root, recursive=True) if places else []
+    if not own:
+        raise UserError(folder, "--images", "no PNG, TIFF or JPEG", "images with labels beside them")
+    labels = [root, *(folder / name for name in _LABEL_FOLDERS if (folder / name).is_dir())]
+    by_suffix = {suffix: {} for suffix in _LABEL_SUFFIXES}  # type: dict[str, dict[Path, Path]]
+    for picture in own:
+        for place in labels:
+            for suffix in _LABEL_SUFFIXES:
+                path = (place / picture.relative_to(root)).with_suffix(suffix)
+                if path.is_file() and path not in own:
+                    by_suffix[suffix].setdefault(picture, path)
+    kinds = [suffix for suffix, files in by_suffix.items() if files]
+    if not kinds:
+        missing = own[0].with_suffix(".txt")
+        raise UserError(missing, "boxes", "no such file", "a file of labels for each image (.txt, .xml or .json)")
+    if len(kinds) > 1:
+        raise UserError(folder, "labels", f"files of {len(kinds)} kinds: {', '.join(kinds)}", "one kind")
+    files = by_suffix[kinds[0]]
+    return _of_pairs(folder, root, files, len(own) - len(files)), ""
+
+
+def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: int) -> LabelFile:
+    """Read the label file of each picture."""
+    pictures_by_label: dict[Path, Path] = {}
+    for picture, path in files.items():
+        if path in pictures_by_label:
+            found = f"{path.name}, also of {pictures_by_label[path].name}"
+            raise UserError(picture, "labels", found, "one image for each label file")
+        pictures_by_label[path] = picture
+    suffix = next(iter(pictures_by_label)).suffix.lower()
+    notes = [f"{n_unlabelled} images without labels are left out"] if n_unlabelled else []
+    entries, clip, n_shapes = [], True, 0
+    names: dict[str, str] = {}
+    read = _reader_of_texts(list(pictures_by_label)) if suffix == ".txt" else None
+    for path, picture in pictures_by_label.items():
+        name = picture.relative_to(root).as_posix()
+        if suffix == ".xml":
+            entries.append(read_voc(path, picture, name))
+        elif suffix == ".json":
+            entry, without_area = read_labelme(path, picture, name)
+            entries.append(entry)
+            n_shapes += without_area
+        elif read is not None:
+            entries.append(Entry(name, picture, read[0](path, picture), path))
+            clip = read[1]
+    if n_shapes:
+        notes.append(f"{n_shapes} points and lines are left out")
+    if suffix == ".txt" and clip:
+        names = _names_beside(folder)
+    return LabelFile(folder, entries, names or _numbers_as_names(entries), clip, tuple(notes))
+
+
+def _reader_of_texts(paths: list[Path]) -> tuple[Callable[[Path, Path], list[LabelledObject]], bool]:
+    """The reader of YOLO or of tables, by the first text that is not empty, and whether boxes are clipped."""
+    first = next((text for path in paths if (text := read_text(path, "boxes")).strip()), "")
+    if yolo.is_yolo(first):
+        return yolo.read_yolo_text, True
+    return _table_objects, False
+
+
+def _table_objects(path: Path, picture: Path) -> list[LabelledObject]:
+    del picture
+    return [LabelledObject(tuple(box)) for box in read_table(path).tolist()]
+
+
+def _names_beside(folder: Path) -> dict[str, str]:
+    """Names of YOLO's classes from classes.txt, as labelImg writes it; {} without one."""
+    for path in (folder / "classes.txt", folder / "labels" / "classes.txt"):
+        if path.is_file():
+            lines = [line.strip() for line in read_text(path, "names").splitlines()]
+            return {str(number): name for number, name in enumerate(lines) if name}
+    return {}

@@ -1,6 +1,7 @@
 """Detect craters in images of any size: tables, overlays and, for images with a georeference, GeoJSON."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from perilune_train.detect.images.georeference import (
     features,
     read_georeference,
 )
+from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
@@ -36,37 +38,49 @@ _LARGEST_OVERLAY_PX = 4096
 _SMALLEST_OVERLAY_PX = 1600
 
 
-def predict_images(
-    paths: list[Path], run: Path, config: DetectConfig, out: Path, threshold: float | None, tiling: Tiling
-) -> int:
-    """Find craters in images; returns their number. Writes all output to the new folder `out`, or nothing.
+@dataclass(frozen=True)
+class PredictSettings:
+    """How to find craters in images."""
 
-    Raises UserError on the first image that cannot be read, before detection starts.
+    tiling: Tiling
+    """How to cut images."""
+    threshold: float | None = None
+    """Minimum score; None for that of the run."""
+    min_size_px: float = 0.0
+    """Minimum size of a crater, sqrt(w h), pixels."""
+    nodata: float | None = None
+    """Value of pixels without data."""
+
+
+def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
+    """Find craters in images and folders of images; returns their number.
+
+    Writes all output to the new folder `out`, or nothing. Raises UserError on the first image that cannot be read,
+    before detection starts.
     """
+    tiling, nodata = settings.tiling, settings.nodata
     tiling.check()
+    paths = expanded(given)
+    check_names(paths, [path.name for path in paths])
     with new_folder(out) as folder, progress_bar() as progress:
         check = progress.add_task("check", total=len(paths), unit="images", note="")
         references: list[Georeference | None] = []
         n_tiles = 0
-        names: set[str] = set()
         for path in paths:
-            if path.name in names:
-                raise UserError(path, "name", "a second image of this name", "unique file names")
-            names.add(path.name)
             width, height = picture_size(path)
-            read_grey(path)
+            read_grey(path, nodata)
             references.append(_reference(path))
             n_tiles += count_tiles(height, width, tiling)
             progress.advance(check)
-        threshold = chosen_threshold(run) if threshold is None else threshold
+        threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
         detector = open_detector(runs.RunFolder(run).best, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes = [], []
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
-            image = read_grey(path)
+            image = read_grey(path, nodata, quiet=True)
             found = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
-            found = above(found, threshold)
+            found = of_size(above(found, threshold), settings.min_size_px)
             tables.append(table_of(path.name, found))
             write_overlay(folder / f"{path.name}.overlay.png", image, found)
             if reference is not None:
@@ -86,7 +100,13 @@ def predict_images(
 
 def _reference(path: Path) -> Georeference | None:
     if can_read_georeferences():
-        return read_georeference(path)
+        try:
+            return read_georeference(path)
+        except UserError as error:
+            # Pixels need no map, and maps of other bodies, or wrong ones, are common.
+            message = f"{path.name}: not in detections.geojson, since its map cannot be used: {error.field}: got"
+            say(f"{message} {error.found}, expected {error.expected}")
+            return None
     if path.suffix.lower() in (".tif", ".tiff") or path.with_suffix(".prj").is_file():
         say(f"{path.name}: reading its georeference needs rasterio and pyproj (pip install 'perilune-train[geo]')")
     return None
@@ -96,6 +116,26 @@ def above(found: Detections, threshold: float) -> Detections:
     """The detections with at least this score."""
     strong = found.scores >= threshold
     return Detections(found.boxes[strong], found.scores[strong])
+
+
+def of_size(found: Detections, min_size_px: float) -> Detections:
+    """The detections of at least this size, sqrt(w h), pixels."""
+    large = np.sqrt(np.prod(found.boxes[:, 2:] - found.boxes[:, :2], axis=1)) >= min_size_px
+    return Detections(found.boxes[large], found.scores[large])
+
+
+def expanded(given: list[Path]) -> list[Path]:
+    """The images that are given, and those of given folders. Raises UserError on a folder without images."""
+    paths = []
+    for path in given:
+        if not path.is_dir():
+            paths.append(path)
+            continue
+        own = pictures_of(path)
+        if not own:
+            raise UserError(path, "images", "a folder without images", "PNG, TIFF, JPEG or others, not in its folders")
+        paths += own
+    return paths
 
 
 def table_of(name: str, found: Detections) -> pd.DataFrame:

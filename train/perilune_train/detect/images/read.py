@@ -1,10 +1,16 @@
-"""Read an image as 8-bit grey: PNG, TIFF and JPEG of any size and depth.
+"""Read a picture as 8-bit grey: PNG, TIFF, JPEG, JPEG 2000, ISIS cubes and PDS, of any size and depth.
 
-Pillow reads most of them. It reduces 16-bit colours to 8 bits, so OpenCV reads such PNGs. rasterio (the extra `geo`)
-reads TIFFs of float64 or with several bands deeper than 8 bits, since OpenCV misreads some of them.
+Pillow reads PNG, JPEG and 8-bit TIFF, OpenCV 16-bit colours in PNG, which Pillow reduces to 8 bits. rasterio (the extra
+`geo`) reads all others, strip by strip; without it Pillow reads 16-bit and float32 TIFF. Pixels are turned upright
+(orientation.py).
 """
 
+import contextlib
+import importlib.util
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,147 +20,296 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from perilune_shared.errors import UserError
+from perilune_shared.storage.rasters import PICTURE_DRIVERS, opened_raster, raster_files
+from perilune_shared.terminal import say
+from perilune_train.detect.images.orientation import (
+    is_turned,
+    orientation_of,
+    stored_coordinates,
+    tiff_orientation,
+    tiff_tags,
+    upright,
+)
+from perilune_train.detect.images.stretch import LARGEST_VALUE, SAMPLE, Stretch, stretch_of
 
-SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
-_FORMATS = ("PNG", "TIFF", "JPEG")
-_LARGEST_PIXELS = 2**29
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".img", ".cub", ".lbl")
+_KINDS = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000", "ISIS3": "ISIS cube", "PDS": "PDS3"}
+LARGEST_PIXELS = 2**29
 """Largest number of pixels of an image: twice a whole Narrow Angle Camera image. The header of a small file can state
 any size."""
-_STRETCH_PERCENT = (0.05, 99.95)
-_SAMPLE = 1_000_000
-_LARGEST_VALUE = 1e30
-"""Larger values are no measurements: ISIS marks missing data by values near the end of float32's range."""
-_BITS_TAG, _NODATA_TAG = 258, 42113
+LARGEST_DECODED = 2**30
+"""Largest number of bytes of a picture that is decoded as a whole, which is all that rasterio does not read."""
+_FORMATS = ("PNG", "TIFF", "JPEG")
+_BITS_TAG, _PHOTOMETRIC_TAG, _SAMPLE_FORMAT_TAG, _NODATA_TAG = 258, 262, 339, 42113
+_WHITE_IS_ZERO, _SIGNED = 0, 2
 _LUMA = (0.299, 0.587, 0.114)
+_STRIP_PIXELS = 2**22
+_CACHE_MB = 64
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """An opened picture."""
+
+    path: Path
+    """The file."""
+    kind: str
+    """PNG, TIFF, JPEG or the name of a raster's format."""
+    width_px: int
+    """Width as decoded, pixels."""
+    height_px: int
+    """Height as decoded, pixels."""
+    orientation: int
+    """See orientation.py."""
+    is_upright: bool
+    """Whether the decoder turns the pixels, as Pillow does those of TIFF."""
+    white_is_zero: bool
+    """Whether larger values are darker, and the decoder has not inverted them."""
+    nodata: float | None
+    """The value that the file gives to pixels without data."""
+    strips: Callable[[], Iterator[NDArray]]
+    """Reads the bands (1 or 3, rows, width) from top to bottom; uint8 is grey as it is."""
+
+    def size_px(self, upright: bool) -> tuple[int, int]:
+        """Width and height, pixels, of the upright or the stored picture."""
+        swapped = is_turned(self.orientation) and upright != self.is_upright
+        return (self.height_px, self.width_px) if swapped else (self.width_px, self.height_px)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, read from the header only. Raises UserError if it is no image or too large."""
+    """Width and height of the upright picture, pixels, from the header. Raises UserError if it is none or too large."""
     with _opened(path) as picture:
-        return picture.width, picture.height
+        return picture.size_px(upright=True)
 
 
 def picture_format(path: Path) -> str:
-    """PNG, TIFF or JPEG, by content. Raises UserError if it is none of these."""
+    """PNG, TIFF, JPEG or another format, by content. Raises UserError if it is none of these."""
     with _opened(path) as picture:
-        return str(picture.format) if isinstance(picture, Image.Image) else "TIFF"
+        return picture.kind
 
 
-def read_grey(path: Path) -> NDArray[np.uint8]:
-    """An image's pixels (height, width) as 8-bit grey.
+def stored_from_upright(path: Path) -> NDArray[np.float64]:
+    """The matrix (2, 3) from pixel coordinates of the upright picture to those of the file (orientation.py)."""
+    with _opened(path) as picture:
+        return stored_coordinates(picture.orientation, *picture.size_px(upright=False))
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """Width and height of the picture as it is stored, pixels."""
+    with _opened(path) as picture:
+        return picture.size_px(upright=False)
+
+
+def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> NDArray[np.uint8]:
+    """The upright picture's pixels (height, width) as 8-bit grey.
 
     8-bit grey is not changed. Colours become their luma; of other bands the first is used. Deeper images (16 bits and
     more, float) are stretched so that 99.9 % of their values are within 0..255: the network removes mean and deviation
-    anyway, and 16-bit files often use a small part of their range. Their values that are not finite, beyond 1e30 or
-    equal to the file's own no-data value (GDAL_NODATA) are left out of the stretch and become 0. Raises UserError on a
-    damaged file.
+    anyway, and 16-bit files often use a small part of their range. Left out of the stretch, and 0, are values that are
+    not finite, beyond 1e30, equal to the file's no-data value or to `nodata`, and, if neither is given, values that
+    stretch.py takes as missing data; a line names these unless `quiet`. Raises UserError on a damaged file.
     """
     with _opened(path) as picture:
-        try:
-            pixels = _by_pillow(path, picture) if isinstance(picture, Image.Image) else _by_rasterio(picture)
-        except (OSError, ValueError, SyntaxError, MemoryError, cv2.error) as error:
-            raise UserError(path, "image", error, "a whole PNG, TIFF or JPEG") from None
-    return pixels if pixels.dtype == np.uint8 else _stretched(pixels)
+        grey = np.empty((picture.height_px, picture.width_px), np.uint8)
+        stretch, top = None, 0
+        for bands in picture.strips():
+            if bands.dtype != np.uint8 and stretch is None:
+                stretch = _stretch(picture, nodata)
+            rows = slice(top, top := top + bands.shape[1])
+            grey[rows] = _grey_of(bands, picture, nodata, stretch)
+        if stretch is not None and stretch.fills and not quiet:
+            values = ", ".join(f"{fill:g}" for fill in stretch.fills)
+            found = f"{stretch.fill_share:.1%} of the pixels are {values}, far from all others"
+            say(f"{path.name}: {found}: taken as no data (--nodata sets the value)")
+        return grey if picture.is_upright else upright(grey, picture.orientation)
 
 
-def _opened(path: Path) -> Any:
-    """A Pillow image, or a rasterio dataset if Pillow does not suffice; both have a width and a height."""
-    if not path.is_file():
-        raise UserError(path, "image", "a folder" if path.is_dir() else "no such file", "a PNG, TIFF or JPEG")
-    Image.MAX_IMAGE_PIXELS = None
-    picture: Any
-    with warnings.catch_warnings():
-        # Serious errors raise an exception; warnings are about metadata only.
-        warnings.simplefilter("ignore")
-        try:
-            picture = Image.open(path, formats=_FORMATS)
-            bits = picture.tag_v2.get(_BITS_TAG, (1,)) if picture.format == "TIFF" else (1,)
-        except (OSError, ValueError, SyntaxError):
-            picture = _opened_by_rasterio(path)
+def _grey_of(bands: NDArray, picture: _Picture, nodata: float | None, stretch: Stretch | None) -> NDArray[np.uint8]:
+    """A strip as 8-bit grey."""
+    if stretch is not None:
+        grey = stretch.grey(_values(bands, picture, nodata))
+        return grey
+    missing = None if nodata is None else (bands == nodata).all(axis=0)
+    grey = np.rint(_luma(bands)).astype(np.uint8) if len(bands) > 1 else bands[0]
+    if picture.white_is_zero:
+        grey = np.uint8(255) - grey
+    return grey if missing is None else np.where(missing, np.uint8(0), grey)
+
+
+def _stretch(picture: _Picture, nodata: float | None) -> Stretch:
+    """The stretch of all pixels, from a sample of them."""
+    step = max(picture.width_px * picture.height_px // SAMPLE, 1)
+    sample, start = [], 0
+    for bands in picture.strips():
+        every = bands.reshape(len(bands), 1, -1)
+        values = _values(every[..., -start % step :: step], picture, nodata).ravel()
+        sample.append(values[np.isfinite(values)])
+        start += every.shape[-1]
+    declared = nodata is not None or picture.nodata is not None
+    return stretch_of(np.concatenate(sample), find_fills=not declared)
+
+
+def _values(bands: NDArray, picture: _Picture, nodata: float | None) -> NDArray:
+    """Bands (1 or 3, rows, width) as float grey (rows, width), larger brighter, NaN where there is no data."""
+    if bands.dtype.kind == "c":
+        raise UserError(picture.path, "image", "complex numbers", "real numbers")
+    # float32 holds all values of 16 bits; those of 32 bits need float64.
+    small = bands.dtype.itemsize <= 2 or bands.dtype == np.float32
+    values = bands.astype(np.float32 if small else np.float64)
+    values[~(np.abs(values) <= LARGEST_VALUE)] = np.nan
+    for missing in (nodata, picture.nodata):
+        if missing is not None and abs(missing) <= LARGEST_VALUE:
+            values[values == (np.float32(missing) if values.dtype == np.float32 else missing)] = np.nan
+    grey = _luma(values) if len(values) > 1 else values[0]
+    return -grey if picture.white_is_zero else grey
+
+
+def _luma(bands: NDArray) -> NDArray:
+    return np.asarray(sum(weight * band for weight, band in zip(_LUMA, bands, strict=True)))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Picture]:
+    """Open a picture by its content. Raises UserError on other files, and on damage in the block too."""
+    driver = raster_files(path, PICTURE_DRIVERS, "image").driver
+    by_pillow = driver in ("GTiff", "PNG", "JPEG")
+    has_rasterio = importlib.util.find_spec("rasterio") is not None
+    if not by_pillow and not has_rasterio:
+        expected = "rasterio, which reads this format (pip install 'perilune-train[geo]')"
+        raise UserError(path, "image", f"{_KINDS.get(driver, driver)} without rasterio", expected)
+    tags = tiff_tags(path) if driver == "GTiff" else {}
+    with contextlib.ExitStack() as stack:
+        opened = None
+        if by_pillow and not (has_rasterio and _is_deep_or_signed(tags)):
+            opened = _pillow_image(path, stack)
+        if opened is not None:
+            yield _by_pillow(path, opened, tags)
+        elif driver == "GTiff" and not has_rasterio:
+            expected = "an 8-bit TIFF, or rasterio, which reads all (pip install 'perilune-train[geo]')"
+            raise UserError(path, "image", "a file that cannot be decoded", expected)
         else:
-            if len(bits) > 1 and max(bits) > 8:
-                picture.close()
-                picture = _opened_by_rasterio(path)
-    width, height = picture.width, picture.height
-    if width * height > _LARGEST_PIXELS:
-        picture.close()
-        raise UserError(path, "size", f"{width} x {height}", f"at most {_LARGEST_PIXELS} pixels")
-    return picture
+            yield stack.enter_context(_by_rasterio(path, driver, tags))
 
 
-def _opened_by_rasterio(path: Path) -> Any:
-    found, expected = "a file that cannot be decoded", "a PNG, TIFF or JPEG"
+def _pillow_image(path: Path, stack: contextlib.ExitStack) -> Any:
+    """An image opened by Pillow; None if it is of a kind that Pillow does not decode."""
+    stack.enter_context(warnings.catch_warnings())
+    # Serious errors raise an exception; warnings are about metadata only.
+    warnings.simplefilter("ignore")
+    Image.MAX_IMAGE_PIXELS = None
+    # From a file object: Pillow would map an uncompressed TIFF of a given name, and a turned one wrongly.
+    file = stack.enter_context(path.open("rb"))
     try:
-        import rasterio
-        from rasterio.errors import RasterioError
-    except ImportError:
-        hint = "; float64 and deep colours in TIFF need rasterio (pip install 'perilune-train[geo]')"
-        raise UserError(path, "image", found, expected + hint) from None
-    try:
-        # By default GDAL opens text files named .tif that refer to other files. PAM files can also refer to them.
-        with rasterio.Env(GDAL_PAM_ENABLED="NO"):
-            return rasterio.open(path.resolve(), driver="GTiff")
-    except RasterioError:
-        raise UserError(path, "image", found, expected) from None
-
-
-def _by_pillow(path: Path, picture: Any) -> NDArray:
-    """Pixels (height, width): uint8, or float with NaN where there is no data."""
-    if picture.mode.startswith(("I", "F")):
-        return _known(np.asarray(picture), _nodata(picture))
-    if picture.format == "PNG" and ";16" in str(picture.tile[0][3]):
-        # Load with Pillow first: it raises an error on damage, OpenCV only prints to standard error.
-        picture.load()
-        deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
-            raise ValueError("16-bit colours that cannot be decoded")
-        return _grey(deep[..., 2::-1].transpose(2, 0, 1).astype(np.float32))
-    return np.asarray(picture.convert("L"))
-
-
-def _by_rasterio(image: Any) -> NDArray:
-    """Pixels as returned by `_by_pillow`."""
-    from rasterio.enums import ColorInterp
-
-    colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-    kinds = list(image.colorinterp)
-    indexes = [kinds.index(colour) + 1 for colour in colours] if all(colour in kinds for colour in colours) else [1]
-    pixels = image.read(indexes)
-    if pixels.dtype.kind == "c":
-        raise ValueError("complex numbers")
-    return _grey(pixels) if pixels.dtype == np.uint8 else _grey(_known(pixels, image.nodata))
-
-
-def _grey(bands: NDArray) -> NDArray:
-    """The only band of (1, height, width), or the luma of red, green and blue (3, height, width)."""
-    if len(bands) == 1:
-        return bands[0]
-    luma = sum(weight * band for weight, band in zip(_LUMA, bands, strict=True))
-    return np.rint(luma).astype(np.uint8) if bands.dtype == np.uint8 else np.asarray(luma)
-
-
-def _nodata(picture: Any) -> float | None:
-    """The value that GDAL's tag of a TIFF gives to pixels without data."""
-    text = picture.tag_v2.get(_NODATA_TAG) if picture.format == "TIFF" else None
-    try:
-        return float(str(text).strip("\0 "))
-    except ValueError:
+        return stack.enter_context(Image.open(file, formats=_FORMATS))
+    except (OSError, ValueError, SyntaxError):
         return None
 
 
-def _known(pixels: NDArray, nodata: float | None) -> NDArray:
-    """Pixels as float, NaN where there is no data."""
-    values = pixels.astype(np.float64 if pixels.dtype == np.float64 else np.float32)
-    values[~(np.abs(values) <= _LARGEST_VALUE)] = np.nan
-    if nodata is not None and abs(nodata) <= _LARGEST_VALUE:
-        values[values == nodata] = np.nan
-    return values
+def _bits(tags: dict[int, Any]) -> tuple[int, ...]:
+    found = tags.get(_BITS_TAG, (1,))
+    found = found if isinstance(found, tuple) else (found,)
+    return tuple(value for value in found if isinstance(value, int)) or (1,)
 
 
-def _stretched(values: NDArray) -> NDArray[np.uint8]:
-    known = np.isfinite(values)
-    sample = values[known]
-    sample = sample[:: max(sample.size // _SAMPLE, 1)]
-    low, high = np.percentile(sample, _STRETCH_PERCENT) if len(sample) else (0.0, 1.0)
-    grey = (np.where(known, values, low) - low) * (255 / max(float(high - low), 1e-12))
-    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+def _is_deep_or_signed(tags: dict[int, Any]) -> bool:
+    """Whether a TIFF has more than 8 bits, or signed numbers: of these Pillow reads only some."""
+    kinds = tags.get(_SAMPLE_FORMAT_TAG, (1,))
+    return max(_bits(tags)) > 8 or _SIGNED in (kinds if isinstance(kinds, tuple) else (kinds,))
+
+
+def _by_pillow(path: Path, opened: Any, tags: dict[int, Any]) -> _Picture:
+    kind = "JPEG" if opened.format == "MPO" else str(opened.format)
+    bytes_per_pixel = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2, "I;16L": 2}.get(opened.mode, 4)
+    orientation = tiff_orientation(tags) if kind == "TIFF" else orientation_of(opened, path)
+    deep_colours = kind == "PNG" and bool(opened.tile) and ";16" in str(opened.tile[0][3]) and opened.mode != "I;16"
+    _check_size(path, opened.width, opened.height, 10 if deep_colours else bytes_per_pixel)
+
+    def strips() -> Iterator[NDArray]:
+        try:
+            yield from decoded()
+        except (OSError, ValueError, SyntaxError, MemoryError, EOFError, cv2.error) as error:
+            raise UserError(path, "image", error, f"a whole {kind}") from None
+
+    def decoded() -> Iterator[NDArray]:
+        opened.load()
+        deep = _deep_colours(path) if deep_colours else None
+        rows = max(_STRIP_PIXELS // opened.width, 1)
+        for top in range(0, opened.height, rows):
+            bottom = min(top + rows, opened.height)
+            if deep is not None:
+                yield deep[top:bottom, :, 2::-1].transpose(2, 0, 1)
+                continue
+            part = opened.crop((0, top, opened.width, bottom))
+            values = np.asarray(part if part.mode.startswith(("I", "F")) else part.convert("L"))
+            if kind == "TIFF" and part.mode == "I" and tags.get(_SAMPLE_FORMAT_TAG, (1,)) in (1, (1,)):
+                # Pillow knows only signed numbers of 32 bits.
+                values = values.view(np.uint32)
+            yield values[None]
+
+    deep_tiff = kind == "TIFF" and opened.mode.startswith(("I", "F"))
+    inverted = deep_tiff and tags.get(_PHOTOMETRIC_TAG) == _WHITE_IS_ZERO
+    # Pillow gives the upright size of a TIFF, and turns its pixels when it loads them.
+    size = opened.width, opened.height
+    return _Picture(path, kind, *size, orientation, kind == "TIFF", inverted, _nodata(tags), strips)
+
+
+def _deep_colours(path: Path) -> NDArray:
+    """16-bit colours (height, width, 3 or 4), blue first, as OpenCV reads them."""
+    # Pillow has loaded the file before: it raises an error on damage, OpenCV only prints to standard error.
+    deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
+        raise ValueError("16-bit colours that cannot be decoded")
+    return np.asarray(deep)
+
+
+@contextmanager
+def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Picture]:
+    import rasterio
+    from rasterio.enums import ColorInterp
+    from rasterio.windows import Window
+
+    files = raster_files(path, PICTURE_DRIVERS, "image")
+    # GDAL's cache is by default 5 % of the machine's memory.
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE_MB), opened_raster(files, "image") as raster:
+        colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+        kinds = list(raster.colorinterp)
+        found = all(colour in kinds for colour in colours)
+        indexes = [kinds.index(colour) + 1 for colour in colours] if found else [1]
+        width, height = raster.width, raster.height
+        # OpenJPEG decodes whole tiles, of which there may be one, to 4 bytes.
+        _check_size(path, width, height, 4 if driver == "JP2OpenJPEG" else 1)
+        block_rows = raster.block_shapes[0][0]
+        some = max(_STRIP_PIXELS // width, 1)
+        rows = max(some // block_rows, 1) * block_rows
+
+        def strips() -> Iterator[NDArray]:
+            for top in range(0, height, rows):
+                bands = raster.read(indexes, window=Window(0, top, width, min(rows, height - top)))
+                for start in range(0, bands.shape[1], some):
+                    yield bands[:, start : start + some]
+
+        yield _Picture(
+            path,
+            _KINDS.get(driver, driver),
+            width,
+            height,
+            tiff_orientation(tags),
+            False,
+            tags.get(_PHOTOMETRIC_TAG) == _WHITE_IS_ZERO,
+            None if raster.nodata is None else float(raster.nodata),
+            strips,
+        )
+
+
+def _check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
+    most = min(LARGEST_PIXELS, LARGEST_DECODED // bytes_per_pixel)
+    if width * height > most:
+        raise UserError(path, "size", f"{width} x {height}", f"at most {most} pixels, for {bytes_per_pixel} bytes each")
+
+
+def _nodata(tags: dict[int, Any]) -> float | None:
+    """The value that GDAL's tag of a TIFF gives to pixels without data."""
+    try:
+        return float(str(tags.get(_NODATA_TAG)).strip("\0 "))
+    except ValueError:
+        return None

@@ -16,6 +16,9 @@ from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
+_REACH = 4
+"""Pixels beyond a slice that its cubic interpolation needs."""
+
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
     """Resize an image (height, width); returns the same object if the size is the same."""
@@ -24,6 +27,33 @@ def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[
     # When shrinking, area averaging avoids aliased noise, which looks like craters.
     how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
+
+
+class Enlarged:
+    """An image (height, width) as if enlarged, of which only the pixels of a slice are computed.
+
+    For images that do not fit into memory when they are enlarged. Values differ from those of `resized` by rounding,
+    since OpenCV interpolates here at 32 places between two pixels.
+    """
+
+    def __init__(self, image: NDArray[np.uint8], width_px: int, height_px: int):
+        self._image, self.shape = image, (height_px, width_px)
+        self._ratio = image.shape[0] / height_px, image.shape[1] / width_px
+
+    def __getitem__(self, place: tuple[slice, slice]) -> NDArray[np.uint8]:
+        starts, sizes, lows, parts = [], [], [], []
+        for part, length, ratio, side in zip(place, self.shape, self._ratio, self._image.shape, strict=True):
+            start, stop, _ = part.indices(length)
+            low, high = (int(np.floor(edge * ratio)) + more for edge, more in ((start, -_REACH), (stop, _REACH + 1)))
+            starts.append((start + 0.5) * ratio - 0.5 - max(low, 0))
+            sizes.append(stop - start)
+            lows.append(max(low, 0))
+            parts.append(slice(max(low, 0), min(high, side)))
+        matrix = np.array([[self._ratio[1], 0, starts[1]], [0, self._ratio[0], starts[0]]])
+        own = np.ascontiguousarray(self._image[parts[0], parts[1]])
+        how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        window = cv2.warpAffine(own, matrix, (sizes[1], sizes[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(window, np.uint8)
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:

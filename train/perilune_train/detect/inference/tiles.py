@@ -15,13 +15,15 @@ from perilune_train.detect.config import COARSEST_STRIDE
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.inference.detector import Detector
-from perilune_train.detect.inference.scales import resized
+from perilune_train.detect.inference.scales import Enlarged, resized
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.inference.tiling import Tiling
 
 Array = NDArray[np.float64]
 _MAX_TOGETHER = 5_000
 """Largest number of boxes that are suppressed together; above it, block by block."""
+_MOST_ENLARGED_PIXELS = 2**27
+"""Images with more pixels after enlarging are enlarged tile by tile."""
 _TOLERANCE_PX = 2.0
 """Tolerance of the distance to a tile's border. Two tiles detect a crater at slightly different positions; without a
 tolerance both could drop it."""
@@ -64,8 +66,9 @@ def detect_image(
     boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
     for scale in tiling.scales:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
-        scaled = resized(image, *size)
-        whole = padded(scaled, tiling.tile_px)
+        large = scale > 1 and size[0] * size[1] > _MOST_ENLARGED_PIXELS and min(size) >= tiling.tile_px
+        scaled = Enlarged(image, *size) if large else resized(image, *size)
+        whole = scaled if isinstance(scaled, Enlarged) else padded(scaled, tiling.tile_px)
         for found in _detect_tiles(detector, whole, tiling, advance):
             own = np.ones(len(found.scores), bool)
             if whole.shape != scaled.shape:
@@ -102,7 +105,7 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 
 
 def _detect_tiles(
-    detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object]
+    detector: Detector, image: NDArray[np.uint8] | Enlarged, tiling: Tiling, advance: Callable[[int], object]
 ) -> Iterator[Detections]:
     """Detections of each tile of an image, in pixels of the image, without boxes that another tile keeps."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)

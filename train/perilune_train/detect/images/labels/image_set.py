@@ -1,0 +1,169 @@
+"""Labelled images, and how the objects of a label file become them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.terminal import say
+from perilune_train.detect.images.labels.boxes import Box, StatedSize
+from perilune_train.detect.images.pictures import check_names
+from perilune_train.detect.images.read import picture_size, stored_size
+
+Array = NDArray[np.float64]
+_CRATER_NAMES = ("crater", "craters")
+
+
+@dataclass(frozen=True)
+class LabelledImage:
+    """One image and its labels; the pixels stay in the file."""
+
+    name: str
+    """Path within the folder, for tables and pictures."""
+    path: Path
+    """The image file."""
+    width_px: int
+    """Width, pixels."""
+    height_px: int
+    """Height, pixels."""
+    boxes: Array
+    """x0, y0, x1, y1 in pixels (M, 4); they may extend beyond the image, except in a clipped set."""
+    not_ignored: NDArray[np.bool_]
+    """False for a box that its source marks as ignored (M,)."""
+    crowd: NDArray[np.bool_] | None = None
+    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if none is."""
+
+    @property
+    def sizes_px(self) -> Array:
+        """Side of the square of equal area, sqrt(w h), pixels (M,): the size of a crater here."""
+        return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
+
+    def selected(self, min_size_px: float) -> NDArray[np.bool_]:
+        """Which boxes are ground truth (M,): not ignored, centred in the image, and of at least this size."""
+        centre = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
+        inside = ((centre >= 0) & (centre < [self.width_px, self.height_px])).all(axis=1)
+        return self.not_ignored & inside & (self.sizes_px >= min_size_px)
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """All labelled images of a folder or a label file."""
+
+    images: list[LabelledImage]
+    """Sorted by name, or in the order of the file."""
+    clipped: bool
+    """Whether boxes are clipped at the image's edge, so that detections must be clipped before matching."""
+    categories: str = ""
+    """Text that names the categories taken as craters; "" if there was no choice."""
+    split: str = ""
+    """Text that names the split, if the source has several; else ""."""
+
+
+@dataclass(frozen=True)
+class LabelledObject:
+    """One object of a label file."""
+
+    box: Box
+    """x0, y0, x1, y1, pixels."""
+    category: str = ""
+    """Identity of its category, a key of `LabelFile.categories`."""
+    ignored: bool = False
+    """Whether its source marks it as one that does not count (`ignore`, `difficult`)."""
+    crowd: bool = False
+    """Whether it is a region of many objects (`iscrowd`)."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A picture and its objects, as a label file gives them."""
+
+    name: str
+    """Name in tables."""
+    path: Path
+    """The picture."""
+    objects: list[LabelledObject]
+    """All objects, of every category."""
+    labels: Path
+    """The label file, named in messages."""
+    size_px: StatedSize = (None, None)
+    """Width and height that the file states."""
+
+
+@dataclass(frozen=True)
+class LabelFile:
+    """What the readers of all formats return."""
+
+    source: Path
+    """Named in messages about categories."""
+    entries: list[Entry]
+    """Pictures."""
+    categories: Mapping[str, str] = field(default_factory=dict)
+    """Name of each category, by its identity in the file."""
+    clip: bool = True
+    """Whether boxes end at the edges of the picture."""
+    notes: tuple[str, ...] = ()
+    """Lines for the user."""
+
+
+def image_set(given: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
+    """Check the pictures, choose the craters among the objects, clip their boxes. Raises UserError."""
+    chosen, text = choose_categories(given.categories, wanted, given.source)
+    check_names([entry.path for entry in given.entries], [entry.name for entry in given.entries])
+    check_names([entry.path for entry in given.entries], [str(entry.path.resolve()) for entry in given.entries])
+    images, n_empty = [], 0
+    for entry in given.entries:
+        size = picture_size(entry.path)
+        if any(stated not in (None, side) for stated, side in zip(entry.size_px, size, strict=True)):
+            raise _other_size(entry, size)
+        own = [one for one in entry.objects if chosen is None or one.category in chosen]
+        boxes = np.array([one.box for one in own], np.float64).reshape(-1, 4)
+        if given.clip:
+            boxes = np.clip(boxes, 0, np.tile(size, 2))
+        kept = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        n_empty += int((~kept).sum())
+        crowd = np.array([one.crowd for one in own], bool)[kept]
+        not_ignored = ~np.array([one.ignored or one.crowd for one in own], bool)[kept]
+        images.append(LabelledImage(entry.name, entry.path, *size, boxes[kept], not_ignored, crowd))
+    left_out = f"{n_empty} boxes without width or height in the picture are left out"
+    for note in (*given.notes, *[left_out] * bool(n_empty), *[text] * bool(text)):
+        say(f"{given.source.name}: {note}")
+    return ImageSet(images, given.clip, text)
+
+
+def choose_categories(
+    categories: Mapping[str, str], wanted: Sequence[str], source: Path
+) -> tuple[set[str] | None, str]:
+    """The identities of the categories that are craters, and a text that names them.
+
+    Without `wanted` these are all named crater or craters, in upper or lower case: there may be several, since exports
+    of Roboflow also have a placeholder category. With fewer than two categories every object is a crater: None.
+    """
+    names = {key: " ".join(name.split()) for key, name in categories.items()}
+    asked = [name.strip().lower() for name in wanted]
+    if not asked and len(names) < 2:
+        odd = [name for name in names.values() if name.lower() not in (*_CRATER_NAMES, "")]
+        return None, "".join(f"every object is taken as a crater; their category is {name}" for name in odd)
+    # With names only, as in Pascal VOC, a name is its own identity.
+    told = {key: name if name == key else f"{name} ({key})" for key, name in names.items()}
+    known = ", ".join(names.values())
+    for name, original in zip(asked, wanted, strict=True):
+        if name not in {key.lower() for key in names} | {other.lower() for other in names.values()}:
+            raise UserError("--category", "name", original, f"one of {known}" if names else "a category of the labels")
+    among = asked or _CRATER_NAMES
+    chosen = {key for key, name in names.items() if name.lower() in among or key.lower() in asked}
+    if not chosen:
+        raise UserError(source, "categories", known, "one named crater or craters, or --category NAME")
+    others = ", ".join(told[key] if asked else names[key] for key in names if key not in chosen)
+    taken = ", ".join(told[key] for key in names if key in chosen)
+    return chosen, f"categories taken as craters: {taken}" + (f"; left out: {others}" if others else "")
+
+
+def _other_size(entry: Entry, size: tuple[int, int]) -> UserError:
+    width, height = (stated or side for stated, side in zip(entry.size_px, size, strict=True))
+    expected = f"{width} x {height}, as stated in {entry.labels.name}"
+    if (height, width) == size and stored_size(entry.path) == (width, height):
+        expected += "; the picture's EXIF orientation turns it, and labels must be those of the upright picture"
+    return UserError(entry.path, "size", f"{size[0]} x {size[1]}", expected)

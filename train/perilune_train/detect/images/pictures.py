@@ -1,0 +1,64 @@
+"""The pictures of a folder, without what only looks like one."""
+
+from pathlib import Path
+
+from perilune_shared.errors import UserError
+from perilune_shared.terminal import say
+from perilune_train.detect.images.read import SUFFIXES
+
+_PICTURES = tuple(suffix for suffix in SUFFIXES if suffix != ".lbl")
+_MASK_ENDINGS = ("mask", "masks", "seg", "label", "labels", "instances", "overlay")
+_FOLDERS_OF_ARCHIVES = ("__MACOSX",)
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a file is named like a picture."""
+    return path.suffix.lower() in _PICTURES
+
+
+def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
+    """The pictures of a folder, sorted; a line names what is left out.
+
+    Left out are hidden files (`._x.png` of macOS), masks and overlays of other pictures (`x_mask.png` beside `x.png`),
+    and the data of a detached PDS3 label, which is listed in their place.
+    """
+    paths = sorted(path for path in (folder.rglob("*") if recursive else folder.iterdir()) if path.is_file())
+    shown = [path for path in paths if not _is_hidden(path, folder)]
+    labels = {path.with_suffix("").as_posix().lower(): path for path in shown if path.suffix.lower() == ".lbl"}
+    named = [path for path in shown if is_picture(path)]
+    stems = {path.with_suffix("").as_posix() for path in named} | {path.as_posix() for path in named}
+    masks = {path for path in named if _is_mask(path, stems)}
+    hidden = sum(is_picture(path) for path in paths) - len(named)
+    if masks or hidden:
+        parts = [f"{hidden} hidden files"] * bool(hidden) + [f"{len(masks)} masks or overlays"] * bool(masks)
+        say(f"{folder.name}: {' and '.join(parts)} are left out")
+    found = []
+    for path in named:
+        if path not in masks:
+            label = labels.get(path.with_suffix("").as_posix().lower()) if path.suffix.lower() == ".img" else None
+            found.append(label or path)
+    return found
+
+
+def check_names(paths: list[Path], names: list[str]) -> None:
+    """Raise UserError if two pictures have one name, by which tables and overlays name them."""
+    seen: set[str] = set()
+    for path, name in zip(paths, names, strict=True):
+        if name in seen:
+            raise UserError(path, "name", "a second image of this name", "unique file names")
+        seen.add(name)
+
+
+def _is_hidden(path: Path, folder: Path) -> bool:
+    parts = path.relative_to(folder).parts
+    return any(part.startswith(".") or part in _FOLDERS_OF_ARCHIVES for part in parts)
+
+
+def _is_mask(path: Path, stems: set[str]) -> bool:
+    """Whether the name is that of another picture with an ending as `_mask`."""
+    stem = path.with_suffix("").as_posix()
+    return any(
+        stem.lower().endswith(f"{sign}{ending}") and stem[: -len(ending) - 1] in stems
+        for ending in _MASK_ENDINGS
+        for sign in "_-."
+    )

@@ -1,0 +1,71 @@
+"""Stretch deep pixels (more than 8 bits, float) to 8 bits, and find values that mark missing data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+PERCENT = (0.05, 99.95)
+"""99.9 % of the values are within 0..255."""
+SAMPLE = 1_000_000
+LARGEST_VALUE = 1e30
+"""Larger values are no measurements: ISIS marks missing data by values near the end of float32's range."""
+_FILL_SHARE = PERCENT[0] / 100
+"""A fill value of a smaller share does not reach the stretch."""
+_MOST_FILLS = 8
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """How the values of a picture become grey."""
+
+    low: float
+    """The value that becomes 0."""
+    high: float
+    """The value that becomes 255."""
+    fills: tuple[float, ...] = ()
+    """Values taken as missing data, although the file does not say so."""
+    fill_share: float = 0.0
+    """Share of the pixels that have one of these values."""
+
+    def grey(self, values: NDArray) -> NDArray[np.uint8]:
+        """Values as 0..255, 0 where there is no data."""
+        known = np.isfinite(values)
+        for fill in self.fills:
+            known &= values != fill
+        grey = (np.where(known, values, self.low) - self.low) * (255 / max(self.high - self.low, 1e-12))
+        return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+
+
+def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
+    """The stretch of a sample of finite values.
+
+    A few values at an end of the range that many pixels share and that are far from all others (-9999, 65535, the
+    special pixels of ISIS) are taken as missing data where the file declares none: as measurements they would leave no
+    range for the ground.
+    """
+    fills: list[float] = []
+    rest = sample
+    if find_fills:
+        # Fill at one end can hide that at the other, so the first end is looked at twice.
+        for sign in (1, -1, 1):
+            own = _isolated_end(sign * rest, len(sample))
+            fills += [sign * value for value in own]
+            rest = rest[~np.isin(rest, fills)]
+    low, high = np.percentile(rest, PERCENT) if len(rest) else (0.0, 1.0)
+    share = 1 - len(rest) / max(len(sample), 1)
+    return Stretch(float(low), float(high), tuple(fills), share)
+
+
+def _isolated_end(values: NDArray, n_all: int) -> list[float]:
+    """The least values, at most _MOST_FILLS, if many share them and the others are farther away than their range."""
+    distinct, counts = np.unique(values, return_counts=True)
+    for n_fills in range(min(_MOST_FILLS, len(distinct) - 2), 0, -1):
+        if counts[:n_fills].sum() < max(_FILL_SHARE * n_all, 2):
+            break
+        rest = values[values >= distinct[n_fills]]
+        low, high = np.percentile(rest, PERCENT)
+        # With a range of 0, one other value would make all others missing.
+        if high > low and float(distinct[n_fills]) - float(distinct[n_fills - 1]) > high - low:
+            return [float(value) for value in distinct[:n_fills]]
+    return []
