@@ -9,7 +9,8 @@ PAGE = Path(__file__).parents[4] / "docs/reference/limits.md"
 
 def test_the_page_lists_the_limits_of_every_table():
     text = PAGE.read_text(encoding="utf-8")
-    rows = [line for line in text.splitlines() if line.startswith("| ") and line[-3].isdigit()]
+    section = text.partition("## Tables")[2].partition("## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ") and line[-3].isdigit()]
     assert rows == [f"| {kind.kind} | {kind.rows:,} | {kind.file_bytes:,} |" for kind in limits.KINDS]
     numbers = (
         limits.MOST_LINE_BYTES,
