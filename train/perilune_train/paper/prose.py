@@ -38,8 +38,9 @@ DEVIATIONS = (
     "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, and "
     "the orientation error says nothing. Descents with attitude noise (ATTITUDE=1) measure it.",
     "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
-    "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own (the "
-    "paper: 1e-4 in both).",
+    "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own, and "
+    "in the fine stage that of the backbone is a hundredth of the paper's 1e-4. Training sequences "
+    "are also of further views, warped over the ground plane.",
     "Features of the backbone are standardised before the LSTM, and its batch statistics stay as in the detector. "
     "Poses are evaluated in causal windows as long as the training's, not with a state carried over the descent.",
     "The best epoch on validation is tested.",
