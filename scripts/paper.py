@@ -161,9 +161,9 @@ PARTS = {
         navigator_width=1.0,
         more=True,
         coarse_epochs=160,
-        fine_epochs=10,
+        fine_epochs=6,
         render_workers=14,
-        trainings=6,
+        trainings=4,
         settings=_GPU,
     ),
     Part.FULL: Sizes(
