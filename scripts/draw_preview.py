@@ -5,7 +5,9 @@ from pathlib import Path
 
 from perilune_shared.interrupts import end_at_interrupt
 
-end_at_interrupt()
+if __name__ == "__main__":
+    # Not where another module imports this one.
+    end_at_interrupt()
 
 import perilune_render.processor  # noqa: F401, I001 - before NumPy
 import cv2

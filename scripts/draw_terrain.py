@@ -9,7 +9,9 @@ from pathlib import Path
 
 from perilune_shared.interrupts import end_at_interrupt
 
-end_at_interrupt()
+if __name__ == "__main__":
+    # Not where another module imports this one.
+    end_at_interrupt()
 
 import cv2
 import matplotlib

@@ -17,7 +17,9 @@ from typing import Annotated, Any
 
 from perilune_shared.interrupts import end_at_interrupt
 
-end_at_interrupt()
+if __name__ == "__main__":
+    # Not where another module imports this one.
+    end_at_interrupt()
 
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator

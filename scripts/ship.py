@@ -16,7 +16,9 @@ from typing import Annotated
 
 from perilune_shared.interrupts import end_at_interrupt
 
-end_at_interrupt()
+if __name__ == "__main__":
+    # Not where another module imports this one.
+    end_at_interrupt()
 
 import typer
 from model_card import Shipment, model_card

@@ -12,7 +12,9 @@ from pathlib import Path
 
 from perilune_shared.interrupts import end_at_interrupt
 
-end_at_interrupt()
+if __name__ == "__main__":
+    # Not where another module imports this one.
+    end_at_interrupt()
 
 import perilune_shared
 import perilune_train

@@ -12,7 +12,6 @@ from perilune_render.config_cameras import CameraConfig
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.calibration import Calibration, read_camera_file
 from perilune_shared.storage.store import open_store
 from perilune_shared.terminal import answer
 
@@ -97,6 +96,9 @@ def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
 
 def read_camera(path: Path) -> CameraConfig:
     """The camera of a file: settings of `dataset.camera`, or a calibration of another program. Raises UserError."""
+    # Imports NumPy, which a command that ends early does not need.
+    from perilune_shared.geometry.calibration import Calibration, read_camera_file
+
     content = read_camera_file(path)
     if isinstance(content, Calibration):
         camera = content.camera

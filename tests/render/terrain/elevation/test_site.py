@@ -58,7 +58,8 @@ def test_a_catalogue_is_placed_about_the_site(path, tmp_path):
     model = read_elevation(path, at(*CRATER))
     row = f"{model.longitude_deg!r},{model.latitude_deg!r},300"
     (tmp_path / "craters.csv").write_text(f"longitude_deg,latitude_deg,diameter_m\n{row}\n")
-    found = read_catalogue(tmp_path / "craters.csv", model, Grid.even(300, 30), TerrainConfig()).craters
+    listed = TerrainConfig(elevation=ElevationConfig(rims="catalogue"))
+    found = read_catalogue(tmp_path / "craters.csv", model, Grid.even(300, 30), listed).craters
     assert len(found) == 1 and np.hypot(found.x_m[0], found.y_m[0]) < 1e-6
 
 
