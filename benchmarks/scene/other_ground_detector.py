@@ -9,7 +9,7 @@ import numpy as np
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.labels.selection import read_labels
-from perilune_train.detect.benchmark.score import MATCH_IOU, RULES, SEED
+from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, SEED
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.frame_facts import facts_of, joined_facts
 from perilune_train.detect.data.split import DetectSplit, load_split
@@ -35,7 +35,9 @@ _SETTINGS = {
     "detect": "{n_scenes: 1, trajectories_per_scene: 2, n_frames: 12, val_share: 0, test_share: 1}",
     "detect.flight.end_altitude_m": f"{END_ALTITUDE_M:g}",
 }
-_KEYS = ("ap50_paper", "ap50_paper_low", "ap50_paper_high", "ap75_paper", "f1", "precision", "recall", "labels")
+_METRICS = ("ap50_paper", "f1", "precision", "recall", "ap75_paper", "labels")
+_ENDS = ("", "_low", "_high")
+"""Of a value and of its interval. AP has one in every account, the others in the usual account or none."""
 
 
 def render(folder: Path, name: str) -> None:
@@ -107,7 +109,7 @@ def _evaluate(splits: dict[str, DetectSplit], found: dict[str, list[Detections]]
 def _figures(evaluation: Evaluation) -> Metrics:
     """Figures of one set of labels; the ratios are radii of found craters over radii of their labels."""
     values = evaluation.figures()
-    keys = [*_KEYS, *(f"{account}/{key}" for account in ("edge", "strict") for key in ("ap50_paper", "f1"))]
+    keys = [f"{account}{name}{end}" for account in ACCOUNTS.values() for name in _METRICS for end in _ENDS]
     overlaps, matches = evaluation.overlaps, evaluation.matches
     own = (matches.label >= 0) & (matches.scores >= evaluation.threshold)
     label = overlaps.label_boxes[matches.label[own]]
