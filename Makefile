@@ -275,7 +275,7 @@ bench-labels: setup-dev ## label ellipses, compared with rendered rings; writes 
 bench-truth: setup-dev ## depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
 	@$(BIN)/python -m benchmarks.scene.truth
 
-bench-other-ground: setup-dev ## rims measured over ground of another generator (pip install terraingenpy); writes runs/bench/other_ground.json
+bench-other-ground: setup-dev ## rims and the installed detector over ground of another generator (.venv/bin/pip install terraingenpy); writes runs/bench/other_ground.json
 	@$(BIN)/python -m benchmarks.scene.other_ground
 
 bench-engines: setup-dev ## frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json

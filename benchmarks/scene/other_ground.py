@@ -1,11 +1,12 @@
-"""Rims of catalogued craters over ground of another generator, terraingenpy (BSD-3; `pip install terraingenpy`).
+"""Rims and detection over ground of another generator, terraingenpy (BSD-3; `pip install terraingenpy`).
 
 Its crater list has the diameters at formation; diffusion moves the crests of worn craters outwards. The benchmark
 writes its height map as an elevation model and its list as a catalogue, reads both as `--dem` and `--catalogue` do, and
 compares the measured rims with the place at which the mean profile of the height map itself, about the listed centre,
-is highest. Writes runs/bench/other_ground.json.
+is highest. Then it renders frames over this ground and scores the installed detector, with labels of the listed rims
+and of the measured ones. Writes runs/bench/other_ground.json, and pictures into runs/bench/other_ground/.
 
-    python -m benchmarks.scene.other_ground --seeds 3
+    python -m benchmarks.scene.other_ground --seeds 5
 """
 
 import json
@@ -17,6 +18,7 @@ import numpy as np
 import typer
 
 from benchmarks.figures import write_figures
+from benchmarks.scene.other_ground_detector import render, score
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.terrain.elevation.catalogue import RealCraters, read_catalogue
 from perilune_render.terrain.elevation.model import read_elevation
@@ -25,22 +27,32 @@ from perilune_shared.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, selenographic_from_site
 
-PIXEL_M, SIDE_PX = 4.0, 1024
+PIXEL_M, SIDE_PX = 2.0, 2048
 _WORN_GYR = 1.0
 """Age from which a crater counts as worn."""
 _CLEAR_DEPTH = 0.04
 """Depth of the mean profile, in diameters, from which a crater takes part in the comparison."""
 
 
-def bench(seeds: Annotated[int, typer.Option(help="Number of different grounds.", min=1)] = 3) -> None:
-    """Measure rims over ground of terraingenpy, and compare them with an independent measurement."""
+def bench(seeds: Annotated[int, typer.Option(help="Number of different grounds.", min=1)] = 5) -> None:
+    """Compare rims over ground of terraingenpy with an independent measurement, and score the installed detector."""
+    with tempfile.TemporaryDirectory() as folder:
+        grounds = {f"other-ground-{seed}": Path(folder) / str(seed) for seed in range(1, seeds + 1)}
+        rims = _compare_rims(list(grounds.values()))
+        for name, ground in grounds.items():
+            render(ground, name)
+        detector = score(grounds, Path("runs/bench/other_ground"))
+    write_figures(Path("runs/bench/other_ground.json"), {"rims": rims, "detector": detector})
+
+
+def _compare_rims(folders: list[Path]) -> dict[str, Any]:
+    """Write one ground into each folder, and compare its rims with its crests."""
     ratios: dict[str, list[float]] = {"measured": [], "listed": []}
     growth: dict[str, list[float]] = {"fresh": [], "worn": []}
     n_used = n_measured = n_compared = 0
-    for seed in range(1, seeds + 1):
-        with tempfile.TemporaryDirectory() as folder:
-            height, craters = _ground(seed)
-            found = _read(Path(folder), height, craters)
+    for seed, folder in enumerate(folders, 1):
+        height, craters = _ground(seed)
+        found = _read(folder, height, craters)
         own = found.craters
         n_used, n_measured = n_used + found.counts.used, n_measured + found.counts.measured
         for place in np.flatnonzero(np.isfinite(own.rim_rms_share)):
@@ -62,7 +74,7 @@ def bench(seeds: Annotated[int, typer.Option(help="Number of different grounds."
     for name, values in growth.items():
         if values:
             figures[f"{name}_crest_over_listed_median"] = float(np.median(values))
-    write_figures(Path("runs/bench/other_ground.json"), figures)
+    return figures
 
 
 def _ground(seed: int) -> tuple[Array, Array]:
@@ -101,6 +113,7 @@ def _read(folder: Path, height_m: Array, craters: Array) -> RealCraters:
     import rasterio
 
     half, crs = PIXEL_M * SIDE_PX / 2, "+proj=aeqd +lat_0=-20 +lon_0=-20 +R=1737400 +units=m"
+    folder.mkdir()
     path = folder / "ground.tif"
     options = {"driver": "GTiff", "count": 1, "dtype": "float32", "crs": crs, "width": SIDE_PX, "height": SIDE_PX}
     transform = rasterio.Affine(PIXEL_M, 0, -half, 0, -PIXEL_M, half)
@@ -114,12 +127,14 @@ def _read(folder: Path, height_m: Array, craters: Array) -> RealCraters:
 
 def _crest_m(height_m: Array, x_m: float, y_m: float, radius_m: float) -> float | None:
     """Radius at which the mean over pixels at equal distance from a listed centre is highest; None if not clear."""
-    column, row = np.meshgrid(np.arange(SIDE_PX), np.arange(SIDE_PX))
-    west, south = (SIDE_PX / 2 - 0.5 - column) * PIXEL_M, (row + 0.5 - SIDE_PX / 2) * PIXEL_M
-    distance = np.hypot(west - x_m, south - y_m)
-    near = distance < 2.2 * radius_m
-    if np.abs([x_m, y_m]).max() + 2.2 * radius_m > PIXEL_M * SIDE_PX / 2:
+    reach_m, half_m = 2.2 * radius_m, PIXEL_M * SIDE_PX / 2
+    if np.abs([x_m, y_m]).max() + reach_m > half_m:
         return None
+    west = half_m - (np.arange(SIDE_PX) + 0.5) * PIXEL_M
+    columns, rows = np.abs(west - x_m) < reach_m, np.abs(-west - y_m) < reach_m
+    height_m = height_m[np.ix_(rows, columns)]
+    distance = np.hypot(west[columns] - x_m, (-west[rows] - y_m)[:, None])
+    near = distance < reach_m
     step = max(PIXEL_M / 2, radius_m / 20)
     bins = (distance[near] / step).astype(int)
     count = np.bincount(bins)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import LabelSettings
-from perilune_train.detect.data.frame_facts import FrameFacts, facts_of
+from perilune_train.detect.data.frame_facts import facts_of, joined_facts
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.bootstrap import average_precisions
@@ -111,7 +111,7 @@ def score(
     """Score detections, by part one entry for each frame; `loaded` is from `load_parts`."""
     evaluations, regions = {}, {}
     splits = loaded[RULES[0]]
-    facts = _joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})
+    facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})
     of_frame = [part.region for part in parts for _ in range(len(splits[part.name]))]
     detections = [each for part in parts for each in found[part.name]]
     for rule, by_part in loaded.items():
@@ -144,21 +144,4 @@ def _region(evaluation: Evaluation, name: str, of_frame: list[str]) -> Region:
         spread["ap50_paper"],
         curve(own(evaluation.at_edge)).ap_paper(),
         at_threshold(matches, evaluation.threshold)[2],
-    )
-
-
-def _joined_facts(parts: Mapping[str, FrameFacts]) -> FrameFacts:
-    """Facts of all frames; names of frames, scenes and trajectories begin with the name of the part."""
-
-    def renamed(part: str, names: list[str]) -> list[str]:
-        return [f"{part}/{name}" for name in names]
-
-    all_facts = parts.values()
-    return FrameFacts(
-        [name for part, facts in parts.items() for name in renamed(part, facts.name)],
-        np.concatenate([facts.sizes_px for facts in all_facts]),
-        [name for part, facts in parts.items() for name in renamed(part, facts.scene)],
-        [name for part, facts in parts.items() for name in renamed(part, facts.trajectory)],
-        np.concatenate([facts.altitude_m for facts in all_facts]),
-        np.concatenate([facts.sun_elevation_deg for facts in all_facts]),
     )

@@ -1,5 +1,6 @@
 """Metadata of evaluated frames: scene, trajectory, altitude, Sun elevation. Any may be unknown for real images."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,4 +52,21 @@ def facts_of(frames: FrameStore) -> FrameFacts:
         [f"{a}/{b}" for a, b in zip(scene, table["trajectory_id"], strict=True)],
         position[:, 2],
         np.degrees(np.arcsin(np.clip(sun[:, 2] / np.linalg.norm(sun, axis=1), -1, 1))),
+    )
+
+
+def joined_facts(parts: Mapping[str, FrameFacts]) -> FrameFacts:
+    """Facts of all frames; names of frames, scenes and trajectories begin with the name of the part."""
+
+    def renamed(part: str, names: list[str]) -> list[str]:
+        return [f"{part}/{name}" for name in names]
+
+    all_facts = parts.values()
+    return FrameFacts(
+        [name for part, facts in parts.items() for name in renamed(part, facts.name)],
+        np.concatenate([facts.sizes_px for facts in all_facts]),
+        [name for part, facts in parts.items() for name in renamed(part, facts.scene)],
+        [name for part, facts in parts.items() for name in renamed(part, facts.trajectory)],
+        np.concatenate([facts.altitude_m for facts in all_facts]),
+        np.concatenate([facts.sun_elevation_deg for facts in all_facts]),
     )
