@@ -135,8 +135,9 @@ class TextTable:
         reader = csv.reader(counted, delimiter=self.separator, skipinitialspace=True)
         try:
             for values in reader:
-                words = [value.strip() for value in values]
-                if any(words):
+                # Stripping takes most of the time, and only lines with a space need it.
+                words = [value.strip() for value in values] if counted.has_space else values
+                if words[0] or any(words):
                     yield counted.first_line, words
                 counted.begin_row()
         except csv.Error as error:
@@ -179,6 +180,7 @@ class _Counted:
     def __init__(self, path: Path, lines: Iterator[tuple[int, str]]):
         self._path, self._lines, self._length = path, lines, 0
         self.first_line = self.line = 0
+        self.has_space = False
 
     def __iter__(self) -> "_Counted":
         return self
@@ -187,6 +189,7 @@ class _Counted:
         self.line, text = next(self._lines)
         self.first_line = self.first_line or self.line
         self._length += len(text)
+        self.has_space = self.has_space or " " in text or "\t" in text or not text.isascii()
         if self._length > MOST_LINE_BYTES:
             expected = "a row of a table; is a quote without its end?"
             raise UserError(f"{self._path}:{self.first_line}", "row", f"more than {MOST_LINE_BYTES} bytes", expected)
@@ -195,6 +198,7 @@ class _Counted:
     def begin_row(self) -> None:
         """Count from the next line on."""
         self.first_line = self._length = 0
+        self.has_space = False
 
 
 class _Numbers:
