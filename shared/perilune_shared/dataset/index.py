@@ -16,6 +16,7 @@ from perilune_shared.dataset.metadata import DatasetInfo, IndexPart
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.dataset.parts import Part, Written
 from perilune_shared.dataset.schema import SCHEMA_VERSION
+from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.store import Store
@@ -130,6 +131,7 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
     if store.sha256(recorded.path) != recorded.sha256 or recorded.path != f"{FOLDER}/{recorded.sha256[:16]}.parquet":
         raise UserError(where, "SHA-256", "a different SHA-256", f"SHA-256 {recorded.sha256}, as in {INFO_NAME}")
     part = Part(store, recorded.path, FOLDER, INDEX)
+    stated = part.stated_groups()
     for group in range(part.n_groups):
         # The paths of a small group are checked before the next one is decompressed.
         in_group = part.file.metadata.row_group(group).num_rows
@@ -138,6 +140,8 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
             raise UserError(where, "rows", f"{part.n_rows}, {in_group} in a row group", expected)
         rows = part.read(groups=[group])
         _check_rows(where, rows)
+        for error in false_statistics(part, next(stated, {}), rows):
+            raise error
         yield rows
 
 

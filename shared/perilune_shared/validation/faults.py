@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, SPLITS, is_whole
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, TABLES
+from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError, one_line, shortened
 
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
@@ -128,8 +129,11 @@ def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
             if _definition(found) != _definition(expected):
                 yield Fault.of(where, None, found.name, found.metadata, f"{expected.type} with {expected.metadata}")
         first_row = 0
+        stated = part.stated_groups()
         for group in range(part.n_groups):
             rows = part.read(groups=[group], any_ids=True)
+            for error in false_statistics(part, next(stated, {}), rows):
+                yield Fault.from_error(where, first_row, error)
             yield from _name_faults(where, first_row, stem, rows)
             for field in rows.schema:
                 yield from _value_faults(where, first_row, field, rows[field.name].combine_chunks())
