@@ -33,6 +33,8 @@ INDEX = pa.schema(
 """Schema of the index."""
 MOST_ROWS = 2_000_000
 """Maximum number of rows of a part."""
+MOST_ROWS_IN_ALL = 4_000_000
+"""Maximum number of rows of all parts: each takes about 0.4 kB of memory while the files are checked."""
 LARGEST_FILE_BYTES = 2**36
 _ROWS_PER_GROUP = 2**16
 _LONGEST_PATH = 500
@@ -75,6 +77,9 @@ def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
 
 def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
     """Write the parts of an index, in any order of the rows, and return their records for dataset.json."""
+    if len(rows) > MOST_ROWS_IN_ALL:
+        expected = f"at most {MOST_ROWS_IN_ALL}; pack the frames, or split the dataset"
+        raise UserError(store, "files", len(rows), expected)
     rows = rows.sort_by("path")
     parts = []
     for start in range(0, max(len(rows), 1), MOST_ROWS):
@@ -110,7 +115,7 @@ def read_index(store: Store, info: DatasetInfo) -> pa.Table:
     if not info.index:
         raise UserError(store.at(INFO_NAME), "index", "none", "the index of a finished dataset")
     pieces: list[pa.Table] = []
-    last = None
+    last, n_rows = None, 0
     for part in info.index:
         for rows in _checked_groups(store, part):
             paths = rows["path"].combine_chunks()
@@ -119,6 +124,11 @@ def read_index(store: Store, info: DatasetInfo) -> pa.Table:
                 raise UserError(store.at(part.path), "path", "repeated or unsorted paths", "each path once, sorted")
             last = paths[-1].as_py() if len(paths) else last
             pieces.append(rows)
+            n_rows += len(rows)
+            if n_rows > MOST_ROWS_IN_ALL:
+                raise UserError(
+                    store.at(FOLDER), "rows", f"more than {MOST_ROWS_IN_ALL}", f"at most {MOST_ROWS_IN_ALL}"
+                )
     return pa.concat_tables([INDEX.empty_table(), *pieces])
 
 

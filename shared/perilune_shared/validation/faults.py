@@ -1,7 +1,7 @@
 """The class Fault, and the checks of one part: name, schema, values."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -70,6 +70,8 @@ _RANGES = {
     "ellipse_theta_rad": (0, np.pi),
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
+MOST_OF_COLUMN = 1000
+"""Maximum number of faults of one column that are listed; others are counted."""
 _MAX_PLAUSIBLE = 1e12
 """Largest plausible value of any length, time or size, far above that of any trajectory."""
 
@@ -88,6 +90,8 @@ class Fault:
     """Value found."""
     expected: str
     """Value expected."""
+    n_faults: int = 1
+    """Number of faults that it stands for; above 1 for the last one of a column with very many."""
 
     @classmethod
     def of(cls, file: object, row: int | None, column: object, found: object, expected: object) -> "Fault":
@@ -104,6 +108,48 @@ class Fault:
     def from_error(cls, file: object, row: int | None, error: UserError) -> "Fault":
         """Create a fault from an error raised while reading."""
         return cls.of(file, row, error.field, error.found, error.expected)
+
+
+class FaultList:
+    """Collects the first faults of each file and column, at most MOST_OF_COLUMN of a column, and counts the others.
+
+    So memory is bounded for datasets with a fault in each of millions of files.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[tuple[str, str, bool], Fault] = {}
+        self._n_of_column: dict[str, int] = {}
+
+    def add(self, fault: Fault) -> None:
+        """Add a fault; one of a file and column that has one is ignored."""
+        key = fault.file, fault.column, fault.row is None
+        if key in self._first:
+            return
+        found = self._n_of_column.get(fault.column, 0)
+        self._n_of_column[fault.column] = found + fault.n_faults
+        if found < MOST_OF_COLUMN and fault.n_faults == 1:
+            self._first[key] = fault
+
+    def extend(self, faults: Iterable[Fault]) -> None:
+        """Add faults in turn."""
+        for fault in faults:
+            self.add(fault)
+
+    def __len__(self) -> int:
+        return len(self._first)
+
+    def faults(self) -> list[Fault]:
+        """Return the faults; the last ones stand for those that were only counted."""
+        kept = dict.fromkeys(self._n_of_column, 0)
+        for fault in self._first.values():
+            kept[fault.column] += 1
+        more = {column: n - kept[column] for column, n in self._n_of_column.items() if n > kept[column]}
+        return [*self._first.values(), *(more_faults(column, n) for column, n in more.items())]
+
+
+def more_faults(column: str, n_faults: int) -> Fault:
+    """Return the fault that stands for others of a column, which are not listed."""
+    return Fault("...", None, column, f"{n_faults} more faults", "none; the first ones are listed", n_faults)
 
 
 def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
