@@ -1,7 +1,7 @@
 """The class Fault, and the checks of one part: name, schema, values."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -129,6 +129,13 @@ class FaultList:
         self._n_of_column[fault.column] = found + fault.n_faults
         if found < MOST_OF_COLUMN and fault.n_faults == 1:
             self._first[key] = fault
+
+    def add_made(self, column: str, make: Callable[[], Fault]) -> None:
+        """Add a fault of this column that `make` returns; it is only made if it is listed."""
+        if self._n_of_column.get(column, 0) < MOST_OF_COLUMN:
+            self.add(make())
+        else:
+            self._n_of_column[column] += 1
 
     def extend(self, faults: Iterable[Fault]) -> None:
         """Add faults in turn."""

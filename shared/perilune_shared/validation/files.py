@@ -4,6 +4,7 @@ Other tools may read files that this package ignores: any file below manifest/, 
 So every unknown file is a fault, and so is every file that is not of the dataset format, even if the index names it.
 """
 
+import functools
 from collections.abc import Container, Iterator, Sequence
 from pathlib import PurePosixPath
 
@@ -151,11 +152,14 @@ def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[
             unknown = path if folder in folders else _top_unknown(folder, folders)
             # The files of a folder follow each other.
             if unknown != last:
-                expected = _cure(unknown)
                 strays = in_read_folders if unknown.startswith(_READ_FOLDERS) else elsewhere
-                strays.add(Fault.of(unknown, None, "file", "a file or folder that is not in the index", expected))
+                strays.add_made("file", functools.partial(_stray, unknown))
             last = unknown
     return sizes, [*in_read_folders.faults(), *elsewhere.faults()]
+
+
+def _stray(path: str) -> Fault:
+    return Fault.of(path, None, "file", "a file or folder that is not in the index", _cure(path))
 
 
 def _is_of_rendering(path: str) -> bool:
@@ -203,8 +207,12 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
     """Compare size and hash of files with the index."""
     store, total = dataset.store, (pc.sum(rows["bytes"]).as_py() or 0) / 1e6
     task = progress.add_task("hashing", total=total, unit="MB")
+    n_missing = 0
     for path, n_bytes, sha256 in _rows_of(rows):
         if path not in sizes:
+            n_missing += 1
+            if n_missing > MOST_OF_COLUMN:
+                continue
             yield Fault.of(path, None, _HASH, "no such file", f"the file with SHA-256 {sha256}, {_IN_INDEX}")
             continue
         try:
@@ -216,6 +224,8 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
                 yield Fault.of(path, None, _HASH, "a different SHA-256", f"SHA-256 {sha256}, {_IN_INDEX}")
         except UserError as error:
             yield Fault.of(path, None, _HASH, error.found, error.expected)
+    if n_missing > MOST_OF_COLUMN:
+        yield more_faults(_HASH, n_missing - MOST_OF_COLUMN)
     progress.update(task, completed=total)
 
 
