@@ -39,11 +39,13 @@ def validate(
     if not faults:
         answer(f"{dataset}: no fault")
         return
-    count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+    n_faults = sum(one.n_faults for one in faults)
+    count = "1 fault" if n_faults == 1 else f"{n_faults} faults"
+    caption = f"the first {most}; `--most` shows more" if len(faults) > most else ""
     rows = [
         (one.file, "" if one.row is None else one.row, one.column, one.found, one.expected) for one in faults[:most]
     ]
-    answer_table(("file", "row", "column", "got", "expected"), rows, title=f"{dataset}: {count}")
+    answer_table(("file", "row", "column", "got", "expected"), rows, title=f"{dataset}: {count}", caption=caption)
     raise typer.Exit(EXIT_USER_ERROR)
 
 

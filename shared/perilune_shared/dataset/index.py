@@ -16,6 +16,7 @@ from perilune_shared.dataset.metadata import DatasetInfo, IndexPart
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.dataset.parts import Part, Written
 from perilune_shared.dataset.schema import SCHEMA_VERSION
+from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.store import Store
@@ -32,6 +33,8 @@ INDEX = pa.schema(
 """Schema of the index."""
 MOST_ROWS = 2_000_000
 """Maximum number of rows of a part."""
+MOST_ROWS_IN_ALL = 4_000_000
+"""Maximum number of rows of all parts: each takes about 0.4 kB of memory while the files are checked."""
 LARGEST_FILE_BYTES = 2**36
 _ROWS_PER_GROUP = 2**16
 _LONGEST_PATH = 500
@@ -74,6 +77,9 @@ def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
 
 def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
     """Write the parts of an index, in any order of the rows, and return their records for dataset.json."""
+    if len(rows) > MOST_ROWS_IN_ALL:
+        expected = f"at most {MOST_ROWS_IN_ALL}; pack the frames, or split the dataset"
+        raise UserError(store, "files", len(rows), expected)
     rows = rows.sort_by("path")
     parts = []
     for start in range(0, max(len(rows), 1), MOST_ROWS):
@@ -109,7 +115,7 @@ def read_index(store: Store, info: DatasetInfo) -> pa.Table:
     if not info.index:
         raise UserError(store.at(INFO_NAME), "index", "none", "the index of a finished dataset")
     pieces: list[pa.Table] = []
-    last = None
+    last, n_rows = None, 0
     for part in info.index:
         for rows in _checked_groups(store, part):
             paths = rows["path"].combine_chunks()
@@ -118,6 +124,11 @@ def read_index(store: Store, info: DatasetInfo) -> pa.Table:
                 raise UserError(store.at(part.path), "path", "repeated or unsorted paths", "each path once, sorted")
             last = paths[-1].as_py() if len(paths) else last
             pieces.append(rows)
+            n_rows += len(rows)
+            if n_rows > MOST_ROWS_IN_ALL:
+                raise UserError(
+                    store.at(FOLDER), "rows", f"more than {MOST_ROWS_IN_ALL}", f"at most {MOST_ROWS_IN_ALL}"
+                )
     return pa.concat_tables([INDEX.empty_table(), *pieces])
 
 
@@ -130,6 +141,7 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
     if store.sha256(recorded.path) != recorded.sha256 or recorded.path != f"{FOLDER}/{recorded.sha256[:16]}.parquet":
         raise UserError(where, "SHA-256", "a different SHA-256", f"SHA-256 {recorded.sha256}, as in {INFO_NAME}")
     part = Part(store, recorded.path, FOLDER, INDEX)
+    stated = part.stated_groups()
     for group in range(part.n_groups):
         # The paths of a small group are checked before the next one is decompressed.
         in_group = part.file.metadata.row_group(group).num_rows
@@ -138,6 +150,8 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
             raise UserError(where, "rows", f"{part.n_rows}, {in_group} in a row group", expected)
         rows = part.read(groups=[group])
         _check_rows(where, rows)
+        for error in false_statistics(part, next(stated, {}), rows):
+            raise error
         yield rows
 
 

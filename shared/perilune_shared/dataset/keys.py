@@ -13,18 +13,22 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import KEYS
+from perilune_shared.dataset.schema import KEYS, TABLES
+from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError
 
 FRAME_COLUMNS = ("frame_id", "scene_id", "trajectory_id")
+_SELECTED_BY = ("scene_id", "trajectory_id", "frame_id", "split")
 _HINT = "see `perilune-manifest validate`"
 
 
 def check_keys(dataset: Dataset) -> None:
     """Raise UserError if a key is not unique, or if a row refers to a missing scene, trajectory, frame or crater.
 
-    Reads labels one row group at a time and keeps 8 bytes of memory per label.
+    Also if the statistics of a part would hide rows of a scene, trajectory or split from readers. Reads labels one row
+    group at a time and keeps 8 bytes of memory per label.
     """
+    _check_statistics(dataset)
     check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
     _checked_ids_and_keys(dataset, "boulders", check.scene_of)
     for part in dataset.parts("labels"):
@@ -32,6 +36,18 @@ def check_keys(dataset: Dataset) -> None:
         for group in range(opened.n_groups):
             check.add_labels(opened.read([*KEYS["labels"], "scene_id"], [group]))
     check.finish()
+
+
+def _check_statistics(dataset: Dataset) -> None:
+    """Raise UserError if the footer of a part is wrong about a column by which readers select row groups."""
+    for table, schema in TABLES.items():
+        names = [name for name in _SELECTED_BY if name in schema.names]
+        for path in dataset.parts(table):
+            part = dataset.open_part(path, table)
+            stated = part.stated_groups()
+            for group in range(part.n_groups):
+                for error in false_statistics(part, next(stated, {}), part.read(names, [group])):
+                    raise error
 
 
 class KeyCheck:

@@ -30,6 +30,7 @@ from perilune_shared.storage.footers import check_footer
 from perilune_shared.storage.pages import pages_of, range_of
 from perilune_shared.storage.ranges import Ranges
 from perilune_shared.storage.store import Address, Store, open_store
+from perilune_shared.storage.thrift import Fields, items_of
 
 MOST_ROWS_WRITTEN = 2_000_000
 """Maximum number of rows of a written part; below the reader's limits for every table."""
@@ -37,6 +38,10 @@ _MAX_TEXT_BYTES = 1000
 # Maximum length of lists in a footer. It also limits the depth of the schema: deep nesting can crash the process.
 _MAX_LIST = 10_000
 _MAX_FOOTER_TEXT_BYTES = 10_000_000
+_FOOTER_END_BYTES = 8
+"""Length of the footer, and the letters PAR1."""
+_ROW_GROUPS = 4
+"""Field number of the row groups in FileMetaData of parquet.thrift."""
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
 _PARQUET_FILE = re.compile(r"[A-Za-z0-9][^/]*\.parquet", re.DOTALL)
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
@@ -100,7 +105,7 @@ class Part:
             # Asked for once: each access of pyarrow's metadata makes new objects.
             columns = self.file.metadata.schema
             self._paths = [columns.column(place).path for place in range(len(columns))]
-            check_footer(self.file.metadata, self._places_of(self.schema.names), self._n_bytes, self.address)
+            check_footer(self.file.metadata, self.places_of(self.schema.names), self._n_bytes, self.address)
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
         metadata = self.found.metadata or {}
@@ -143,7 +148,19 @@ class Part:
         """Number of row groups."""
         return self.file.metadata.num_row_groups
 
-    def _places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
+    def stated_groups(self) -> Iterator[Fields]:
+        """Yield the RowGroup of each row group as the footer states it. Raises UserError if it is damaged."""
+        try:
+            with self._bytes_of([], []) as stream:
+                stream.seek(self._n_bytes - _FOOTER_END_BYTES)
+                start = self._n_bytes - _FOOTER_END_BYTES - int.from_bytes(stream.read(4), "little")
+                stream.seek(start)
+                footer = stream.read(self._n_bytes - _FOOTER_END_BYTES - start)
+            yield from items_of(footer, _ROW_GROUPS)
+        except (OSError, ValueError) as error:
+            raise UserError(self.address, "content", error, "a complete Parquet file") from None
+
+    def places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
         """Places and paths of the columns of the file that belong to fields of these names."""
         wanted = set(names)
         return [(place, path) for place, path in enumerate(self._paths) if path.split(".")[0] in wanted]
@@ -197,7 +214,7 @@ class Part:
         columns = [
             range_of(row_group.column(place))
             for row_group in map(self.file.metadata.row_group, groups)
-            for place, _ in self._places_of(names)
+            for place, _ in self.places_of(names)
         ]
         with self._ranges.fetched(columns):
             yield cast(BinaryIO, self._ranges)
@@ -205,7 +222,7 @@ class Part:
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """Check that the pages do not exceed the sizes in the footer, which have been checked."""
         metadata = self.file.metadata.row_group(group)
-        for place, name in self._places_of(names):
+        for place, name in self.places_of(names):
             if (group, name) in self._checked:
                 continue
             column = metadata.column(place)

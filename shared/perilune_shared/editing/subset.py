@@ -65,8 +65,12 @@ def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
     """Return the scenes that may contain a selected frame, so that the tables of the others are not read."""
     scene_ids = set(source.scene_ids())
     for condition in on_frames:
-        if condition.columns_of_only("frames") is not None:
-            scene_ids &= set(source.table("frames", ["scene_id"], where=condition)["scene_id"].unique().to_pylist())
+        names = condition.columns_of_only("frames")
+        if names is not None:
+            # Not `where` of Dataset.table: it skips row groups by statistics of columns that nobody has checked.
+            rows = source.table("frames", list(dict.fromkeys(["scene_id", *names])))
+            chosen = condition.holds(rows.rename_columns([f"frames.{name}" for name in rows.column_names]))
+            scene_ids &= set(rows["scene_id"].filter(pa.array(chosen)).unique().to_pylist())
     return sorted(scene_ids)
 
 

@@ -26,19 +26,20 @@ def local_items(folder: Path, prefix: str) -> Iterator[Item]:
     """
     try:
         with os.scandir(folder) as scanned:
-            # "a-b" comes before "a/b", as in the listing of an object store.
-            found = sorted(scanned, key=lambda entry: entry.name + ("/" if entry.is_dir(follow_symlinks=False) else ""))
+            # "a-b" comes before "a/b", as in the listing of an object store. Entries of millions of files would fill
+            # memory, so only their names are kept.
+            names = sorted(entry.name + ("/" if entry.is_dir(follow_symlinks=False) else "") for entry in scanned)
     except FileNotFoundError:
         return
-    for entry in found:
-        if entry.is_dir(follow_symlinks=False):
-            yield from local_items(Path(entry.path), f"{prefix}{entry.name}/")
+    for name in names:
+        if name.endswith("/"):
+            yield from local_items(folder / name[:-1], prefix + name)
             continue
         try:
-            size_bytes = entry.stat(follow_symlinks=False).st_size
+            size_bytes = os.lstat(f"{folder}/{name}").st_size
         except FileNotFoundError:
             continue
-        yield Item(prefix + entry.name, size_bytes)
+        yield Item(prefix + name, size_bytes)
 
 
 def object_items(found: Mapping[str, Any], prefix: str, address: str) -> Iterator[Item]:

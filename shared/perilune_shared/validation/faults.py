@@ -1,7 +1,7 @@
 """The class Fault, and the checks of one part: name, schema, values."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, SPLITS, is_whole
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, TABLES
+from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError, one_line, shortened
 
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
@@ -69,6 +70,8 @@ _RANGES = {
     "ellipse_theta_rad": (0, np.pi),
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
+MOST_OF_COLUMN = 1000
+"""Maximum number of faults of one column that are listed; others are counted."""
 _MAX_PLAUSIBLE = 1e12
 """Largest plausible value of any length, time or size, far above that of any trajectory."""
 
@@ -87,6 +90,8 @@ class Fault:
     """Value found."""
     expected: str
     """Value expected."""
+    n_faults: int = 1
+    """Number of faults that it stands for; above 1 for the last one of a column with very many."""
 
     @classmethod
     def of(cls, file: object, row: int | None, column: object, found: object, expected: object) -> "Fault":
@@ -103,6 +108,55 @@ class Fault:
     def from_error(cls, file: object, row: int | None, error: UserError) -> "Fault":
         """Create a fault from an error raised while reading."""
         return cls.of(file, row, error.field, error.found, error.expected)
+
+
+class FaultList:
+    """Collects the first faults of each file and column, at most MOST_OF_COLUMN of a column, and counts the others.
+
+    So memory is bounded for datasets with a fault in each of millions of files.
+    """
+
+    def __init__(self) -> None:
+        self._first: dict[tuple[str, str, bool], Fault] = {}
+        self._n_of_column: dict[str, int] = {}
+
+    def add(self, fault: Fault) -> None:
+        """Add a fault; one of a file and column that has one is ignored."""
+        key = fault.file, fault.column, fault.row is None
+        if key in self._first:
+            return
+        found = self._n_of_column.get(fault.column, 0)
+        self._n_of_column[fault.column] = found + fault.n_faults
+        if found < MOST_OF_COLUMN and fault.n_faults == 1:
+            self._first[key] = fault
+
+    def add_made(self, column: str, make: Callable[[], Fault]) -> None:
+        """Add a fault of this column that `make` returns; it is only made if it is listed."""
+        if self._n_of_column.get(column, 0) < MOST_OF_COLUMN:
+            self.add(make())
+        else:
+            self._n_of_column[column] += 1
+
+    def extend(self, faults: Iterable[Fault]) -> None:
+        """Add faults in turn."""
+        for fault in faults:
+            self.add(fault)
+
+    def __len__(self) -> int:
+        return len(self._first)
+
+    def faults(self) -> list[Fault]:
+        """Return the faults; the last ones stand for those that were only counted."""
+        kept = dict.fromkeys(self._n_of_column, 0)
+        for fault in self._first.values():
+            kept[fault.column] += 1
+        more = {column: n - kept[column] for column, n in self._n_of_column.items() if n > kept[column]}
+        return [*self._first.values(), *(more_faults(column, n) for column, n in more.items())]
+
+
+def more_faults(column: str, n_faults: int) -> Fault:
+    """Return the fault that stands for others of a column, which are not listed."""
+    return Fault("...", None, column, f"{n_faults} more faults", "none; the first ones are listed", n_faults)
 
 
 def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
@@ -128,8 +182,11 @@ def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
             if _definition(found) != _definition(expected):
                 yield Fault.of(where, None, found.name, found.metadata, f"{expected.type} with {expected.metadata}")
         first_row = 0
+        stated = part.stated_groups()
         for group in range(part.n_groups):
             rows = part.read(groups=[group], any_ids=True)
+            for error in false_statistics(part, next(stated, {}), rows):
+                yield Fault.from_error(where, first_row, error)
             yield from _name_faults(where, first_row, stem, rows)
             for field in rows.schema:
                 yield from _value_faults(where, first_row, field, rows[field.name].combine_chunks())

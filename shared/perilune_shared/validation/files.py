@@ -4,6 +4,7 @@ Other tools may read files that this package ignores: any file below manifest/, 
 So every unknown file is a fault, and so is every file that is not of the dataset format, even if the index names it.
 """
 
+import functools
 from collections.abc import Container, Iterator, Sequence
 from pathlib import PurePosixPath
 
@@ -20,7 +21,7 @@ from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE
-from perilune_shared.validation.faults import Fault
+from perilune_shared.validation.faults import MOST_OF_COLUMN, Fault, FaultList, more_faults
 
 EXTRA_NAMES = frozenset(
     {
@@ -40,7 +41,7 @@ _RECORDS = "work"
 _LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
 _READ_FOLDERS = ("manifest/", "shards/")
 """Folders whose files are read without being named by a row."""
-_MAX_REPORTED = 1000
+_ROWS_AT_A_TIME = 10_000
 _IN_INDEX = "as in the index"
 _HASH = "SHA-256"
 
@@ -74,11 +75,11 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
     except UserError as error:
         yield Fault.from_error("manifest/scenes", None, error)
         of_scenes = INDEX.empty_table()
-    sizes = {item.path: item.size_bytes for item in dataset.store.list()}
     if not dataset.info.complete:
-        known = [*_named_by_format(dataset), *of_scenes["path"].to_pylist()]
-        known += frames["path"].to_pylist() if frames is not None else ()
-        yield from _strays(dataset.info, sizes, known)
+        known = {*_named_by_format(dataset), *of_scenes["path"].to_pylist()}
+        known |= set(frames["path"].to_pylist()) if frames is not None else set()
+        _, strays = _listed(dataset, dataset.info, known)
+        yield from strays
         return
     if not has_own_hash(dataset.store):
         expected = "the SHA-256 that is its last member, of the text before it"
@@ -90,14 +91,18 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
     except UserError as error:
         yield Fault.from_error(error.where.removeprefix(f"{dataset.store.address}/"), None, error)
         return
-    yield from _strays(info, sizes, rows["path"].to_pylist())
+    sizes, strays = _listed(dataset, info, set(rows["path"].to_pylist()))
+    yield from strays
     yield from _differences(rows, of_scenes, "scenes")
     if frames is not None:
         yield from _differences(rows, frames, "frames")
         rows = rows.filter(pc.invert(pc.is_in(rows["path"], frames["path"].combine_chunks())))
-        by_format = {*_named_by_format(dataset), *of_scenes["path"].to_pylist()}
-        for path in [path for path in rows["path"].to_pylist() if path not in by_format][:_MAX_REPORTED]:
+        by_format = pa.array({*_named_by_format(dataset), *of_scenes["path"].to_pylist()}, pa.string())
+        odd = rows["path"].filter(pc.invert(pc.is_in(rows["path"], by_format)))
+        for path in odd[:MOST_OF_COLUMN].to_pylist():
             yield Fault.of(path, None, "file", "an unexpected file", "only files of the dataset format")
+        if len(odd) > MOST_OF_COLUMN:
+            yield more_faults("file", len(odd) - MOST_OF_COLUMN)
     yield from _hash_faults(dataset, rows, sizes, progress)
 
 
@@ -125,23 +130,47 @@ def _named_by_format(dataset: Dataset) -> set[str]:
     return parts | shards | EXTRA_NAMES
 
 
-def _strays(info: DatasetInfo, sizes: dict[str, int], known: list[str]) -> Iterator[Fault]:
-    """Yield the files that are not known, at most 1000; an unknown folder only once."""
-    own = {*known, INFO_NAME, *_LOCKS, *(part.path for part in info.index)}
-    strays = [path for path in sizes if path not in own]
-    if not info.complete:
-        strays = [path for path in strays if path.split("/")[0] != _RECORDS]
-        strays = [path for path in strays if not TEMPORARY_FILE.fullmatch(PurePosixPath(path).name)]
-    if not strays:
-        return
-    folders = {path.rpartition("/")[0] for path in own} | {index.FOLDER, *(f"manifest/{table}" for table in TABLES)}
+def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[str, int], list[Fault]]:
+    """List the files: return the sizes of those that are known, bytes, and faults of the others.
+
+    An unknown folder is one fault. Memory does not grow with the number of unknown files.
+    """
+    own = {INFO_NAME, *_LOCKS, *(part.path for part in info.index)}
+    folders = {path.rpartition("/")[0] for paths in (known, own) for path in paths}
+    folders |= {index.FOLDER, *(f"manifest/{table}" for table in TABLES)}
     folders |= {str(parent) for folder in folders for parent in PurePosixPath(folder).parents}
-    reported: dict[str, None] = {}
-    for path in strays:
-        above = [str(parent) for parent in reversed(PurePosixPath(path).parents)][1:]
-        reported.setdefault(next((folder for folder in above if folder not in folders), path))
-    for path in list(reported)[:_MAX_REPORTED]:
-        yield Fault.of(path, None, "file", "a file or folder that is not in the index", _cure(path))
+    sizes: dict[str, int] = {}
+    # Apart, so that no number of other files hides those that are read.
+    in_read_folders, elsewhere = FaultList(), FaultList()
+    last = ""
+    for item in dataset.store.list():
+        path = item.path
+        if path in known:
+            sizes[path] = item.size_bytes
+        elif path not in own and not (not info.complete and _is_of_rendering(path)):
+            folder = path.rpartition("/")[0]
+            unknown = path if folder in folders else _top_unknown(folder, folders)
+            # The files of a folder follow each other.
+            if unknown != last:
+                strays = in_read_folders if unknown.startswith(_READ_FOLDERS) else elsewhere
+                strays.add_made("file", functools.partial(_stray, unknown))
+            last = unknown
+    return sizes, [*in_read_folders.faults(), *elsewhere.faults()]
+
+
+def _stray(path: str) -> Fault:
+    return Fault.of(path, None, "file", "a file or folder that is not in the index", _cure(path))
+
+
+def _is_of_rendering(path: str) -> bool:
+    """Whether a file belongs to a rendering in progress."""
+    return path.split("/")[0] == _RECORDS or bool(TEMPORARY_FILE.fullmatch(PurePosixPath(path).name))
+
+
+def _top_unknown(folder: str, folders: set[str]) -> str:
+    """Return the first folder above, or this one, that is not in `folders`."""
+    above = [*reversed(PurePosixPath(folder).parents)][1:]
+    return next((str(parent) for parent in above if str(parent) not in folders), folder)
 
 
 def _cure(path: str) -> str:
@@ -178,8 +207,12 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
     """Compare size and hash of files with the index."""
     store, total = dataset.store, (pc.sum(rows["bytes"]).as_py() or 0) / 1e6
     task = progress.add_task("hashing", total=total, unit="MB")
-    for path, n_bytes, sha256 in zip(*(rows[name].to_pylist() for name in INDEX.names), strict=True):
+    n_missing = 0
+    for path, n_bytes, sha256 in _rows_of(rows):
         if path not in sizes:
+            n_missing += 1
+            if n_missing > MOST_OF_COLUMN:
+                continue
             yield Fault.of(path, None, _HASH, "no such file", f"the file with SHA-256 {sha256}, {_IN_INDEX}")
             continue
         try:
@@ -191,4 +224,12 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
                 yield Fault.of(path, None, _HASH, "a different SHA-256", f"SHA-256 {sha256}, {_IN_INDEX}")
         except UserError as error:
             yield Fault.of(path, None, _HASH, error.found, error.expected)
+    if n_missing > MOST_OF_COLUMN:
+        yield more_faults(_HASH, n_missing - MOST_OF_COLUMN)
     progress.update(task, completed=total)
+
+
+def _rows_of(rows: pa.Table) -> Iterator[tuple[str, int, str]]:
+    """Yield path, size and hash of each row; few rows at a time become objects of Python."""
+    for batch in rows.to_batches(max_chunksize=_ROWS_AT_A_TIME):
+        yield from zip(*(batch[name].to_pylist() for name in INDEX.names), strict=True)

@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.packed import FOLDER, open_shard, packed_rows, shard_name, split_of
 from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
 from perilune_shared.validation.faults import Fault
@@ -28,8 +29,11 @@ def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
         try:
             shard = open_shard(dataset.store, where)
             first_row = 0
+            stated = shard.stated_groups()
             for group in range(shard.n_groups):
                 rows = shard.read(groups=[group])
+                for error in false_statistics(shard, next(stated, {}), rows):
+                    yield Fault.from_error(where, first_row, error)
                 for row, frame_id in enumerate(rows["frame_id"].to_pylist(), first_row):
                     if frame_id not in missing:
                         yield Fault.of(where, row, "frame_id", frame_id, "frames of the manifest, each once")

@@ -20,7 +20,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.validation.cameras import camera_faults
-from perilune_shared.validation.faults import Fault, part_faults
+from perilune_shared.validation.faults import Fault, FaultList, part_faults
 from perilune_shared.validation.files import file_faults
 from perilune_shared.validation.images import image_faults
 from perilune_shared.validation.measurements import measurement_faults
@@ -43,27 +43,28 @@ def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
 
 
 def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
-    faults = list(file_faults(dataset, progress))
+    found = FaultList()
+    found.extend(file_faults(dataset, progress))
     if not dataset.info.complete:
         expected = "a finished dataset; run `make dataset` again to resume"
-        faults.append(Fault.of("dataset.json", None, "complete", "False", expected))
+        found.add(Fault.of("dataset.json", None, "complete", "False", expected))
     for name in TABLES:
         for part in dataset.parts(name):
-            faults += part_faults(dataset, part, name)
+            found.extend(part_faults(dataset, part, name))
     try:
-        faults += _table_faults(dataset, progress)
+        found.extend(_table_faults(dataset, progress))
     except UserError as error:
-        if not faults:
-            faults.append(Fault.from_error("manifest", None, error))
+        if not len(found):
+            found.add(Fault.from_error("manifest", None, error))
     try:
         if dataset.info.images == "files":
-            faults += image_faults(dataset, progress)
+            found.extend(image_faults(dataset, progress))
         elif dataset.info.images == "packed":
-            faults += shard_faults(dataset, progress)
+            found.extend(shard_faults(dataset, progress))
     except UserError as error:
-        if not faults:
-            faults.append(Fault.from_error("images", None, error))
-    return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
+        if not len(found):
+            found.add(Fault.from_error("images", None, error))
+    return found.faults()
 
 
 def _table_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:

@@ -1,0 +1,91 @@
+"""Compare what the footer of a Parquet part states about values with the values.
+
+Readers skip row groups by these statements, so a false one hides rows. pyarrow does not show all of the footer: other
+programs also read the older fields of minimum and maximum, and trust writers whose statistics pyarrow ignores.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perilune_shared.dataset.parts import Part
+from perilune_shared.errors import UserError
+from perilune_shared.storage.thrift import Fields
+
+# Field numbers of parquet.thrift.
+_COLUMNS, _METADATA, _PATH, _N_VALUES, _STATISTICS = 1, 3, 3, 5, 12
+_NULLS, _DISTINCT = 3, 4
+_EXTREMES = {1: "max", 2: "min", 5: "max", 6: "min"}
+_OF_GROUP = {4: "a sort order"}
+_OF_CHUNK = {1: "values in another file", 4: "a page index", 6: "a page index"}
+_OF_COLUMN = {14: "a Bloom filter"}
+"""Other statements by which programs select or find rows. No version of this package writes one."""
+_BYTES = {pa.int64(): "<i8", pa.int32(): "<i4", pa.float64(): "<f8", pa.float32(): "<f4", pa.bool_(): "?"}
+
+
+def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[UserError]:
+    """Yield what is wrong in the footer about a row group: `stated` is its RowGroup, `rows` has columns of it.
+
+    Statements that cannot be checked, such as Bloom filters, are wrong too.
+    """
+    for number in _OF_GROUP.keys() & stated.keys():
+        yield UserError(part.address, "row group", _OF_GROUP[number], "none")
+    chunks = stated.get(_COLUMNS, [])
+    for name in rows.column_names:
+        places = part.places_of([name])
+        leaves = _leaves(rows[name].combine_chunks()) if places else ()
+        for (place, path), leaf in zip(places, leaves, strict=False):
+            try:
+                yield from _false_of_column(part.address, path, chunks[place], leaf)
+            except (TypeError, KeyError, IndexError, AttributeError, ValueError):
+                yield UserError(part.address, path, "a damaged description in the footer", "a complete Parquet file")
+
+
+def _leaves(column: pa.Array) -> Iterator[pa.Array]:
+    """Yield the arrays that Parquet stores as columns, in its order; without the elements of lists that are null."""
+    if pa.types.is_struct(column.type):
+        for place in range(column.type.num_fields):
+            yield from _leaves(pc.struct_field(column, place))
+    elif pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        yield from _leaves(column.flatten())
+    else:
+        yield column
+
+
+def _false_of_column(address: str, path: str, chunk: Fields, values: pa.Array) -> Iterator[UserError]:
+    """Yield what is wrong about one column: `chunk` is its ColumnChunk."""
+    metadata = chunk[_METADATA]
+    for notes, fields in ((_OF_CHUNK, chunk), (_OF_COLUMN, metadata)):
+        for number in sorted(notes.keys() & fields.keys()):
+            yield UserError(address, path, notes[number], "none")
+    if (own := b".".join(metadata[_PATH])) != path.encode():
+        yield UserError(address, path, f"the name {own.decode(errors='replace')}", f"{path}, as in the schema")
+    statistics = metadata.get(_STATISTICS, {})
+    n_present = len(values) - values.null_count
+    if _NULLS in statistics and metadata[_N_VALUES] - statistics[_NULLS] != n_present:
+        expected = f"{metadata[_N_VALUES] - n_present}, from the values"
+        yield UserError(address, path, f"{statistics[_NULLS]} nulls in the statistics", expected)
+    if _DISTINCT in statistics and statistics[_DISTINCT] != (distinct := pc.count_distinct(values).as_py()):
+        found = f"{statistics[_DISTINCT]} distinct values in the statistics"
+        yield UserError(address, path, found, f"{distinct}, from the values")
+    if not _EXTREMES.keys() & statistics.keys():
+        return
+    extremes = pc.min_max(values).as_py()
+    for number in sorted(_EXTREMES.keys() & statistics.keys()):
+        name = _EXTREMES[number]
+        stated, actual = _value(statistics[number], values.type), extremes[name]
+        if actual is None or stated != actual:
+            expected = f"{actual if n_present else 'none'}, from the values"
+            yield UserError(address, path, f"{name} {stated} in the statistics", expected)
+
+
+def _value(raw: bytes, kind: pa.DataType) -> object:
+    """Decode a value of the statistics. Raises ValueError if it has another length than its type."""
+    if pa.types.is_string(kind):
+        return raw.decode(errors="replace")
+    if pa.types.is_binary(kind):
+        return raw
+    (value,) = np.frombuffer(raw, _BYTES[kind])
+    return value.item()
