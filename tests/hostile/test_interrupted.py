@@ -35,7 +35,9 @@ PROGRAMS = {
         "perilune_train", "detect", "train", "--preset", "tiny", "--dataset", "drawn/detect",
         "--set", "detect.epochs=500",
     ),
-    "perilune-train detect evaluate": ("perilune_train", "detect", "evaluate", "--dataset", "drawn/detect"),
+    "perilune-train detect evaluate": (
+        "perilune_train", "detect", "evaluate", "--dataset", "drawn/detect", "--out", "evaluated",
+    ),
     "perilune-train navigate train": (
         "perilune_train", "navigate", "train", "--preset", "tiny", "--dataset", "drawn/nav",
     ),

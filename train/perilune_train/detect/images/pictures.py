@@ -20,12 +20,15 @@ def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
     """The pictures of a folder, sorted; a line names what is left out.
 
     Left out are hidden files (`._x.png` of macOS), masks and overlays of other pictures (`x_mask.png` beside `x.png`),
-    and the data of a detached PDS3 label, which is listed in their place.
+    and the data of a detached PDS3 label, which is listed in their place. Raises UserError on a name that is not UTF-8.
     """
     paths = sorted(path for path in (folder.rglob("*") if recursive else folder.iterdir()) if path.is_file())
     shown = [path for path in paths if not _is_hidden(path, folder)]
     labels = {path.with_suffix("").as_posix().lower(): path for path in shown if path.suffix.lower() == ".lbl"}
     named = [path for path in shown if is_picture(path)]
+    for path in named:
+        if not path.name.isascii() and any("\ud800" <= sign <= "\udfff" for sign in path.name):
+            raise UserError(folder, "image", path.name, "file names in UTF-8")
     stems = {path.with_suffix("").as_posix() for path in named} | {path.as_posix() for path in named}
     masks = {path for path in named if _is_mask(path, stems)}
     hidden = sum(is_picture(path) for path in paths) - len(named)
