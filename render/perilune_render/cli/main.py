@@ -6,6 +6,7 @@ from typing import Annotated, get_args
 
 import typer
 
+import perilune_render
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
 from perilune_render.cli.dataset import dataset
@@ -29,23 +30,17 @@ from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
-from perilune_shared.command_line import Verbose, run_command_line
+from perilune_shared.command_line import new_program, run_command_line
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
 from perilune_shared.errors import EXIT_USER_ERROR, UserError
 from perilune_shared.terminal import answer, answer_page, progress_bar
 
-app = typer.Typer(
-    help="Generate lunar terrain and trajectories, and render labelled frames with Blender.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+app = new_program(
+    "perilune-render",
+    perilune_render.__version__,
+    "Generate lunar terrain and trajectories, and render labelled frames with Blender.",
 )
-
-
-@app.callback()
-def program(verbose: Verbose = False) -> None:
-    pass
 
 
 @app.command()
