@@ -28,6 +28,7 @@ from perilune_render.cli.options import (
 from perilune_render.cli.serve import serve
 from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
+from perilune_render.cli.sun import warn_of_sun, warn_of_suns
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
 from perilune_shared.command_line import new_program, run_command_line
@@ -99,6 +100,7 @@ def plan(
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
+    warn_of_suns(resolved, (one_kind(kind),))
     from perilune_render.dataset.manifest_only import write_manifest_only
 
     with progress_bar() as progress:
@@ -194,6 +196,8 @@ def preview(
         plan, resolved = given_plan(
             read_poses(poses, *site_of(resolved), camera_axes), resolved, first_kind(kind), poses
         )
+    setting_of_sun = "sun_elevation_deg" if poses else f"dataset.{first_kind(kind)}.sun.elevation_deg"
+    warn_of_sun(resolved, setting_of_sun, max(each.sun_elevation_deg for each in plan.scenes))
     map_path = out.with_name(f"{out.stem}-map.png")
     write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
     answer(f"look at {out} and {map_path}")
