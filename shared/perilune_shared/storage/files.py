@@ -189,7 +189,7 @@ def new_folder(out: Path) -> Iterator[Path]:
 def check_free(out: Path) -> None:
     """Raise UserError if the folder for a new dataset is not empty."""
     if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
-        raise UserError(out, "--out", "a path that is not empty", "a new or empty folder; --overwrite replaces it")
+        raise UserError(out, "--out", "a path that is not empty", "a new or empty folder")
 
 
 def copy_or_link(path: Path, to: Path, *, link: bool) -> None:

@@ -19,14 +19,16 @@ def replaceable(out: Out, known_by: tuple[str, ...], *, overwrite: bool) -> Iter
 
     The old folder stays until the new one is complete. It is replaced only if it has one of the files or folders
     `known_by`, which the command always writes, so that a wrong `out` deletes no other data. Raises UserError if it
-    has none of them, or if `out` is in an object store.
+    has none of them, if it is not empty and not to be replaced, or with `overwrite` if `out` is in an object store.
     """
-    folder = open_store(out).folder if overwrite else None
+    folder = open_store(out).folder
     if overwrite and folder is None:
         raise UserError(out, "--overwrite", "an address", "a local folder; delete what is below the address first")
     if folder is None or not folder.is_dir() or not any(folder.iterdir()):
         yield out
         return
+    if not overwrite:
+        raise UserError(out, "--out", "a path that is not empty", "a new or empty folder; --overwrite replaces it")
     if folder.is_symlink() or not any(folder.joinpath(name).exists() for name in known_by):
         expected = "a folder that this command has written, with " + " or ".join(known_by)
         raise UserError(out, "--overwrite", "another folder", expected)
