@@ -55,6 +55,7 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON): not found: Blender's module needs Python 3.11 (sudo apt-get install -y python3.11 python3.11-venv)" >&2; exit 2; }
 	@scripts/system-libraries
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "$(VENV): got $$($(BIN)/python -V), expected Python 3.11, which Blender's module needs: move $(VENV) away, and run the same command again" >&2; exit 2; }
 	@echo "installing into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
 	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[geo]"
@@ -91,6 +92,10 @@ nav-frames: setup
 
 # OVERWRITE=1 replaces the runs of the targets named on the command line, and no others.
 OVER = $(if $(OVERWRITE),$(if $(filter $@,$(MAKECMDGOALS)),--overwrite))
+.PHONY: train
+train:
+	@echo "make train: got no task, expected make train-detect (craters) or make train-nav (navigation)" >&2; exit 2
+
 train-detect: detect-frames ## train and evaluate crater detection; run again to resume (OVERWRITE=1 replaces)
 	@$(BIN)/perilune-train detect train $(TRAIN) --dataset "$(DATA)/detect" $(OVER)
 

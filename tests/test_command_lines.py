@@ -12,6 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 import perilune_render.cli.main
+import perilune_shared
 import perilune_shared.cli.main
 import perilune_train.cli
 
@@ -72,3 +73,24 @@ def test_a_dataset_opens_without_a_command_line():
 @pytest.mark.parametrize("module", ["perilune_shared.cli.main", "perilune_render.cli.main", "perilune_train.cli"])
 def test_a_command_line_starts_without_heavy_libraries(module):
     assert not loaded(f"import {module}") & HEAVY
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_tells_its_version_and_short_help(program):
+    def printed(*words: str) -> str:
+        shown = CliRunner().invoke(PROGRAMS[program], words, prog_name=program)
+        assert shown.exit_code == 0 and shown.exception is None
+        return shown.output
+
+    assert printed("--version") == f"{program} {perilune_shared.__version__}\n"
+    first = next(iter(typer.main.get_command(PROGRAMS[program]).commands))
+    assert "Usage:" in printed("-h") and "Usage:" in printed(first, "-h")
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_shell_completes_commands(program):
+    variable = f"_{program.upper().replace('-', '_')}_COMPLETE"
+    line = {variable: "complete_bash", "COMP_WORDS": f"{program} con", "COMP_CWORD": "1"}
+    line["COMP_WORDS"] = f"{program} val" if program == "perilune-manifest" else line["COMP_WORDS"]
+    shown = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env=line)
+    assert shown.output.split() == ["validate" if program == "perilune-manifest" else "config"]

@@ -73,3 +73,19 @@ def test_the_image_installs_from_what_make_setup_reads():
     before_setup, _ = (ROOT / "Dockerfile").read_text().split("RUN make setup")
     for name in ["requirements-dev.txt", *read.group(1).split()]:
         assert re.search(rf"^COPY .*\b{re.escape(name)}\b", before_setup, re.MULTILINE), name
+
+
+def test_train_without_a_task_says_what_to_type():
+    done = make("train", check=False)
+    assert done.returncode == 2 and "make train-detect" in done.stderr and "make train-nav" in done.stderr
+
+
+def test_an_environment_of_another_python_is_named(tmp_path):
+    """As the README's first command makes it with Python 3.12 or 3.10."""
+    python = tmp_path / ".venv/bin/python"
+    python.parent.mkdir(parents=True)
+    python.write_text('#!/bin/sh\n[ "$1" = -V ] && echo Python 3.12.1 && exit 0\nexit 1\n')
+    python.chmod(0o755)
+    done = make("setup", f"VENV={python.parents[1]}", "PYTHON=sh", check=False)
+    assert done.returncode == 2
+    assert "got Python 3.12.1, expected Python 3.11" in done.stderr and "move" in done.stderr

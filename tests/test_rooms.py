@@ -19,7 +19,7 @@ ROOMS = {
         "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
         "heightfield engines outputs dataset preview server jobs cli"
     ),
-    "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main program",
+    "render/perilune_render/cli": "options sun dataset frames spice serve status survey counterfactual main program",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
         "level_ground cache export"

@@ -1,4 +1,4 @@
-"""Run a command line: threads, errors in one line, exit codes, and the option `--verbose` of all programs."""
+"""Make and run a command line: threads, errors in one line, exit codes, and the options that all programs have."""
 
 import atexit
 import contextlib
@@ -14,6 +14,7 @@ import typer
 
 from perilune_shared.errors import DISK_FAULTS, EXIT_INTERRUPTED, EXIT_USER_ERROR, STOPPED, UserError, one_line
 from perilune_shared.interrupts import ended_by_interrupt, ends_at_interrupt
+from perilune_shared.terminal import answer
 from perilune_shared.threads import described_settings, set_up_program
 
 
@@ -29,6 +30,35 @@ Verbose = Annotated[
     ),
 ]
 """The option of a program, before the name of the command: `perilune-train -v detect train`."""
+
+
+def new_program(name: str, version: str, summary: str) -> typer.Typer:
+    """A program without commands: options -h, --verbose and --version, and completion for the user's shell."""
+    app = typer.Typer(
+        name=name,
+        help=summary,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+    def print_version(asked: bool) -> None:
+        if asked:
+            answer(f"{name} {version}")
+            raise typer.Exit
+
+    @app.callback()
+    def program(
+        verbose: Verbose = False,
+        version: Annotated[
+            bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version and end.")
+        ] = False,
+    ) -> None:
+        pass
+
+    return app
+
+
 _UNTRACKED = {
     "DO_NOT_TRACK": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",

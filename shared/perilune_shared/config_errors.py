@@ -3,6 +3,7 @@
 import difflib
 import json
 import re
+import types
 import typing
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -22,6 +23,9 @@ _EXPECTED = {
     "bool_type": "true or false",
     "int_type": "an integer",
     "int_from_float": "an integer",
+    "int_parsing": "an integer",
+    "float_parsing": "a number",
+    "bool_parsing": "true or false",
     "int_parsing_size": "a smaller integer",
     "float_type": "a number",
     "finite_number": "a finite number",
@@ -47,6 +51,10 @@ _EXPECTED = {
 _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "max_length")}
 
 
+_KEY = "[key]"
+"""Pydantic's name of the place of a mapping's key."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a suggestion for an unknown name: the most similar known name, or all known names if none is similar."""
     known = list(known)
@@ -66,8 +74,7 @@ def expected_of(fault: ErrorDetails) -> str:
         # `{low:5}` and `low:5` are text in YAML, since a colon needs a space after it.
         spaced = expected == "a mapping" and isinstance(fault["input"], str) and re.search(r":\S", fault["input"])
         return f"{expected}, with a space after each colon" if spaced else expected
-    text = re.sub(r"^(\w+ )?[Ii]nput should (be|have) (a valid )?", "", fault["msg"])
-    return text[0].lower() + text[1:]
+    return "another value"  # never pydantic's own sentence
 
 
 def formatted(value: Any) -> str:
@@ -90,8 +97,22 @@ def user_error_of(
     field = ".".join([section, *location])
     if fault["type"] == "extra_forbidden":
         return UserError(where, field, "an unknown key", nearest(location[-1], _fields_at(model, location[:-1])))
-    got = "nothing" if fault["type"] == "missing" else formatted(fault["input"])
-    return UserError(where, field, got, expected_of(fault))
+    if location and location[-1] == _KEY:
+        field = ".".join([section, *location[:-2]])
+        return UserError(where, field, f"the key {formatted(fault['input'])}", expected_of(fault))
+    return UserError(where, field, _got(fault), expected_of(fault))
+
+
+def _got(fault: ErrorDetails) -> str:
+    """The value that is wrong; of settings that do not fit together only those that the message names."""
+    if fault["type"] == "missing":
+        return "nothing"
+    value = fault["input"]
+    if fault["type"] == "value_error" and isinstance(value, Mapping):
+        words = set(re.findall(r"\w+", expected_of(fault)))
+        named = [f"{key} {formatted(each)}" for key, each in value.items() if key in words]
+        return ", ".join(named) if named else "settings that do not fit together"
+    return formatted(value)
 
 
 def _contains(content: Any, location: list[str]) -> bool:
@@ -105,16 +126,37 @@ def _contains(content: Any, location: list[str]) -> bool:
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
+    """Names of the settings at a place below `model`; none if there is no section."""
+    annotation: Any = model
     for key in location:
-        field = model.model_fields.get(key)
-        found = [] if field is None else _models_in(field.annotation)
-        if not found:
-            return []
-        model = found[0]
-    return list(model.model_fields)
+        section = next(iter(_sections_in(annotation)), None)
+        if section is not None:
+            field = section.model_fields.get(key)
+            annotation = None if field is None else field.annotation
+        else:
+            # A key of a mapping, or the number of an item: go on with the type of the values.
+            annotation = next(iter(typing.get_args(_container_in(annotation))[-1:]), None)
+    return [name for section in _sections_in(annotation)[:1] for name in section.model_fields]
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [found for part in typing.get_args(annotation) for found in _models_in(part)]
+def _parts(annotation: Any) -> list[Any]:
+    """The types of a union, and the type itself of anything else; without Annotated."""
+    if typing.get_origin(annotation) is typing.Annotated:
+        return _parts(typing.get_args(annotation)[0])
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return [part for each in typing.get_args(annotation) for part in _parts(each)]
+    return [annotation]
+
+
+def _sections_in(annotation: Any) -> list[type[BaseModel]]:
+    return [part for part in _parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+
+
+def _container_in(annotation: Any) -> Any:
+    """The mapping, list or tuple of a type; a tuple of any length as a list."""
+    for part in _parts(annotation):
+        if typing.get_origin(part) in (dict, list):
+            return part
+        if typing.get_origin(part) is tuple:
+            return list[typing.get_args(part)[0]]  # type: ignore[misc]
+    return None

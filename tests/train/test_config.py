@@ -25,5 +25,5 @@ def test_the_papers_weights_and_limits_are_the_defaults():
 
 
 def test_frozen_epochs_must_leave_some_to_train():
-    with pytest.raises(ValidationError, match="frozen_epochs must be less than epochs"):
+    with pytest.raises(ValidationError, match="frozen_epochs below epochs"):
         DetectConfig(epochs=3, frozen_epochs=3)

@@ -4,7 +4,8 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.command_line import Verbose, run_command_line
+import perilune_train
+from perilune_shared.command_line import new_program, run_command_line
 from perilune_shared.config import Section, resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
 from perilune_shared.terminal import answer_page
@@ -21,17 +22,11 @@ from perilune_train.report.command import report
 from perilune_train.shipped.models import shipped_models
 
 SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
-app = typer.Typer(
-    help="Train networks for crater detection and landing navigation on perilune datasets; draw attention masks.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+app = new_program(
+    "perilune-train",
+    perilune_train.__version__,
+    "Train networks for crater detection and landing navigation on perilune datasets; draw attention masks.",
 )
-
-
-@app.callback()
-def program(verbose: Verbose = False) -> None:
-    pass
 
 
 app.add_typer(detect, name="detect")

@@ -22,6 +22,7 @@ from perilune_render.cli.options import (
     warn_of_size,
     with_unit,
 )
+from perilune_render.cli.sun import warn_of_suns
 from perilune_render.config import DatasetConfig
 from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
@@ -150,7 +151,9 @@ def dataset(
         from perilune_render.jobs.job import Job
         from perilune_render.jobs.run import RenderingFailed
 
-        for name in KINDS if kind == "both" else (kind,):
+        kinds = KINDS if kind == "both" else (kind,)
+        warn_of_suns(resolved, kinds)
+        for name in kinds:
             try:
                 made = _made(Job.planned(resolved, name, preset), store.sub(name), how, early)
             except RenderingFailed as error:

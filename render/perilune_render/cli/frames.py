@@ -7,6 +7,7 @@ import typer
 
 from perilune_render.cli.dataset import How, first_worker, made_or_exit
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
+from perilune_render.cli.sun import warn_of_sun
 from perilune_render.config import DatasetConfig
 from perilune_render.config_cameras import CameraConfig
 from perilune_shared.config import resolve_over
@@ -77,6 +78,7 @@ def frames(
 
         given = read_poses(poses, *site_of(config), camera_axes)
         plan, config = given_plan(given, config, kind, poses)
+        warn_of_sun(config, "sun_elevation_deg", max(scene.sun_elevation_deg for scene in plan.scenes))
         begun = new_info(config, plan, recipe_of(config, kind, preset))
         made = made_or_exit(Job(plan, config, begun, str(poses)), store, how, early)
     if made is not None:

@@ -6,6 +6,7 @@ from typing import Annotated, get_args
 
 import typer
 
+import perilune_render
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
 from perilune_render.cli.dataset import dataset
@@ -27,25 +28,20 @@ from perilune_render.cli.options import (
 from perilune_render.cli.serve import serve
 from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
+from perilune_render.cli.sun import warn_of_sun, warn_of_suns
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
-from perilune_shared.command_line import Verbose, run_command_line
+from perilune_shared.command_line import new_program, run_command_line
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
 from perilune_shared.errors import EXIT_USER_ERROR, UserError
 from perilune_shared.terminal import answer, answer_page, progress_bar
 
-app = typer.Typer(
-    help="Generate lunar terrain and trajectories, and render labelled frames with Blender.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+app = new_program(
+    "perilune-render",
+    perilune_render.__version__,
+    "Generate lunar terrain and trajectories, and render labelled frames with Blender.",
 )
-
-
-@app.callback()
-def program(verbose: Verbose = False) -> None:
-    pass
 
 
 @app.command()
@@ -104,6 +100,7 @@ def plan(
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
+    warn_of_suns(resolved, (one_kind(kind),))
     from perilune_render.dataset.manifest_only import write_manifest_only
 
     with progress_bar() as progress:
@@ -199,6 +196,8 @@ def preview(
         plan, resolved = given_plan(
             read_poses(poses, *site_of(resolved), camera_axes), resolved, first_kind(kind), poses
         )
+    setting_of_sun = "sun_elevation_deg" if poses else f"dataset.{first_kind(kind)}.sun.elevation_deg"
+    warn_of_sun(resolved, setting_of_sun, max(each.sun_elevation_deg for each in plan.scenes))
     map_path = out.with_name(f"{out.stem}-map.png")
     write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
     answer(f"look at {out} and {map_path}")

@@ -84,6 +84,7 @@ def export(
         match format:
             case "coco":
                 done = f"{export_coco(opened, out, progress, split, choose)} annotations"
+                done += "" if choose is None else " of selected labels; the others are marked iscrowd"
             case "yolo":
                 done = f"{export_yolo(opened, out, progress, split, choose, link=link)} boxes"
             case "huggingface":

@@ -10,21 +10,15 @@ import typer
 import perilune_shared as ps
 from perilune_shared.cli import edit, export
 from perilune_shared.cli.edit import DatasetArgument
-from perilune_shared.command_line import Verbose, run_command_line
+from perilune_shared.command_line import new_program, run_command_line
 from perilune_shared.errors import EXIT_USER_ERROR, one_line, shortened
 from perilune_shared.terminal import answer, answer_table, progress_bar
 
-app = typer.Typer(
-    help="Validate, inspect, edit and export perilune datasets.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+app = new_program(
+    "perilune-manifest",
+    ps.__version__,
+    "Validate, inspect, edit and export perilune datasets.",
 )
-
-
-@app.callback()
-def program(verbose: Verbose = False) -> None:
-    pass
 
 
 @app.command()

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.export.rows import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, frame_sizes, scenes_of
+from perilune_shared.export.rows import (
+    LABEL_MEASURES,
+    Choice,
+    SceneRows,
+    clipped_boxes,
+    count_scenes,
+    frame_sizes,
+    scenes_of,
+)
 from perilune_shared.progress import Progress
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address
@@ -33,14 +41,14 @@ _POLYGON *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 def export_coco(
     dataset: Dataset, out: Address, progress: Progress, split: str | None = None, choose: Choice | None = None
 ) -> int:
-    """Write `out`/instances_<split>.json for each split, or for one; return the number of annotations.
+    """Write `out`/instances_<split>.json for each split, or for one; return the number that are not crowds.
 
     `file_name` is the frame's png_path, so use the dataset's folder as the image folder. Raises UserError if `out` is
     not empty, the dataset is a plan, a png_path is outside the dataset or the split has no frames.
     """
     if dataset.info.images == "planned":
         raise UserError(dataset.store, "images", "planned", "a rendered dataset: a plan has no labels")
-    task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
+    task = progress.add_task("coco", total=count_scenes(dataset, split), unit="scenes")
     opened: dict[str, _SplitFile] = {}
     with new_files(out) as folder:
         try:
@@ -54,7 +62,7 @@ def export_coco(
         finally:
             for file in opened.values():
                 file.close()
-    return sum(file.n_annotations for file in opened.values())
+    return sum(file.n_chosen for file in opened.values())
 
 
 def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
@@ -130,12 +138,24 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
     return found
 
 
+def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_]:
+    """Whether box and outline of each label, clipped to its image, have an area; others are not exported."""
+    boxes, size = clipped_boxes(labels, frames), frame_sizes(labels, frames)
+    found = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    polygons = polygons_of(labels)
+    cut = ~((polygons >= 0) & (polygons <= size[:, None])).all(axis=(1, 2))
+    for k in np.flatnonzero(found & cut):
+        polygon = clip_to_image(polygons[k], *size[k])
+        found[k] = len(polygon) > 2 and area_of(polygon) > 0
+    return found
+
+
 class _SplitFile:
     """Writer of one JSON file: writes annotations when they are added, and the images on closing."""
 
     def __init__(self, path: Path, dataset: Dataset):
         info = dataset.info
-        self.n_annotations = 0
+        self.n_annotations = self.n_chosen = 0
         self._dataset = dataset
         self._images: list[dict[str, Any]] = []
         head = {
@@ -169,6 +189,7 @@ class _SplitFile:
                 self._stream.write(",\n" if self.n_annotations else "\n")
                 self._stream.write(json.dumps(annotation, allow_nan=False))
                 self.n_annotations += 1
+                self.n_chosen += not annotation["iscrowd"]
 
     def close(self) -> None:
         """Write the images and close the file."""

@@ -18,7 +18,7 @@ from perilune_shared.dataset.names import IMAGE_KINDS, SPLITS
 from perilune_shared.dataset.packed import IMAGE, LABEL, features_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.export.card_head import head_of
-from perilune_shared.export.rows import Choice, SceneRows, scenes_of
+from perilune_shared.export.rows import Choice, SceneRows, count_frames, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
@@ -42,7 +42,7 @@ def export_hugging_face(
     The field `chosen` of each label states whether it is selected. Raises UserError if `out` is not empty, an image is
     missing or the split has no frames.
     """
-    task = progress.add_task("hugging face", total=dataset.info.counts.frames, unit="frames")
+    task = progress.add_task("hugging face", total=count_frames(dataset, split), unit="frames")
     writers: dict[str, _Shards] = {}
     n_frames = 0
     with new_files(out) as folder:

@@ -87,6 +87,22 @@ def scenes_of(
         )
 
 
+def count_scenes(dataset: Dataset, split: str | None = None) -> int:
+    """Number of scenes that `scenes_of` yields: the total of a progress bar."""
+    return len(dataset.scene_ids()) if split is None else len(set(_scene_of_each_frame(dataset, split)))
+
+
+def count_frames(dataset: Dataset, split: str | None = None) -> int:
+    """Number of frames in the scenes of `scenes_of`: the total of a progress bar."""
+    return dataset.info.counts.frames if split is None else len(_scene_of_each_frame(dataset, split))
+
+
+def _scene_of_each_frame(dataset: Dataset, split: str) -> list[str]:
+    if split not in SPLITS:
+        raise UserError(dataset.store, "split", split, "one of " + ", ".join(SPLITS))
+    return dataset.table("frames", ["scene_id"], split=split)["scene_id"].to_pylist()
+
+
 def clipped_boxes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
     """Return the boxes (N, 4) of labels as x0, y0, x1, y1, pixels, clipped to their frames."""
     size = frame_sizes(labels, frames)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.export.rows import scenes_of
+from perilune_shared.export.rows import count_scenes, scenes_of
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
@@ -76,7 +76,7 @@ def _trajectories(
     dataset: Dataset, progress: Progress, task_name: str, split: str | None
 ) -> Iterator[tuple[str, str, pd.DataFrame]]:
     """Yield scene_id, trajectory_id and frames in temporal order, for each trajectory."""
-    task = progress.add_task(task_name, total=len(dataset.scene_ids()), unit="scenes")
+    task = progress.add_task(task_name, total=count_scenes(dataset, split), unit="scenes")
     for scene in scenes_of(dataset, split, with_labels=False):
         for trajectory_id, frames in scene.frames.groupby("trajectory_id"):
             yield scene.scene_id, str(trajectory_id), frames.sort_values("frame_index")

@@ -14,7 +14,8 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
-from perilune_shared.export.rows import Choice, clipped_boxes, frame_sizes, scenes_of
+from perilune_shared.export.coco import are_in_image
+from perilune_shared.export.rows import Choice, clipped_boxes, count_scenes, frame_sizes, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
@@ -37,7 +38,7 @@ def export_yolo(
     Images are copied, or with `link` hard-linked where the file system allows it. An image without craters has an empty
     label file. Raises UserError if `out` is not empty, an image is missing or the split has no frames.
     """
-    task = progress.add_task("yolo", total=len(dataset.scene_ids()), unit="scenes")
+    task = progress.add_task("yolo", total=count_scenes(dataset, split), unit="scenes")
     lists: dict[str, list[str]] = defaultdict(list)
     n_boxes = 0
     with new_files(out) as folder:
@@ -46,7 +47,7 @@ def export_yolo(
             boxes = clipped_boxes(labels, scene.frames) / np.tile(frame_sizes(labels, scene.frames), 2)
             # The 8 decimals below resolve 0.001 px in the widest image (100,000 px).
             size, centre = boxes[:, 2:] - boxes[:, :2], (boxes[:, 2:] + boxes[:, :2]) / 2
-            not_empty = (size > 0).all(axis=1)
+            not_empty = are_in_image(labels, scene.frames)
             lines: dict[str, list[str]] = defaultdict(list)
             for frame_id, (x, y), (w, h) in zip(
                 labels["frame_id"][not_empty], centre[not_empty], size[not_empty], strict=True

@@ -208,9 +208,9 @@ class DetectConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":
         if self.strides not in ((8, 16, 32), (4, 8, 16)):
-            raise ValueError("expected strides 8, 16, 32 or 4, 8, 16")
+            raise ValueError("strides 8, 16, 32 or 4, 8, 16")
         if self.frozen_epochs >= self.epochs:
-            raise ValueError("frozen_epochs must be less than epochs")
+            raise ValueError("frozen_epochs below epochs")
         if self.epochs % self.validate_every:
-            raise ValueError("epochs must be a multiple of validate_every")
+            raise ValueError("epochs a multiple of validate_every")
         return self

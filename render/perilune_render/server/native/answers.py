@@ -15,6 +15,7 @@ from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World
 from perilune_shared.client import CRATER_COLUMNS
 from perilune_shared.config import Section
+from perilune_shared.config_errors import expected_of, formatted
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
 
@@ -126,9 +127,9 @@ def _parsed(content: bytes) -> Section:
     try:
         return _REQUESTS[kind].model_validate_json(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(map(str, first["loc"])) or kind
-        raise UserError("request", field, first.get("input"), first["msg"]) from None
+        fault = error.errors(include_url=False)[0]
+        field = ".".join(map(str, fault["loc"])) or kind
+        raise UserError("request", field, formatted(fault["input"]), expected_of(fault)) from None
 
 
 def _answer(world: World, request: Section) -> list[bytes]:

@@ -119,6 +119,12 @@ def read_elevation(
     )
 
 
+def read_site(path: Path, config: ElevationConfig = _AT_THE_MIDDLE) -> Site:
+    """The site of an elevation model, without its heights. Raises UserError as `read_elevation`."""
+    with opened_raster(raster_files(path, field="dem", tiles=config.vrt_files), "dem") as file:
+        return site_in(path, map_of(path, file, config), config)
+
+
 def _source_of(files: RasterFiles, used: set[str]) -> str:
     """File name (without folder and special characters) and SHA-256 of a raster.
 

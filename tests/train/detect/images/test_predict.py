@@ -64,8 +64,8 @@ def test_everything_is_written(run, tmp_path):
     assert list(written.columns) == COLUMNS
     assert written["x0_px"].to_numpy() == pytest.approx(values["x0_px"], abs=1e-4)
     overlay = cv2.imread(str(tmp_path / "out" / "a.png.overlay.png"))
-    assert overlay.shape == (280, 1200, 3)
-    assert (overlay[..., 0] > overlay[..., 2].astype(int) + 100).any()
+    assert overlay.shape == (280 + 24, 1200, 3)
+    assert np.ptp(overlay[:280], axis=-1).max() > 60, "lines have a colour, the image has none"
     shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())
     assert len(shapes["features"]) == (table["image"] == "g.tif").sum()
     assert shapes["crs"]["properties"]["name"] == MOON_CRS
@@ -183,7 +183,7 @@ def test_the_command(run, tmp_path):
     assert "detections.csv, detections.geojson, *.overlay.png" in " ".join(result.output.split())
     table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
     assert len(table) == 0 and list(table.columns) == COLUMNS
-    for options in (["--threshold", "2"], ["--scale", "0"], ["--tile", "100"], ["--overlap", "-1"], []):
+    for options in (["--min-score", "2"], ["--scale", "0"], ["--tile", "100"], ["--overlap", "-1"], []):
         refused = CliRunner().invoke(app, [*arguments, *options])
         assert isinstance(refused.exception, UserError), options
 
@@ -248,3 +248,39 @@ def test_a_folder_and_a_least_size(run, tmp_path):
     ):
         refused = CliRunner().invoke(app, ["detect", "predict", *arguments])
         assert isinstance(refused.exception, UserError) and message in str(refused.exception)
+
+
+def test_results_keep_the_strongest_and_the_large_and_replace_older_ones(run, tmp_path):
+    path, out = tmp_path / "a.png", tmp_path / "out"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (96, 96), dtype=np.uint8))
+    command = [
+        "detect",
+        "predict",
+        str(path),
+        "--run",
+        str(run),
+        "--out",
+        str(out),
+        "--tile",
+        "96",
+        "--min-score",
+        "1e-6",
+    ]
+
+    def table(*options: str) -> pd.DataFrame:
+        result = CliRunner().invoke(app, [*command, *options])
+        assert result.exit_code == 0, result.output
+        return pd.read_parquet(out / "detections.parquet")
+
+    full = table()
+    assert len(full) > 5
+    with pytest.raises(UserError, match="--overwrite replaces it"):
+        table_again = CliRunner().invoke(app, command)
+        raise table_again.exception
+    strong = table("--top", "3", "--overwrite")
+    assert sorted(strong["score"]) == sorted(full["score"])[-3:]
+    radius = float(full["radius_px"].median())
+    large = table("--min-radius-px", str(radius), "--overwrite")
+    assert len(large) == (full["radius_px"] >= radius).sum() < len(full)
+    both = CliRunner().invoke(app, [*command, "--overwrite", "--min-size", "1", "--min-radius-px", "1"])
+    assert "--min-size: options: got together with --min-radius-px" in str(both.exception)

@@ -29,7 +29,8 @@ from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import check_output, chosen_threshold
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, Request, read_images
-from perilune_train.detect.images.predict import draw_boxes, table_of
+from perilune_train.detect.images.overlay import draw_boxes
+from perilune_train.detect.images.predict import table_of
 from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image

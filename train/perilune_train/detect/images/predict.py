@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import write_csv
@@ -24,18 +22,13 @@ from perilune_train.detect.images.georeference import (
     features,
     read_georeference,
 )
+from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
-from perilune_train.evaluation.pictures import save_image
 from perilune_train.training import runs
-
-_DETECTED = (227, 211, 25)
-"""Cyan, in OpenCV's order blue, green, red."""
-_LARGEST_OVERLAY_PX = 4096
-_SMALLEST_OVERLAY_PX = 1600
 
 
 @dataclass(frozen=True)
@@ -50,6 +43,8 @@ class PredictSettings:
     """Minimum size of a crater, sqrt(w h), pixels."""
     nodata: float | None = None
     """Value of pixels without data."""
+    top: int | None = None
+    """Maximum number of craters in an image, those of the highest scores; None for all."""
 
 
 def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
@@ -80,9 +75,9 @@ def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
             found = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
-            found = of_size(above(found, threshold), settings.min_size_px)
+            found = strongest(of_size(above(found, threshold), settings.min_size_px), settings.top)
             tables.append(table_of(path.name, found))
-            write_overlay(folder / f"{path.name}.overlay.png", image, found)
+            write_overlay(folder / f"{path.name}.overlay.png", image, found, threshold)
             if reference is not None:
                 own = features(path.name, found, reference)
                 shapes += own
@@ -124,6 +119,14 @@ def of_size(found: Detections, min_size_px: float) -> Detections:
     return Detections(found.boxes[large], found.scores[large])
 
 
+def strongest(found: Detections, top: int | None) -> Detections:
+    """The `top` detections of the highest scores, in their order; all if None."""
+    if top is None or len(found.scores) <= top:
+        return found
+    best = np.sort(np.argsort(-found.scores, kind="stable")[:top])
+    return Detections(found.boxes[best], found.scores[best])
+
+
 def expanded(given: list[Path]) -> list[Path]:
     """The images that are given, and those of given folders. Raises UserError on a folder without images."""
     paths = []
@@ -153,22 +156,3 @@ def table_of(name: str, found: Detections) -> pd.DataFrame:
         "score": found.scores,
     }
     return pd.DataFrame(columns)
-
-
-def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections) -> None:
-    """Draw the detections as ellipses over the image; small ones are enlarged, large ones reduced."""
-    side = max(image.shape)
-    factor = min(max(_SMALLEST_OVERLAY_PX // side, 1), 4) if side < _LARGEST_OVERLAY_PX else _LARGEST_OVERLAY_PX / side
-    size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
-    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-    canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
-    draw_boxes(canvas, found.boxes * factor, _DETECTED)
-    save_image(path, canvas)
-
-
-def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
-    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) in blue, green, red."""
-    # OpenCV takes integers, here sixteenths of a pixel, and has its origin at a pixel's centre.
-    sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
-    for x, y, a, b in sixteenths.astype(int).tolist():
-        cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, colour, 1, cv2.LINE_AA, 4)

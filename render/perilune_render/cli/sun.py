@@ -1,0 +1,49 @@
+"""Warn of a Sun that never stands so high at the landing site."""
+
+from pathlib import Path
+
+from perilune_render.config import DatasetConfig
+from perilune_render.config_terrain import TerrainConfig
+from perilune_shared.dataset.names import Kind
+from perilune_shared.terminal import say
+
+_LARGEST_SUN_LATITUDE_DEG = 1.54
+"""Largest distance of the Sun from the Moon's equator: the tilt of the Moon's axis to the ecliptic, degrees."""
+
+
+def highest_sun_deg(latitude_deg: float) -> float:
+    """The highest elevation of the Sun above level ground at a latitude, degrees."""
+    return min(90.0, 90.0 - abs(latitude_deg) + _LARGEST_SUN_LATITUDE_DEG)
+
+
+def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None:
+    """Warn if the Sun never stands this high at the site; `where` names the setting.
+
+    Only of a site that is stated, by an elevation model or a `dataset.terrain.latitude_deg` of the user: other ground
+    is procedural and of no place. Raises UserError if the elevation model cannot be read.
+    """
+    latitude = _stated_latitude_deg(config)
+    if latitude is None or elevation_deg <= highest_sun_deg(latitude):
+        return
+    place = f"{abs(latitude):.1f} degrees {'south' if latitude < 0 else 'north'}"
+    say(
+        f"warning: {where}: got {elevation_deg:g} degrees, expected at most {highest_sun_deg(latitude):.1f}: at {place}"
+        " the Sun never stands higher"
+    )
+
+
+def warn_of_suns(config: DatasetConfig, kinds: tuple[Kind, ...]) -> None:
+    """`warn_of_sun` of the Suns that are drawn for datasets of these kinds."""
+    for kind in kinds:
+        warn_of_sun(config, f"dataset.{kind}.sun.elevation_deg", config.kind(kind).sun.elevation_deg.high)
+
+
+def _stated_latitude_deg(config: DatasetConfig) -> float | None:
+    terrain = config.terrain
+    if terrain.dem is None:
+        usual = TerrainConfig.model_fields["latitude_deg"].default
+        return None if terrain.latitude_deg == usual else terrain.latitude_deg
+    # Imports rasterio.
+    from perilune_render.terrain.elevation.model import read_site
+
+    return read_site(Path(terrain.dem), terrain.elevation).latitude_deg

@@ -1,0 +1,80 @@
+"""Draw detections over an image: ellipses coloured by score, above a strip with the scale of colours and a count."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.evaluation.pictures import save_image
+
+MOST_DRAWN = 1000
+"""Maximum number of craters in an overlay. Lines of more than that hide the ground."""
+_LARGEST_PX = 4096
+_SMALLEST_PX = 1600
+_LINE_OPACITY = 0.8
+"""Lines are one pixel wide, the least that OpenCV draws; the ground shows through them."""
+_DARKEST = 80
+"""First entry of the colour map that is used, of 256: the darker ones cannot be seen on grey."""
+_STRIP_SHARE = 0.02
+"""Height of the strip below the image, as a share of the image's longer side."""
+
+
+def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections, threshold: float) -> None:
+    """Draw the detections as ellipses over the image; small images are enlarged, large ones reduced.
+
+    Colours go from purple (the threshold) to yellow (a score of 1). At most MOST_DRAWN detections are drawn, those of
+    the highest scores; the strip below the image states how many.
+    """
+    side = max(image.shape)
+    factor = min(max(_SMALLEST_PX // side, 1), 4) if side < _LARGEST_PX else _LARGEST_PX / side
+    size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
+    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
+    # The strongest are drawn last, above the others.
+    drawn = np.argsort(found.scores, kind="stable")[-MOST_DRAWN:]
+    lines = canvas.copy()
+    for k, colour in zip(drawn, _colours(found.scores[drawn], threshold), strict=True):
+        draw_boxes(lines, found.boxes[k : k + 1] * factor, colour)
+    canvas = cv2.addWeighted(lines, _LINE_OPACITY, canvas, 1 - _LINE_OPACITY, 0)
+    count = f"{len(found.scores)} craters"
+    if len(drawn) < len(found.scores):
+        count += f", drawn: the {len(drawn)} with the highest scores"
+    save_image(path, np.vstack([canvas, _strip(canvas.shape[1], max(size), threshold, count)]))
+
+
+def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
+    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) in blue, green, red."""
+    # OpenCV takes integers, here sixteenths of a pixel, and has its origin at a pixel's centre.
+    sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
+    for x, y, a, b in sixteenths.astype(int).tolist():
+        cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, colour, 1, cv2.LINE_AA, 4)
+
+
+def _colours(scores: NDArray[np.float64], threshold: float) -> list[tuple[int, int, int]]:
+    """Colours of scores between the threshold and 1, in OpenCV's order blue, green, red."""
+    share = np.clip((scores - threshold) / max(1 - threshold, 1e-9), 0, 1)
+    levels = np.rint(_DARKEST + share * (255 - _DARKEST)).astype(np.uint8)
+    if not len(levels):
+        return []
+    return [(int(b), int(g), int(r)) for b, g, r in cv2.applyColorMap(levels[:, None], cv2.COLORMAP_PLASMA)[:, 0]]
+
+
+def _strip(width_px: int, side_px: int, threshold: float, count: str) -> NDArray[np.uint8]:
+    """A black strip with the scale of colours and a line of text, (height, width, 3); cut on narrow images."""
+    height = max(round(_STRIP_SHARE * side_px), 24)
+    strip = np.zeros((height, max(width_px, 1), 3), np.uint8)
+    scale, margin = height / 48, height // 4
+    base = height - height // 3
+
+    def write(text: str, x_px: int) -> int:
+        cv2.putText(strip, text, (x_px, base), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
+        return x_px + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] + margin
+
+    x = write(f"score {threshold:.2f}", margin)
+    bar = np.array(_colours(np.linspace(threshold, 1, 4 * height), threshold), np.uint8)[None]
+    bar = bar[:, : max(strip.shape[1] - x, 0)]
+    strip[margin : height - margin, x : x + bar.shape[1]] = bar
+    write(count, write("1", x + 4 * height + margin) + margin)
+    return strip
