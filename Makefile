@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results release clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -343,6 +343,10 @@ bench-suppress: setup-dev ## time of suppression of a batch, compared with OpenC
 results: setup ## write the headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
 	@$(if $(RECORD),$(BIN)/python scripts/results.py record $(RECORD))
 	@$(BIN)/python scripts/results.py write
+
+release: setup-dev ## check, build and tag a version from a clean tree (VERSION=0.1.0); uploads only with UPLOAD=1
+	@$(BIN)/python scripts/release.py release $(call quoted,$(or $(VERSION),$(error VERSION: got nothing, expected a version: make release VERSION=0.1.0))) \
+	  $(if $(filter 1,$(UPLOAD)),--upload)
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

@@ -22,6 +22,8 @@ class Shipment:
     """SHA-256 of its dataset.json."""
     size_mb: float
     """Size of the weights, MB."""
+    precision: str = "half precision"
+    """How the weights are stored."""
     others: tuple[dict[str, Any], ...] = ()
     """benchmark.json of trainings with other seeds, which are not installed."""
     notes: tuple[str, ...] = ()
@@ -39,7 +41,7 @@ def _facts(one: Shipment, network: str, threshold: str | None) -> list[str]:
     data = f"manifest `{one.manifest}`, SHA-256 of dataset.json {one.sha256[:16]}; rendered frames only"
     rows = {
         "Network": network,
-        "Weights": f"{one.size_mb:.1f} MB, half precision, safetensors",
+        "Weights": f"{one.size_mb:.1f} MB, {one.precision}, safetensors",
         "Training data": data,
         "Trained at": f"commit {commit}, {one.metrics.get('run/hardware', 'unknown hardware')}",
         "Threshold": threshold,

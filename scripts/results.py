@@ -4,8 +4,9 @@
     python scripts/results.py write
 
 `record` keeps the JSON of a run or a benchmark as results/<name>.json, with the commit, hardware and command that the
-run recorded itself. `write` (`make results`) puts the rows of results/headline.toml, with their figures from these
-records, into the pages. tests/test_results.py fails if they do not agree.
+run recorded itself, and with hashes of that commit's sources: they stay valid in a shallow clone and after a squash of
+the history, when nobody can look the commit up. `write` (`make results`) puts the rows of results/headline.toml, with
+their figures from these records, into the pages. tests/test_results.py fails if they do not agree.
 """
 
 import json
@@ -22,7 +23,7 @@ if __name__ == "__main__":
     end_at_interrupt()
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from perilune_shared.command_line import run_command_line
 from perilune_shared.errors import UserError
@@ -33,7 +34,10 @@ RESULTS = ROOT / "results"
 PAGES = {ROOT / "docs/results.md": False, ROOT / "README.md": True}
 """Pages with a table between BEGIN and END, and whether it has only the rows for the README."""
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
+SOURCES = ("shared", "render", "train", "benchmarks", "scripts")
+"""Folders with the code that makes figures."""
 _COMMIT = re.compile(r"[0-9a-f]{7,40}")
+_TREE = re.compile(r"[0-9a-f]{40}")
 _NEEDED = "a file that a run or a benchmark of this version wrote"
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
@@ -48,6 +52,9 @@ class Record(BaseModel):
     """The file that the run wrote; or "transcribed from ..." if that file was not kept."""
     commit: str = Field(pattern=f"^{_COMMIT.pattern}$")
     """Commit of the code that made the figures; for a transcribed record, the commit that added them to the page."""
+    sources: dict[str, Annotated[str, Field(pattern=f"^{_TREE.pattern}$")]]
+    """Hash of each folder with code in this commit, as `git rev-parse COMMIT:FOLDER` prints it: it depends on the names
+    and bytes of the files alone, so it also identifies the code in a history that lacks the commit."""
     date: str = Field(pattern=r"^\d{4}-\d\d-\d\d$")
     """UTC day of the run."""
     hardware: str
@@ -60,6 +67,13 @@ class Record(BaseModel):
     """What the run wrote, unchanged."""
     quotes: tuple[str, ...] = ()
     """For a transcribed record, the text of the page with the figures."""
+
+    @field_validator("sources")
+    @classmethod
+    def _all_sources(cls, sources: dict[str, str]) -> dict[str, str]:
+        if tuple(sources) != SOURCES:
+            raise ValueError(f"got hashes of {', '.join(sources)}, expected those of {', '.join(SOURCES)}")
+        return sources
 
     @property
     def transcribed(self) -> bool:
@@ -155,6 +169,7 @@ def _record_of(file: Path) -> Record:
         found = Record(
             source=name,
             commit=commit,
+            sources=_sources_of_run(file, commit),
             date=made["date"],
             hardware=hardware,
             load=made["load"],
@@ -168,15 +183,25 @@ def _record_of(file: Path) -> Record:
         raise UserError(file, "run", "no commit, hardware and command", _NEEDED) from None
     if re.search(r"(^|[\s=])/", found.command):
         raise UserError(file, "run/command", command, "paths relative to the repository, so that others can run it")
-    if not is_ancestor(commit):
-        raise UserError(file, "run/commit", commit, "a commit of this branch")
     return found
 
 
-def is_ancestor(commit: str) -> bool:
-    """Whether a commit belongs to the history of this branch."""
-    command = ["git", "-C", str(ROOT), "merge-base", "--is-ancestor", commit, "HEAD"]
-    return subprocess.run(command, capture_output=True).returncode == 0
+def _sources_of_run(file: Path, commit: str) -> dict[str, str]:
+    """Hashes of the sources that made a file. Raises UserError if they cannot be looked up."""
+    if not _TREE.fullmatch(commit):
+        raise UserError(file, "run/commit", commit, f"{_NEEDED}, with committed code")
+    sources = sources_of(commit)
+    if sources is None:
+        raise UserError(file, "run/commit", commit, "a commit of this repository")
+    return sources
+
+
+def sources_of(commit: str, repository: Path = ROOT) -> dict[str, str] | None:
+    """Hash of each folder of `SOURCES` in a commit; None if this clone lacks the commit."""
+    names = [f"{commit}:{folder}" for folder in SOURCES]
+    command = ["git", "-C", str(repository), "rev-parse", *names]
+    done = subprocess.run(command, capture_output=True, text=True)
+    return dict(zip(SOURCES, done.stdout.split(), strict=True)) if done.returncode == 0 else None
 
 
 def read_records() -> dict[str, Record]:

@@ -4,7 +4,8 @@
     make benchmark
     python scripts/ship.py card --name crater-detector --benchmark runs/benchmark/crater-detector/benchmark.json
 
-The benchmark scores the installed weights in half precision. `install` writes train/perilune_train/shipped/NAME/ with
+The benchmark scores the installed weights as they are stored: in half precision, or in half of that size with
+`install --eight-bits`, where the validation split loses no AP. `install` writes train/perilune_train/shipped/NAME/ with
 weights.safetensors, config.yaml and metrics.json. `card` adds benchmark.json and card.md, and writes
 docs/reference/models/NAME.md, a copy of the card, and NAME-benchmark.md, the page of the benchmark.
 """
@@ -29,7 +30,7 @@ from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.navigate.covariance import FILE as COVARIANCE
 from perilune_train.shipped.models import BENCHMARK, CARD, WEIGHTS
-from perilune_train.training.half_weights import write_half
+from perilune_train.training.half_weights import precision_of, write_bytewise, write_half
 from perilune_train.training.runs import RunFolder, load_weights
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,14 +45,18 @@ app = typer.Typer(pretty_exceptions_enable=False, add_completion=False, no_args_
 
 
 @app.command()
-def install(run: Annotated[Path, typer.Argument(help="Folder of a finished run.")], name: Name) -> None:
+def install(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
+    name: Name,
+    eight_bits: Annotated[bool, typer.Option("--eight-bits", help="Store 8 bits per weight.")] = False,
+) -> None:
     """Write weights, configuration and metrics of a run into the package; a card of an earlier network is removed."""
     folder, source = _folder(name), RunFolder(run)
     content, metrics = load_weights(source.best), read_metrics(run)
     folder.mkdir(parents=True, exist_ok=True)
     for stale in (BENCHMARK, CARD):
         (folder / stale).unlink(missing_ok=True)
-    write_half(folder / WEIGHTS, content)
+    (write_bytewise if eight_bits else write_half)(folder / WEIGHTS, content)
     size = (folder / WEIGHTS).stat().st_size / 1e6
     if size > MAX_MB[name]:
         (folder / WEIGHTS).unlink()
@@ -80,7 +85,9 @@ def card(
     size = (folder / WEIGHTS).stat().st_size / 1e6
     sha256 = sha256_of(ROOT / "data_manifests" / manifest / "dataset.json")
     others = tuple(read_metrics(path.parent, path.name) for path in other or [])
-    text = model_card(Shipment(name, content, metrics, figures, manifest, sha256, size, others, tuple(note or [])))
+    precision = precision_of(folder / WEIGHTS)
+    shipment = Shipment(name, content, metrics, figures, manifest, sha256, size, precision, others, tuple(note or []))
+    text = model_card(shipment)
     write_text(folder / BENCHMARK, json.dumps(figures, indent=2) + "\n")
     write_text(folder / CARD, text)
     PAGES.mkdir(parents=True, exist_ok=True)

@@ -53,15 +53,53 @@ def test_every_record_is_shown():
 
 
 @pytest.mark.parametrize("name", RECORDS)
-def test_the_commit_of_a_record_is_in_the_history(name):
-    if "true" in git("rev-parse", "--is-shallow-repository"):
-        pytest.skip("this clone has no history")
+def test_the_sources_of_a_record_are_those_of_its_commit(name):
+    """Where this clone has the commit: a shallow or squashed one has the hashes alone."""
     record = RECORDS[name]
-    assert results.is_ancestor(record.commit)
+    assert results.sources_of(record.commit) in (record.sources, None)
     if record.transcribed:
         page, commit = record.source.removeprefix("transcribed from ").split(" at ")
-        text = git("show", f"{commit}:{page}")
-        assert record.quotes and all(quote in text for quote in record.quotes)
+        assert record.quotes
+        if results.sources_of(commit) is not None:
+            text = git("show", f"{commit}:{page}")
+            assert all(quote in text for quote in record.quotes)
+
+
+def test_hashes_of_sources_outlive_a_squash(tmp_path):
+    """The commit is gone from the squashed clone; the same files have the same hashes there."""
+    whole, squashed = tmp_path / "whole", tmp_path / "squashed"
+    for folder in results.SOURCES:
+        (whole / folder).mkdir(parents=True)
+        (whole / folder / "code.py").write_text(f"# {folder}\n")
+
+    def run(repository: Path, *arguments: str) -> str:
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
+        command = ["git", "-C", str(repository), *identity, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    run(tmp_path, "init", "-q", str(whole))
+    commits = []
+    for message in ("first", "second"):
+        (whole / "page.md").write_text(message)
+        run(whole, "add", ".")
+        run(whole, "commit", "-q", "-m", message)
+        commits.append(run(whole, "rev-parse", "HEAD"))
+    run(tmp_path, "clone", "-q", "--depth", "1", whole.as_uri(), str(squashed))
+    sources = results.sources_of(commits[0], whole)
+    assert sources is not None and len(set(sources.values())) == len(results.SOURCES)
+    assert results.sources_of(commits[0], squashed) is None
+    assert results.sources_of("HEAD", squashed) == sources
+    (whole / "render/code.py").write_text("other")
+    run(whole, "commit", "-q", "-a", "-m", "third")
+    assert results.sources_of("HEAD", whole) == {**sources, "render": results.sources_of("HEAD", whole)["render"]}
+    assert results.sources_of("HEAD", whole) != sources
+
+
+def test_a_record_without_the_hash_of_a_folder_is_refused():
+    content = RECORDS["train"].model_dump()
+    del content["sources"]["render"]
+    with pytest.raises(ValueError, match="got hashes of shared, train"):
+        results.Record.model_validate(content)
 
 
 def test_a_benchmark_becomes_a_record(tmp_path):
@@ -70,6 +108,7 @@ def test_a_benchmark_becomes_a_record(tmp_path):
     found = results.Record.model_validate_json((tmp_path / "sizes.json").read_text())
     assert found.figures == FIGURES and found.command == "make it" and not found.transcribed
     assert found.source == "bench/sizes.json" and found.commit == git("rev-parse", "HEAD").strip()
+    assert found.sources["render"] == git("rev-parse", "HEAD:render").strip()
 
 
 def test_a_run_becomes_a_record(tmp_path):
@@ -85,7 +124,7 @@ def test_a_run_becomes_a_record(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"commit": "0" * 40}, "expected a commit of this branch"),
+        ({"commit": "0" * 40}, "expected a commit of this repository"),
         ({"commit": "a" * 40 + " modified"}, "with committed code"),
         ({"commit": "unknown"}, "with committed code"),
         ({"command": "make it OUT=/home/me/out"}, "expected paths relative to the repository"),

@@ -1,15 +1,15 @@
-"""Weights in half precision: what is kept, and files that are refused."""
+"""Weights in half precision and in 8 bits: what is kept, and files that are refused."""
 
 import json
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from perilune_shared.errors import UserError
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.training.half_weights import write_half
+from perilune_train.training.half_weights import precision_of, write_bytewise, write_half
 from perilune_train.training.runs import RunFolder, load_weights, save_weights
 
 ARCHITECTURE = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
@@ -36,9 +36,10 @@ def test_it_detects_nearly_the_same(network, tmp_path):
     assert 0.45 < sizes[1] / sizes[0] < 0.6
 
 
-def test_vectors_and_buffers_keep_their_precision(network, tmp_path):
+@pytest.mark.parametrize("write", [write_half, write_bytewise])
+def test_vectors_and_buffers_keep_their_precision(network, tmp_path, write):
     content = {"architecture": ARCHITECTURE, "state_dict": network.state_dict()}
-    write_half(tmp_path / "weights.safetensors", content)
+    write(tmp_path / "weights.safetensors", content)
     again = load_weights(tmp_path / "weights.safetensors")["state_dict"]
     exact = [key for key in again if key == "anchors" or "running" in key or key.endswith("bias")]
     assert len(exact) > 100 and all(torch.equal(network.state_dict()[key], again[key]) for key in exact)
@@ -58,6 +59,49 @@ def test_weights_out_of_range_are_refused(network, tmp_path):
     with pytest.raises(UserError, match="65504"):
         write_half(tmp_path / "weights.safetensors", {"architecture": ARCHITECTURE, "state_dict": state})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_eight_bits_round_by_half_a_step_of_each_channel(network, tmp_path):
+    state = network.state_dict()
+    name = next(key for key, value in state.items() if value.ndim == 4)
+    state[name][0] = 0
+    state[name][1] *= 1000
+    half, bytewise = tmp_path / "half.safetensors", tmp_path / "weights.safetensors"
+    content = {"architecture": ARCHITECTURE, "state_dict": state, "terrain": {"known": True, "uses": []}}
+    write_half(half, content)
+    write_bytewise(bytewise, content)
+    assert [precision_of(path) for path in (half, bytewise)] == ["half precision", "8 bits per weight"]
+    again = load_weights(bytewise)
+    assert {key: again[key] for key in ("architecture", "terrain")} == {
+        key: load_weights(half)[key] for key in again if key != "state_dict"
+    }
+    rounded = [key for key, value in state.items() if key.endswith(".weight") and value.ndim >= 2]
+    assert set(again["state_dict"]) == set(state)
+    for key in rounded:
+        flat, found = state[key].flatten(1), again["state_dict"][key].flatten(1)
+        step = flat.abs().amax(1, keepdim=True) / 127
+        assert bool(((flat - found).abs() <= 0.5001 * step).all()), key
+    assert not bool(again["state_dict"][name][0].any())
+    assert bytewise.stat().st_size < 0.75 * half.stat().st_size
+
+
+@pytest.mark.parametrize("damage", ["no steps", "no integers", "steps of half precision", "too few steps"])
+def test_integers_whose_steps_do_not_fit_are_refused(network, tmp_path, damage):
+    path = tmp_path / "weights.safetensors"
+    write_bytewise(path, {"architecture": ARCHITECTURE, "state_dict": network.state_dict()})
+    tensors = load_file(path)
+    name = next(key for key, value in tensors.items() if value.dtype == torch.int8)
+    if damage == "no steps":
+        del tensors[f"{name}#step"]
+    elif damage == "no integers":
+        del tensors[name]
+    elif damage == "too few steps":
+        tensors[f"{name}#step"] = tensors[f"{name}#step"][1:].contiguous()
+    else:
+        tensors[f"{name}#step"] = tensors[f"{name}#step"].half()
+    save_file(tensors, path, {"architecture": json.dumps(ARCHITECTURE)})
+    with pytest.raises(UserError, match=f"{name}: got"):
+        load_weights(path)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "text", "no architecture", "not JSON", "missing"])

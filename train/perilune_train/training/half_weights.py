@@ -1,4 +1,4 @@
-"""Weights as a safetensors file in half precision: small, and loading it executes nothing."""
+"""Weights as a safetensors file in half precision or in 8 bits: small, and loading it executes nothing."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +15,9 @@ from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
 
 SUFFIX = ".safetensors"
 _MOST_HEADER_BYTES = 8_000_000
-_DTYPES = {"F16", "F32", "F64", "I64", "I32", "BOOL"}
+_DTYPES = {"F16", "F32", "F64", "I64", "I32", "I8", "BOOL"}
+_STEP = "#step"
+"""Ending of the name of the steps of a tensor of 8-bit integers."""
 _PLAIN = ("architecture", "terrain")
 """Keys of a checkpoint that are stored as JSON in the header; `terrain` may be missing."""
 
@@ -28,16 +30,48 @@ def write_half(path: Path, content: Mapping[str, Any]) -> None:
     """
     tensors = {}
     for name, tensor in content["state_dict"].items():
-        halved = tensor.half() if name.endswith(".weight") and tensor.ndim >= 2 else tensor
+        halved = tensor.half() if _is_rounded(name, tensor) else tensor
         if not bool(torch.isfinite(halved).all()):
             raise UserError(path, name, "a weight above 65504", "weights in the range of half precision")
         tensors[name] = halved.contiguous()
+    _write(path, tensors, content)
+
+
+def write_bytewise(path: Path, content: Mapping[str, Any]) -> None:
+    """Write the content of a checkpoint with 8 bits per weight, half the size of `write_half`.
+
+    The same tensors are rounded: each output channel to integers of -127 to 127 times its own step (float32). Raises
+    UserError if a weight is not finite.
+    """
+    tensors = {}
+    for name, tensor in content["state_dict"].items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise UserError(path, name, "a weight that is not finite", "finite weights")
+        if _is_rounded(name, tensor):
+            flat = tensor.float().flatten(1)
+            # A channel of zeros has any step.
+            step = (flat.abs().amax(1) / 127).clamp(min=torch.finfo(torch.float32).tiny)
+            tensors[name] = torch.round(flat / step[:, None]).to(torch.int8).view(tensor.shape).contiguous()
+            tensors[name + _STEP] = step
+        else:
+            tensors[name] = tensor.contiguous()
+    _write(path, tensors, content)
+
+
+def _is_rounded(name: str, tensor: torch.Tensor) -> bool:
+    return name.endswith(".weight") and tensor.ndim >= 2
+
+
+def _write(path: Path, tensors: dict[str, torch.Tensor], content: Mapping[str, Any]) -> None:
     metadata = {key: json.dumps(content[key], separators=(",", ":")) for key in _PLAIN if key in content}
     write_bytes(path, save(tensors, metadata))
 
 
 def read_half(path: Path) -> dict[str, Any]:
-    """The content that `write_half` wrote, weights as float32, on the CPU. Raises UserError on any other file."""
+    """The content that `write_half` or `write_bytewise` wrote, weights as float32, on the CPU.
+
+    Raises UserError on any other file.
+    """
     expected = "a file of weights that perilune wrote"
     try:
         _check_header(path, expected)
@@ -52,8 +86,29 @@ def read_half(path: Path) -> dict[str, Any]:
         raise UserError(path, "weights", str(error) or type(error).__name__, expected) from None
     if not isinstance(content.get("architecture"), dict):
         raise UserError(path, "architecture", "missing", expected)
-    content["state_dict"] = {key: t.float() if t.dtype == torch.float16 else t for key, t in tensors.items()}
+    content["state_dict"] = _as_float32(path, tensors)
     return content
+
+
+def _as_float32(path: Path, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Undo the rounding. Raises UserError if integers and steps do not belong together."""
+    steps = {name.removesuffix(_STEP): tensors.pop(name) for name in list(tensors) if name.endswith(_STEP)}
+    for name in {key for key, tensor in tensors.items() if tensor.dtype == torch.int8} | set(steps):
+        whole, step = tensors.get(name), steps.get(name)
+        if whole is None or step is None or whole.dtype != torch.int8 or whole.ndim < 2:
+            raise UserError(path, name, "integers without steps, or the reverse", "both, for a tensor of weights")
+        if step.dtype != torch.float32 or step.shape != whole.shape[:1]:
+            found = f"steps of shape {list(step.shape)}, {step.dtype}"
+            raise UserError(path, name, found, f"{whole.shape[0]} of torch.float32")
+        tensors[name] = whole.float() * step.view(-1, *[1] * (whole.ndim - 1))
+    return {key: tensor.float() if tensor.dtype == torch.float16 else tensor for key, tensor in tensors.items()}
+
+
+def precision_of(path: Path) -> str:
+    """How a file stores its weights, for people: half precision or 8 bits per weight."""
+    with safetensors.safe_open(path, "pt") as file:
+        bytewise = any(file.get_slice(name).get_dtype() == "I8" for name in file.keys())  # noqa: SIM118
+    return "8 bits per weight" if bytewise else "half precision"
 
 
 def is_whole(path: Path) -> bool:
