@@ -12,12 +12,12 @@ ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
         "errors cgroups threads interrupts run_record terminal progress content yaml_text command_line "
-        "config_errors config config_page storage geometry client dataset labels validation editing export cli"
+        "config_errors config config_page storage pictures geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
         "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene "
         "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
-        "heightfield engines outputs dataset preview server jobs cli"
+        "heightfield engines outputs dataset preview server scenes jobs cli"
     ),
     "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main program",
     "render/perilune_render/terrain": (
