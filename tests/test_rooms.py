@@ -19,6 +19,7 @@ ROOMS = {
         "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
         "heightfield engines outputs dataset preview server scenes jobs cli"
     ),
+    "perilune/perilune": "parts datasets",
     "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main program",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
@@ -73,7 +74,11 @@ def test_imports_flow_one_way(folder):
 
 def test_every_test_named_in_a_page_or_a_docstring_exists():
     files = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-    files += [path for house in ("shared", "render", "train", "benchmarks") for path in (ROOT / house).rglob("*.py")]
+    files += [
+        path
+        for house in ("shared", "render", "train", "perilune", "benchmarks")
+        for path in (ROOT / house).rglob("*.py")
+    ]
     named = {name for path in files for name in re.findall(r"tests/[\w/*]+\.py", path.read_text(encoding="utf-8"))}
     assert len(named) > 5
     assert [name for name in sorted(named) if not list(ROOT.glob(name))] == []
