@@ -236,6 +236,10 @@ def _world_of(
         expected = "one recipe; select its scenes with `perilune-manifest subset`"
         raise UserError(where, "recipes", len(info.recipes), expected)
     recipe = info.recipe()
+    terrain = recipe.config.get("terrain")
+    if isinstance(terrain, dict) and terrain.get("dem") is not None:
+        expected = "procedural ground; give the elevation model itself as the source"
+        raise UserError(where, "terrain.dem", terrain["dem"], expected)
     config = config_of(recipe, where)
     if config.survey is not None or config.counterfactual is not None:
         raise UserError(where, "recipe", "a survey or a counterfactual dataset", "a dataset of descents or given poses")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from tests.helpers.elevation_models import hilly_raster
 
 import perilune
 from perilune_render.config import DatasetConfig
@@ -88,6 +89,31 @@ def test_a_scene_of_a_file_of_settings(tmp_path):
     scene = perilune.Scene(path, settings=SMALL[2:])
     assert scene.config.name == "own"
     assert scene.render(perilune.look_down(500)).image.shape == (64, 96)
+
+
+def test_a_scene_over_an_elevation_model(tmp_path):
+    path = hilly_raster(tmp_path / "hills.tif")
+    scene = perilune.Scene(path, settings=SMALL)
+    depth_m = scene.render(perilune.look_down(altitude_m=900)).depth_m
+    # The hill of the model is 300 m high, the pit 120 m deep; both are within half a kilometre of the site.
+    assert (900 - depth_m).max() > 150 and "hills.tif" in repr(scene)
+
+
+def test_the_ground_of_a_dataset_with_an_elevation_model_is_not_guessed(quick):
+    dataset = perilune.open_dataset(quick / "detect")
+    (recipe,) = dataset.info.recipes.values()
+    terrain = recipe.config["terrain"] | {"dem": "hills.tif"}
+    recipe = recipe.model_copy(update={"config": recipe.config | {"terrain": terrain}})
+    dataset.info = dataset.info.model_copy(update={"recipes": {recipe.key: recipe}})
+    with pytest.raises(perilune.UserError, match=r"terrain.dem: got hills.tif, expected procedural ground"):
+        perilune.Scene(dataset)
+
+
+def test_the_polar_terrain_has_long_shadows(scene):
+    pose = perilune.look_down(altitude_m=900)
+    polar = perilune.Scene("polar", settings=SMALL).render(pose)
+    dark, usual = (np.median(frame.labels["sunlit_fraction"]) for frame in (polar, scene.render(pose)))
+    assert dark < usual
 
 
 @pytest.mark.parametrize("name", ["mare", "highland"])
