@@ -26,6 +26,8 @@ COPY --chown=perilune render/pyproject.toml render/README.md render/LICENSE rend
 COPY --chown=perilune render/perilune_render/__init__.py render/perilune_render/
 COPY --chown=perilune train/pyproject.toml train/README.md train/LICENSE train/
 COPY --chown=perilune train/perilune_train/__init__.py train/perilune_train/
+COPY --chown=perilune perilune/pyproject.toml perilune/README.md perilune/LICENSE perilune/
+COPY --chown=perilune perilune/perilune/__init__.py perilune/perilune/
 RUN make setup
 
 COPY --chown=perilune . .

@@ -49,16 +49,16 @@ help: ## list the targets
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
 
-setup: $(VENV)/.ready ## create the environment (.venv) with the three packages
+setup: $(VENV)/.ready ## create the environment (.venv) with all packages
 
-$(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pyproject.toml train/pyproject.toml scripts/system-libraries
+$(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pyproject.toml train/pyproject.toml perilune/pyproject.toml scripts/system-libraries
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON): not found: Blender's module needs Python 3.11 (sudo apt-get install -y python3.11 python3.11-venv)" >&2; exit 2; }
 	@scripts/system-libraries
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "$(VENV): got $$($(BIN)/python -V), expected Python 3.11, which Blender's module needs: move $(VENV) away, and run the same command again" >&2; exit 2; }
 	@echo "installing into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
-	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[geo]"
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[geo]" -e perilune
 	@touch $@
 
 setup-dev: $(VENV)/.ready-dev ## also install the tools of tests, checks, documentation and benchmarks
@@ -218,7 +218,7 @@ coverage: setup-dev ## run all tests, the slow ones too, and print their line co
 lint: setup-dev ## ruff (rules and format) and mypy
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train benchmarks examples
+	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train perilune/perilune benchmarks examples
 
 docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import perilune
 import perilune_render
 import perilune_shared
 import perilune_train
@@ -17,6 +18,7 @@ MAY_IMPORT = {
     "shared": {"perilune_shared"},
     "render": {"perilune_shared", "perilune_render"},
     "train": {"perilune_shared", "perilune_train"},
+    "perilune": {"perilune", "perilune_shared", "perilune_render", "perilune_train"},
 }
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu"}
 
@@ -42,7 +44,7 @@ def sources() -> list[tuple[str, Path]]:
 
 def test_distributions_import_only_what_they_may():
     for house, path in sources():
-        ours = {name for name in imported(path) if name.startswith("perilune_")}
+        ours = {name for name in imported(path) if name.startswith("perilune")}
         assert ours <= MAY_IMPORT[house], path
 
 
@@ -89,7 +91,7 @@ def test_imports_have_no_circle():
 
 
 def test_licences_are_as_promised():
-    expected = {"shared": "Apache-2.0", "render": "GPL-3.0-or-later", "train": "Apache-2.0"}
+    expected = {"shared": "Apache-2.0", "render": "GPL-3.0-or-later", "train": "Apache-2.0", "perilune": "Apache-2.0"}
     for house, licence in expected.items():
         content = tomllib.loads((ROOT / house / "pyproject.toml").read_text())
         # An SPDX expression, which setuptools reads from version 77 on.
@@ -101,7 +103,7 @@ def test_licences_are_as_promised():
 
 def test_the_distributions_have_one_version():
     """Each is built from its own `__version__`, and requires the sibling of the same."""
-    versions = {package.__version__ for package in (perilune_shared, perilune_render, perilune_train)}
+    versions = {package.__version__ for package in (perilune, perilune_shared, perilune_render, perilune_train)}
     assert len(versions) == 1
     (version,) = versions
     for house in ("render", "train"):
@@ -184,4 +186,4 @@ def test_every_direct_dependency_is_pinned():
         extras = [name for extra in project.get("optional-dependencies", {}).values() for name in extra]
         for requirement in project["dependencies"] + extras:
             name = re.split(r"[<>=!~ \[]", requirement)[0].lower()
-            assert name in pinned or name == "perilune-shared", name
+            assert name in pinned or name.startswith("perilune-"), name

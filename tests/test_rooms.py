@@ -12,13 +12,14 @@ ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
         "errors cgroups threads interrupts run_record terminal progress content yaml_text command_line "
-        "config_errors config config_page storage geometry client dataset labels validation editing export cli"
+        "config_errors config config_page storage pictures geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
         "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene "
         "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
-        "heightfield engines outputs dataset preview server jobs cli"
+        "heightfield engines outputs dataset preview server scenes jobs cli"
     ),
+    "perilune/perilune": "parts datasets",
     "render/perilune_render/cli": "options sun dataset frames spice serve status survey counterfactual main program",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
@@ -73,7 +74,11 @@ def test_imports_flow_one_way(folder):
 
 def test_every_test_named_in_a_page_or_a_docstring_exists():
     files = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-    files += [path for house in ("shared", "render", "train", "benchmarks") for path in (ROOT / house).rglob("*.py")]
+    files += [
+        path
+        for house in ("shared", "render", "train", "perilune", "benchmarks")
+        for path in (ROOT / house).rglob("*.py")
+    ]
     named = {name for path in files for name in re.findall(r"tests/[\w/*]+\.py", path.read_text(encoding="utf-8"))}
     assert len(named) > 5
     assert [name for name in sorted(named) if not list(ROOT.glob(name))] == []

@@ -1,13 +1,11 @@
 """The command `perilune-render serve`."""
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from perilune_render.cli.frames import CameraFile, Scene, read_camera
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
-from perilune_render.config import DatasetConfig
 from perilune_render.config_scene import SceneConfig
 from perilune_shared.errors import UserError
 from perilune_shared.progress import say
@@ -70,6 +68,7 @@ def serve(
     from perilune_render.server.pangu_serve import greets, serve_pangu
     from perilune_render.server.pangu_session import Conventions, Session
     from perilune_render.server.serve import Connection, Interface, Limits, Server
+    from perilune_render.server.world import open_world
 
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
@@ -107,29 +106,6 @@ def serve(
         if host not in _OWN:
             say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
         server.run()
-
-
-def open_world(config: DatasetConfig) -> "World":
-    """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
-    from perilune_render.flight.lens import camera_of
-    from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
-    from perilune_render.poses.plan import scene_seed
-    from perilune_render.server.world import World
-    from perilune_render.terrain.cache import cached_scene
-    from perilune_render.terrain.scene import check_ground
-
-    pinhole = camera_of(config.camera).covering_pinhole()
-    scene = config.scene or SceneConfig()
-    if scene.views:
-        view = scene_view(scene, pinhole)
-    else:
-        view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
-    if config.render.engine == "cycles":
-        # No mesh in levels, which hold only the ground of one descent: a ground that is too large is refused.
-        view = replace(view, seen=None)
-    check_ground(config, view)
-    say("generating the ground")
-    return World(cached_scene(config, view, scene_seed(config)), config, say)
 
 
 def _start(world: "World") -> tuple[int, int, float, "Array", int]:

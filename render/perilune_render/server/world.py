@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,16 +13,21 @@ from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS, Poses, check_places, check_poses
+from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.heightfield.query import first_hits, heights_m
 from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
-from perilune_render.terrain.scene import Scene
+from perilune_render.poses.plan import scene_seed
+from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.envelope import ViewEnvelope
+from perilune_render.terrain.scene import Scene, check_ground
 from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, sun_direction
+from perilune_shared.progress import say
 
 _MOST_SOURCES = 8
 _PREPARED_AT_M = 500.0
@@ -148,6 +153,27 @@ class World:
             open_engine(self.scene, self.config, pinhole, view.sun, None if cycles else self.surface)
         )
         return FrameSource.of(engine, self.config, view.camera, self._circles), stack
+
+
+def open_world(config: DatasetConfig) -> World:
+    """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
+    pinhole = camera_of(config.camera).covering_pinhole()
+    scene = config.scene or SceneConfig()
+    if scene.views:
+        view = scene_view(scene, pinhole)
+    else:
+        view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
+    return world_over(config, view, scene_seed(config))
+
+
+def world_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> World:
+    """The world of a configuration over the ground of a seed, made for given views."""
+    if config.render.engine == "cycles":
+        # No mesh in levels, which hold only the ground of one descent: a ground that is too large is refused.
+        view = replace(view, seen=None)
+    check_ground(config, view)
+    say("generating the ground")
+    return World(cached_scene(config, view, seed), config, say)
 
 
 def _poses(position_m: Array, rotation_camera_from_site: Array) -> Poses:

@@ -2,15 +2,22 @@
 
 import io
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
-from perilune_shared.errors import UserError
+from perilune_shared.errors import UserError, one_line
+from perilune_shared.pictures import GREEN, display, with_ellipses
 from perilune_shared.storage.png import png_header
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
+
+ELLIPSE_COLUMNS = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+"""Columns of an ellipse in the table labels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,3 +61,16 @@ class Frame:
             raise UserError(
                 self.frame_id, "image", error, f"a grey PNG of 8 or 16 bits, at most {LARGEST_IMAGE_PX} pixels"
             ) from None
+
+    def plot(self) -> "Picture":
+        """Return a picture of the frame with the ellipses of all labels. Raises UserError as `image`."""
+        return with_ellipses(self.image, self.labels[ELLIPSE_COLUMNS].to_numpy(), [GREEN] * len(self.labels))
+
+    def show(self) -> None:
+        """Show the picture of `plot` in the notebook, or in the system's viewer."""
+        display(self.plot())
+
+    def __repr__(self) -> str:
+        split, time_s, altitude_m = self.row["split"], self.row["time_s"], self.row["position_m"][2]
+        about = f"{split}, time {time_s:.1f} s, {altitude_m:.0f} m above the site, {len(self.labels)} labels"
+        return one_line(f"Frame({self.frame_id}: {about})")

@@ -12,7 +12,7 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import pandas as pd
 import pyarrow as pa
@@ -27,7 +27,7 @@ from perilune_shared.dataset.packed import read_packed, shards_of
 from perilune_shared.dataset.part_rows import may_contain, rows_of_part
 from perilune_shared.dataset.parts import Part, parquet_files
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.errors import UserError
+from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage import files
 from perilune_shared.storage.store import Address, open_store
@@ -119,11 +119,26 @@ class Dataset:
         """Number of frames."""
         return self.info.counts.frames
 
-    def __getitem__(self, place: int | str) -> Frame:
-        """Return a frame by its row number in `frames` or by its frame_id.
+    def __repr__(self) -> str:
+        counts, camera = self.info.counts, self.info.camera
+        frames = f"{counts.frames} frames of {camera.width_px} x {camera.height_px} px"
+        return one_line(
+            f"Dataset({self.store}: {frames}, {counts.trajectories} trajectories, {counts.scenes} scenes, "
+            f"{counts.labels} labels)"
+        )
+
+    @overload
+    def __getitem__(self, place: int | str) -> Frame: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[Frame]: ...
+    def __getitem__(self, place: int | str | slice) -> Frame | list[Frame]:
+        """Return a frame by its row number in `frames` or by its frame_id, or the list of frames of a slice.
 
         Raises IndexError or KeyError if there is no such frame, UserError if its image or labels cannot be read.
         """
+        if isinstance(place, slice):
+            with self.parts_kept_open():
+                return [self[k] for k in range(*place.indices(len(self.frames)))]
         if isinstance(place, str):
             found = self.frames.index[self.frames["frame_id"] == place]
             if len(found) == 0:

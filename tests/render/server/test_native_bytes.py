@@ -10,8 +10,8 @@ from tests.render.server.native_running import NativeRunning
 
 from perilune_render.cli.main import main
 from perilune_render.cli.options import resolved_config
-from perilune_render.cli.serve import open_world
 from perilune_render.server.grounds import Grounds
+from perilune_render.server.world import open_world
 from perilune_shared.client import SceneClient
 from perilune_shared.dataset.manifest import open_dataset
 

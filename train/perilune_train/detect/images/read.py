@@ -124,6 +124,29 @@ def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> N
         return grey if picture.is_upright else upright(grey, picture.orientation)
 
 
+def grey_of_array(pixels: NDArray, where: object = "image") -> NDArray[np.uint8]:
+    """Pixels in memory, (height, width) or (height, width, 1, 3 or 4), as 8-bit grey, as `read_grey` makes it.
+
+    Colours are red, green, blue; a fourth band is left out. Raises UserError on anything else.
+    """
+    kind = pixels.dtype.kind
+    if kind not in "buif" or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
+        found, expected = f"{pixels.dtype} of shape {pixels.shape}", "numbers (height, width) or (height, width, 3)"
+        raise UserError(where, "pixels", found, expected)
+    if pixels.size == 0 or pixels.size > LARGEST_PIXELS:
+        raise UserError(where, "pixels", f"shape {pixels.shape}", f"1 to {LARGEST_PIXELS} pixels")
+    bands = [pixels] if pixels.ndim == 2 else [pixels[..., k] for k in range(3 if pixels.shape[2] > 1 else 1)]
+    if pixels.dtype in (np.bool_, np.uint8):
+        grey = np.rint(_luma(np.stack(bands))) if len(bands) > 1 else bands[0] * (255 if kind == "b" else 1)
+        return np.ascontiguousarray(grey, np.uint8)
+    small = pixels.dtype.itemsize <= 2 or pixels.dtype == np.float32
+    values = np.stack(bands).astype(np.float32 if small else np.float64)
+    values[~(np.abs(values) <= LARGEST_VALUE)] = np.nan
+    values = _luma(values) if len(bands) > 1 else values[0]
+    known = values[np.isfinite(values)]
+    return stretch_of(known[:: max(known.size // SAMPLE, 1)], find_fills=True).grey(values)
+
+
 def _grey_of(bands: NDArray, picture: _Picture, nodata: float | None, stretch: Stretch | None) -> NDArray[np.uint8]:
     """A strip as 8-bit grey."""
     if stretch is not None:

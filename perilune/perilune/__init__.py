@@ -1,0 +1,71 @@
+"""Find lunar craters, render labelled lunar scenes, and read datasets of lunar landings.
+
+    import perilune
+
+    craters = perilune.load_detector()("photo.png")
+    craters.table, craters.plot()
+
+    scene = perilune.Scene("mare", seed=7, sun_elevation_deg=20)
+    frame = scene.render(perilune.look_down(altitude_m=800, tilt_deg=10))
+    frame.image, frame.depth_m, frame.labels
+
+    dataset = perilune.open_dataset("data/small/detect")
+    dataset[0].show()
+    frames = dataset.torch(split="train", selection="visible")
+
+The detector and `torch` need the extra `train`, scenes the extra `render`. Each part is imported when a name of it is
+first used.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from perilune.parts import MissingPart, part
+from perilune_shared.errors import UserError
+
+if TYPE_CHECKING:
+    from perilune.datasets import Dataset as Dataset
+    from perilune.datasets import open_dataset as open_dataset
+    from perilune_render.scenes import RenderedFrame as RenderedFrame
+    from perilune_render.scenes import Scene as Scene
+    from perilune_shared.geometry.poses import Pose as Pose
+    from perilune_shared.geometry.poses import descent as descent
+    from perilune_shared.geometry.poses import look_at as look_at
+    from perilune_shared.geometry.poses import look_down as look_down
+    from perilune_train.detect.images.find import CraterDetector as CraterDetector
+    from perilune_train.detect.images.find import Craters as Craters
+    from perilune_train.detect.images.find import load_detector as load_detector
+
+__version__ = "0.1.0"
+_MODULES = {
+    "perilune.datasets": ("Dataset", "open_dataset"),
+    "perilune_render.scenes": ("RenderedFrame", "Scene"),
+    "perilune_shared.geometry.poses": ("Pose", "descent", "look_at", "look_down"),
+    "perilune_train.detect.images.find": ("CraterDetector", "Craters", "load_detector"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = [
+    "CraterDetector",
+    "Craters",
+    "Dataset",
+    "MissingPart",
+    "Pose",
+    "RenderedFrame",
+    "Scene",
+    "UserError",
+    "descent",
+    "load_detector",
+    "look_at",
+    "look_down",
+    "open_dataset",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the part that has a name. Raises MissingPart if it is not installed."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(part(_MODULE_OF[name], name), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,257 @@
+"""A scene that is rendered in this process, without a server: `perilune.Scene`.
+
+scene = Scene("mare", seed=7, sun_elevation_deg=20)
+frame = scene.render(look_down(altitude_m=800, tilt_deg=10))
+frame.image, frame.depth_m, frame.labels["radius_px"]
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import numpy as np
+import pandas as pd
+
+from perilune_render.config import DatasetConfig
+from perilune_render.config_scene import SceneConfig
+from perilune_render.dataset.tables import ground_tables, label_table
+from perilune_render.flight.lens import camera_of
+from perilune_render.flight.rig import rig_of
+from perilune_render.flight.view import view_of
+from perilune_render.poses.plan import trajectory_seed
+from perilune_render.provenance.recipe import config_of
+from perilune_render.server.world import View, World, open_world, world_over
+from perilune_shared.config import PRESETS, resolve
+from perilune_shared.config_errors import nearest
+from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
+from perilune_shared.dataset.manifest import Dataset, open_single
+from perilune_shared.errors import UserError, one_line
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.geometry.poses import Pose, listed
+from perilune_shared.labels.selection import selected
+from perilune_shared.labels.thresholds import SELECTIONS
+from perilune_shared.pictures import GREEN, ORANGE, display, with_ellipses
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
+
+EngineName = Literal["heightfield", "cycles"]
+_HIGHLAND = (
+    "dataset.light.photometry=hapke_highland",
+    "dataset.terrain.relief.rms_slope_deg={low: 5.0, high: 7.0}",
+    "dataset.terrain.craters={surface_age_gyr: 4.0, equilibrium_share: {low: 1.2, high: 1.8}}",
+    "dataset.terrain.boulders.density=0.15",
+)
+TERRAINS: dict[str, tuple[str, ...]] = {
+    "mare": (
+        "dataset.light.photometry=hapke_mare",
+        "dataset.terrain.relief.rms_slope_deg={low: 2.0, high: 3.0}",
+        "dataset.terrain.boulders.density=0.05",
+    ),
+    "highland": _HIGHLAND,
+    "polar": (*_HIGHLAND, "dataset.terrain.latitude_deg=-85.0", "dataset.scene.sun_elevation_deg=5.0"),
+}
+"""Named terrains: settings over the preset `small`. `mare`: dark, gentle slopes, few boulders; `highland`: bright,
+slopes 2.4 times as steep, denser craters (both as in configs/); `polar`: highland ground at latitude -85 degrees, where
+the Sun's elevation is at most 6.5 degrees, with the Sun at 5 degrees."""
+_BASE = "small"
+_CONFIGURATIONS = (".yaml", ".yml")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedFrame:
+    """A frame that `Scene.render` returns."""
+
+    image: np.ndarray
+    """Grey values, DN (h, w): uint8, or uint16 above 8 bits."""
+    depth_m: np.ndarray
+    """Depth along the line of sight of the camera, metres (h, w) float32, infinite for the sky. With a distorting lens
+    it is in the pixels of the pinhole that covers the view."""
+    labels: pd.DataFrame
+    """One row per crater, with the columns of the table `labels`, and with `depth_m` and `diameter_m` of the crater."""
+    pose: Pose
+    """Pose of the camera."""
+
+    def plot(self) -> "Picture":
+        """Return a picture with the ellipses of the labels: those of the selection `visible` green, others orange."""
+        colours = [GREEN if each else ORANGE for each in selected(self.labels, SELECTIONS["visible"])]
+        return with_ellipses(self.image, self.labels[ELLIPSE_COLUMNS].to_numpy(), colours)
+
+    def show(self) -> None:
+        """Show the picture of `plot` in the notebook, or in the system's viewer."""
+        display(self.plot())
+
+    def __repr__(self) -> str:
+        height, width = self.image.shape
+        return f"RenderedFrame({width} x {height} px, {self.image.dtype}, {len(self.labels)} labels, {self.pose!r})"
+
+
+class Scene:
+    """Lunar ground with craters, a Sun and a camera; renders labelled frames from any pose above it.
+
+    Frames are those of `perilune-render serve` for the same settings and poses. The ground is made for the descents of
+    the configuration, up to 1500 m; a pose from which the camera sees farther raises UserError. To see the horizon, set
+    `dataset.scene.horizon=true`. Use a scene in one thread.
+
+        scene = Scene("mare", seed=7, sun_elevation_deg=20)
+        scene.render(look_down(altitude_m=800)).plot().save("frame.png")
+    """
+
+    def __init__(
+        self,
+        source: str | Path | Dataset = "mare",
+        *,
+        seed: int | None = None,
+        sun_elevation_deg: float | None = None,
+        sun_azimuth_deg: float | None = None,
+        engine: EngineName = "heightfield",
+        settings: Sequence[str] = (),
+    ):
+        """Generate the ground, which takes seconds, or read it from the cache.
+
+        `source` is the name of a terrain (mare, highland, polar) or of a preset, a YAML file of settings, an elevation
+        model, or a dataset or manifest, of which this is the first scene. `settings` are as those of `--set`, for
+        example "dataset.camera.width_px=512". The engine `cycles` needs Blender. Raises UserError if one of these
+        cannot be used.
+        """
+        given: dict[str, Any] = {
+            "scene.sun_elevation_deg": sun_elevation_deg,
+            "scene.sun_azimuth_deg": sun_azimuth_deg,
+            "seed": seed,
+        }
+        changes = {name: value for name, value in given.items() if value is not None}
+        changes["render.engine"] = engine
+        for name, value in changes.items():
+            if not isinstance(value, str | int | float | np.integer | np.floating) or isinstance(value, bool):
+                raise UserError("Scene", name.rpartition(".")[2], repr(value), "a number")
+        if not isinstance(source, str | Path | Dataset):
+            raise UserError("Scene", "source", type(source).__name__, "a name, a path or a dataset")
+        every = (*(f"dataset.{name}={value}" for name, value in changes.items()), *settings)
+        if isinstance(source, Dataset) or (Path(source) / "dataset.json").is_file() or "://" in str(source):
+            if seed is not None or settings:
+                raise UserError("Scene", "seed and settings", "given", "none: a dataset has its own")
+            dataset = source if isinstance(source, Dataset) else open_single(source)
+            self.name = str(dataset.store)
+            self._world = _world_of(dataset, sun_azimuth_deg, sun_elevation_deg, engine)
+        else:
+            self.name = str(source)
+            self._world = open_world(_config_of(source, every))
+
+    @property
+    def config(self) -> DatasetConfig:
+        """The settings."""
+        return self._world.config
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the frames."""
+        return camera_of(self.config.camera)
+
+    @property
+    def craters(self) -> pd.DataFrame:
+        """The craters of the ground, one row each, with the columns of the table `craters`."""
+        return ground_tables("scene", self._world.scene)["craters"].to_pandas()
+
+    @overload
+    def render(self, poses: Pose) -> RenderedFrame: ...
+    @overload
+    def render(self, poses: Sequence[Pose]) -> list[RenderedFrame]: ...
+    def render(self, poses: Pose | Sequence[Pose]) -> RenderedFrame | list[RenderedFrame]:
+        """Render and label the frame of a pose, or the list of frames of several poses.
+
+        Frame i of a list has the noise of frame i of a sequence; a single frame has the noise of the first one. Raises
+        UserError for a pose below the ground, or from which the camera sees beyond it.
+        """
+        frames = [self._render(pose, index) for index, pose in enumerate(listed(poses))]
+        return frames[0] if isinstance(poses, Pose) else frames
+
+    def _render(self, pose: Pose, index: int) -> RenderedFrame:
+        world, stated = self._world, self.config.scene or SceneConfig()
+        sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
+        view = View(pose.position_m, pose.rotation_camera_from_site, self.camera, sun)
+        frame = world.frame(view, trajectory_seed(world.scene.seed, 0), index, pose.velocity_mps)
+        labels = world.labels(view, frame)
+        rows = label_table("frame", labels).to_pandas().drop(columns="frame_id")
+        place = np.searchsorted(world.scene.crater_id, labels.crater_id)
+        rows["depth_m"] = world.scene.rims.depth_m[place]
+        rows["diameter_m"] = world.scene.craters.diameter_m[place]
+        return RenderedFrame(frame.image, frame.radiance.depth_m, rows, pose)
+
+    def close(self) -> None:
+        """Release the engine; the end of a program does so too."""
+        self._world.close()
+
+    def __enter__(self) -> "Scene":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        stated, scene = self.config.scene or SceneConfig(), self._world.scene
+        about = (
+            f"{len(scene.craters)} craters on {scene.grid.extent_m / 1000:.1f} km of ground, Sun at elevation "
+            f"{stated.sun_elevation_deg:g} and azimuth {stated.sun_azimuth_deg:g} degrees, {self.camera.width_px} x "
+            f"{self.camera.height_px} px, {self.config.render.engine}"
+        )
+        return one_line(f"Scene({self.name}: {about})")
+
+
+def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
+    """The settings of a terrain, a preset, a file of settings or an elevation model. Raises UserError on another."""
+    name, path = str(source), Path(source)
+    preset, file, own, dem = _BASE, None, TERRAINS.get(name, ()), None
+    if name in PRESETS:
+        preset = name
+    elif path.suffix.lower() in _CONFIGURATIONS:
+        file = path
+    elif path.is_file():
+        dem = name
+    elif name not in TERRAINS:
+        known = nearest(name, (*TERRAINS, *PRESETS))
+        expected = f"{known}, a YAML file, an elevation model, or the folder of a dataset"
+        raise UserError("Scene", "source", name, expected)
+    try:
+        config = resolve(DatasetConfig, "dataset", "perilune_render", preset, file, (*own, *settings))
+    except UserError as error:
+        if error.where != "--set":
+            raise
+        raise UserError("Scene", error.field, error.found, error.expected) from None
+    for section in ("survey", "counterfactual", "cameras"):
+        if getattr(config, section):
+            raise UserError("Scene", f"dataset.{section}", "set", "none: a scene has one camera and given poses")
+    if dem is not None:
+        config = config.model_copy(update={"terrain": config.terrain.model_copy(update={"dem": dem})})
+    return config
+
+
+def _world_of(
+    dataset: Dataset, sun_azimuth_deg: float | None, sun_elevation_deg: float | None, engine: EngineName
+) -> World:
+    """The first scene of a dataset, with its ground and settings; the Sun is its own unless another is given."""
+    info, where = dataset.info, dataset.store.at("dataset.json")
+    if len(info.recipes) != 1:
+        expected = "one recipe; select its scenes with `perilune-manifest subset`"
+        raise UserError(where, "recipes", len(info.recipes), expected)
+    recipe = info.recipe()
+    terrain = recipe.config.get("terrain")
+    if isinstance(terrain, dict) and terrain.get("dem") is not None:
+        expected = "procedural ground; give the elevation model itself as the source"
+        raise UserError(where, "terrain.dem", terrain["dem"], expected)
+    config = config_of(recipe, where)
+    if config.survey is not None or config.counterfactual is not None:
+        raise UserError(where, "recipe", "a survey or a counterfactual dataset", "a dataset of descents or given poses")
+    view = view_of(config, rig_of(config), recipe.kind)
+    first: dict[str, Any] = dataset.table("scenes").sort_by("scene_id").slice(0, 1).to_pylist()[0]
+    sun = {
+        "sun_azimuth_deg": first["sun_azimuth_deg"] if sun_azimuth_deg is None else float(sun_azimuth_deg),
+        "sun_elevation_deg": first["sun_elevation_deg"] if sun_elevation_deg is None else float(sun_elevation_deg),
+    }
+    for name, least, most in (("sun_azimuth_deg", -720, 720), ("sun_elevation_deg", 0, 90)):
+        if not least <= sun[name] <= most or sun["sun_elevation_deg"] == 0:
+            raise UserError("Scene", name, sun[name], f"{least} to {most}, the elevation above 0")
+    lit = (config.scene or SceneConfig()).model_copy(update=sun)
+    render = config.render.model_copy(update={"engine": engine})
+    return world_over(config.model_copy(update={"scene": lit, "render": render}), view, first["seed"])

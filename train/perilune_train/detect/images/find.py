@@ -1,0 +1,157 @@
+"""Find craters from Python: `perilune.load_detector`.
+
+detector = load_detector()
+craters = detector("photo.png")
+craters["score"], craters.table, craters.plot()
+"""
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from PIL import Image
+
+from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
+from perilune_shared.errors import UserError, one_line
+from perilune_shared.pictures import display, with_ellipses
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.images.predict import above, table_of
+from perilune_train.detect.images.read import grey_of_array, read_grey
+from perilune_train.detect.inference.detector import Detector, open_detector
+from perilune_train.detect.inference.tiles import detect_image
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.shipped.models import shipped_models, shipped_run
+from perilune_train.training.runs import RunFolder
+
+ImageLike = str | PathLike[str] | NDArray[Any] | Image.Image
+"""A file, pixels (height, width) or (height, width, 3), or a Pillow image."""
+Images = list[Any] | tuple[Any, ...]
+"""Several of these."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Craters:
+    """The craters that a detector finds in one image, best first."""
+
+    table: pd.DataFrame
+    """One row per crater, in pixels from the outer corner of the first pixel: the box `x0_px`, `y0_px`, `x1_px`,
+    `y1_px`, `centre_x_px`, `centre_y_px`, `radius_px` (half of sqrt(w h)), `score`, and the columns of an ellipse as in
+    the table `labels`. The detector finds boxes: the ellipse is the axis-aligned one inside the box."""
+    image: NDArray[np.uint8]
+    """The image as the network sees it before it is normalised: upright, 8-bit grey (height, width)."""
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        """Return a column of the table as an array (N,). Raises UserError if there is no such column."""
+        if column not in self.table:
+            raise UserError("craters", "column", column, "one of " + ", ".join(self.table.columns))
+        return self.table[column].to_numpy()
+
+    def plot(self) -> Image.Image:
+        """Return a picture of the image with the ellipses."""
+        return with_ellipses(self.image, self.table[ELLIPSE_COLUMNS].to_numpy())
+
+    def show(self) -> None:
+        """Show the picture of `plot` in the notebook, or in the system's viewer."""
+        display(self.plot())
+
+    def __repr__(self) -> str:
+        height, width = self.image.shape
+        scores = f", score {self['score'].min():.2f} to {self['score'].max():.2f}" if len(self) else ""
+        return f"Craters({len(self)} in {width} x {height} px{scores})"
+
+
+class CraterDetector:
+    """Finds craters in images of any size; `load_detector` makes one. Call it with an image or a list of images."""
+
+    def __init__(self, run: Path):
+        """Load the network of a finished detect run. Raises UserError if the folder has none."""
+        config = config_of_run(run)
+        self.run = run
+        self.threshold = chosen_threshold(run)
+        self._tiling = Tiling(scales=tuple(config.evaluation.scales))
+        self._detector: Detector = open_detector(RunFolder(run).best, config)
+
+    @overload
+    def __call__(self, image: ImageLike, *, threshold: float | None = None) -> Craters: ...
+    @overload
+    def __call__(self, image: Images, *, threshold: float | None = None) -> list[Craters]: ...
+    def __call__(self, image: ImageLike | Images, *, threshold: float | None = None) -> Craters | list[Craters]:
+        """Return the craters of an image, or the list of the craters of several images.
+
+        An image is a path (PNG, TIFF, JPEG; others with the extra `geo`), a NumPy array (height, width) or (height,
+        width, 3), or a Pillow image. Pixels of more than 8 bits are stretched as by `perilune-train detect predict`.
+        `threshold` is the lowest score, by default the one that the run chose on its validation split. Raises UserError
+        on anything else, and on a file that cannot be read.
+        """
+        threshold = self.threshold if threshold is None else threshold
+        if not 0 <= threshold <= 1:
+            raise UserError("detector", "threshold", threshold, "0 to 1")
+        if isinstance(image, list | tuple):
+            return [self._craters(each, threshold) for each in image]
+        return self._craters(image, threshold)
+
+    def _craters(self, image: ImageLike, threshold: float) -> Craters:
+        name, grey = _read(image)
+        found = above(detect_image(self._detector, grey, self._tiling), threshold)
+        return Craters(_with_ellipses(table_of(name, found), found), grey)
+
+    def __repr__(self) -> str:
+        where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"
+        return one_line(f"CraterDetector({self.run.name}: score at least {self.threshold:.3f}, on {where})")
+
+
+def load_detector(run_or_file: str | PathLike[str] | None = None) -> CraterDetector:
+    """Load a crater detector: the installed one, or the one of a run.
+
+    `run_or_file` is the folder of a detect run, a file in it (such as checkpoints/best.ckpt), or the name of an
+    installed network. Raises UserError if it is none of these.
+
+        craters = load_detector()("photo.png")
+    """
+    if run_or_file is None:
+        return CraterDetector(shipped_run("detect"))
+    path = Path(run_or_file)
+    installed = {model.name: model.folder for model in shipped_models() if model.task == "detect"}
+    if not path.exists():
+        if str(run_or_file) in installed:
+            return CraterDetector(installed[str(run_or_file)])
+        known = ", ".join(installed) or "none is installed"
+        raise UserError("load_detector", "run_or_file", path, f"the folder of a detect run, or a name ({known})")
+    if path.is_dir():
+        return CraterDetector(path)
+    run = next((folder for folder in list(path.absolute().parents)[:2] if (folder / "config.yaml").is_file()), None)
+    if run is None or path.absolute() != RunFolder(run).best:
+        raise UserError("load_detector", "run_or_file", path, "the best weights of a detect run, in its folder")
+    return CraterDetector(run)
+
+
+def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
+    """The name of an image and its pixels as 8-bit grey. Raises UserError on anything that is none."""
+    if isinstance(image, str | PathLike):
+        path = Path(image)
+        return path.name, read_grey(path)
+    if isinstance(image, Image.Image):
+        deep = image.mode.startswith(("I", "F"))
+        return "image", grey_of_array(np.asarray(image if deep else image.convert("L")))
+    if isinstance(image, np.ndarray):
+        return "image", grey_of_array(image)
+    expected = "a path, a NumPy array, a Pillow image, or a list of these"
+    raise UserError("detector", "image", type(image).__name__, expected)
+
+
+def _with_ellipses(table: pd.DataFrame, found: Detections) -> pd.DataFrame:
+    """The table with the axis-aligned ellipses inside the boxes, by the columns and rules of labels."""
+    x0, y0, x1, y1 = found.boxes.T
+    width, height = x1 - x0, y1 - y0
+    columns = [(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(width, height) / 2, np.minimum(width, height) / 2]
+    # The direction of the longer axis.
+    columns.append(np.where(width >= height, 0.0, np.pi / 2))
+    return table.assign(**dict(zip(ELLIPSE_COLUMNS, columns, strict=True)))
