@@ -60,10 +60,10 @@ def test_one_command_changes_the_version_everywhere(ready):
     assert {each for found in release.stated_versions(ready).values() for each in found} == {"1.10.0rc2"}
     assert all(path.read_text().replace("1.10.0rc2", "0.3.0") == text for path, text in before.items())
     assert release.write_version("1.10.0rc2", ready) == []
-    meta = ready / "perilune/pyproject.toml"
+    meta = ready / "another/pyproject.toml"
     meta.parent.mkdir()
     meta.write_text(
-        '[project]\nname = "perilune"\nversion = "0.3.0"\ndependencies = ["perilune-train[s3,gcs]==0.3.0"]\n'
+        '[project]\nname = "another"\nversion = "0.3.0"\ndependencies = ["perilune-train[s3,gcs]==0.3.0"]\n'
     )
     assert release.write_version("1.10.0rc2", ready) == [meta] and meta.read_text().count('1.10.0rc2"') == 2
 
