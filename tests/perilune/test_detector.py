@@ -57,6 +57,18 @@ def test_every_form_of_an_image_gives_the_same_craters(detector, picture, pixels
         np.testing.assert_array_equal(found.image, pixels)
 
 
+def test_a_pillow_image_is_turned_upright_as_a_file_is(detector, pixels, tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels).save(tmp_path / "turned.png", exif=exif)
+    from_file = detector(tmp_path / "turned.png")
+    with Image.open(tmp_path / "turned.png") as image:
+        opened = detector(image)
+    assert from_file.image.shape == pixels.shape[::-1] == opened.image.shape
+    np.testing.assert_array_equal(opened.image, from_file.image)
+    np.testing.assert_array_equal(opened["x0_px"], from_file["x0_px"])
+
+
 def test_deep_pixels_are_stretched_as_in_a_file(detector, tmp_path):
     deep = np.random.default_rng(2).integers(100, 4000, (96, 96), np.uint16)
     cv2.imwrite(str(tmp_path / "deep.png"), deep)

@@ -13,7 +13,7 @@ from typing import Any, overload
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
 from perilune_shared.errors import UserError, one_line
@@ -139,6 +139,8 @@ def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
         path = Path(image)
         return path.name, read_grey(path)
     if isinstance(image, Image.Image):
+        # As in a file: pixels and craters are those of the upright image.
+        image = ImageOps.exif_transpose(image)
         deep = image.mode.startswith(("I", "F"))
         return "image", grey_of_array(np.asarray(image if deep else image.convert("L")))
     if isinstance(image, np.ndarray):
