@@ -16,6 +16,8 @@ from perilune_shared.errors import EXIT_INTERRUPTED, STOPPED
 
 _BELOW_BAR = "\n\x1b[?25h"
 """New line, and the control sequence that shows the cursor."""
+_UNFINISHED: dict[str, None] = {}
+"""Paths to remove if Ctrl-C ends the process before its own code can."""
 _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
 
 
@@ -78,14 +80,38 @@ def interrupts_held() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def unfinished(*paths: os.PathLike[str]) -> Iterator[None]:
+    """Remove these files and folders if `ended_by_interrupt` ends the process within the block."""
+    names = [os.fspath(path) for path in paths]
+    _UNFINISHED.update(dict.fromkeys(names))
+    try:
+        yield
+    finally:
+        for name in names:
+            _UNFINISHED.pop(name, None)
+
+
+def _remove_unfinished() -> None:
+    # Large to import, and not needed before.
+    import shutil
+    from pathlib import Path
+
+    for name in list(_UNFINISHED):
+        with contextlib.suppress(OSError):
+            Path(name).unlink()
+        shutil.rmtree(name, ignore_errors=True)
+
+
+@contextlib.contextmanager
 def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda: None) -> Iterator[None]:
     """End the process `after_s` seconds after Ctrl-C, if the block has not ended by then: with one line and code 130.
 
     `at_end` may end the processes that the block has started. It is called before that, in another thread; or in this
     one if the block itself ends with KeyboardInterrupt, which may have interrupted the code that ends them.
 
-    For commands whose output survives SIGKILL. Python raises KeyboardInterrupt only between two steps of its own, and
-    one call of Blender or NumPy may take longer. Without effect if Ctrl-C is ignored, and outside the main thread.
+    Files and folders of `unfinished` are removed. For commands whose output survives SIGKILL. Python raises
+    KeyboardInterrupt only between two steps of its own, and one call of Blender or NumPy may take longer. Without effect
+    if Ctrl-C is ignored, and outside the main thread.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
         yield
@@ -118,6 +144,7 @@ def _end_late(asked: int, ended: int, after_s: float, at_end: Callable[[], objec
         if signal.SIGINT in os.read(asked, 100) and not select.select([ended], [], [], after_s)[0]:
             with contextlib.suppress(Exception):
                 at_end()
+            _remove_unfinished()
             with contextlib.suppress(OSError):
                 # A progress bar hides the cursor.
                 os.write(2, f"{_BELOW_BAR if os.isatty(2) else ''}{STOPPED}\n".encode())

@@ -114,3 +114,27 @@ def test_ctrl_c_after_the_work_is_done_changes_nothing(exits):
     assert process.stdout.readline() == "ending\n"
     process.send_signal(signal.SIGINT)
     assert process.communicate(timeout=60) == ("", "") and process.returncode == 0
+
+
+def test_what_is_unfinished_is_removed_when_the_process_is_ended(tmp_path):
+    """A block that Ctrl-C cannot interrupt is ended from outside, and leaves no folder, lock or temporary file."""
+    code = f"""
+import signal, sys, time
+from pathlib import Path
+from perilune_shared.interrupts import ended_by_interrupt
+from perilune_shared.storage.files import new_folder, written_aside
+folder = Path({str(tmp_path)!r})
+with ended_by_interrupt(after_s=0.2), new_folder(folder / "out") as aside, written_aside(folder / "page.md") as page:
+    (aside / "part").write_text("half")
+    page.write_text("half")
+    signal.signal(signal.SIGINT, lambda *_: None)  # as code that holds the interrupt
+    print("begun", flush=True)
+    time.sleep(60)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "begun\n"
+    assert len(list(tmp_path.iterdir())) >= 3
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130 and errors.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 from perilune_shared.errors import UserError
+from perilune_shared.interrupts import unfinished
 from perilune_shared.storage.locks import lock
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -38,15 +39,16 @@ def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = temporary_name(path)
-    try:
-        yield aside
-        if durable:
-            sync(aside)
-        aside.replace(path)
-        if durable:
-            sync(path.parent)
-    finally:
-        aside.unlink(missing_ok=True)
+    with unfinished(aside):
+        try:
+            yield aside
+            if durable:
+                sync(aside)
+            aside.replace(path)
+            if durable:
+                sync(path.parent)
+        finally:
+            aside.unlink(missing_ok=True)
 
 
 def sync(path: Path) -> None:
@@ -173,17 +175,18 @@ def new_folder(out: Path) -> Iterator[Path]:
             if leftover.fullmatch(path.name):
                 shutil.rmtree(path, ignore_errors=True)
         aside = out.with_name(f".{out.name}.{secrets.token_hex(8)}.part")
-        try:
-            aside.mkdir()
-            yield aside
-            sync_all(path for path in aside.rglob("*") if not path.is_symlink())
-            check_free(out)
-            if out.is_dir():
-                out.rmdir()
-            aside.replace(out)
-            sync(out.parent)
-        finally:
-            shutil.rmtree(aside, ignore_errors=True)
+        with unfinished(aside):
+            try:
+                aside.mkdir()
+                yield aside
+                sync_all(path for path in aside.rglob("*") if not path.is_symlink())
+                check_free(out)
+                if out.is_dir():
+                    out.rmdir()
+                aside.replace(out)
+                sync(out.parent)
+            finally:
+                shutil.rmtree(aside, ignore_errors=True)
 
 
 def check_free(out: Path) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from perilune_shared.errors import UserError
-from perilune_shared.interrupts import interrupts_held
+from perilune_shared.interrupts import interrupts_held, unfinished
 
 LOCK_NAME = ".perilune.lock"
 """Lock file in a folder that is written in place."""
@@ -72,7 +72,7 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
         if held_elsewhere:
             expected = f"a free folder: if that process was killed, remove {record} or wait {seconds_left:.0f} s"
             raise _locked_error(folder, _read(record), expected)
-        with _recorded(record):
+        with unfinished(path, record), _recorded(record):
             yield
     finally:
         if held.is_locked:
