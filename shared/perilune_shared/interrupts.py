@@ -110,8 +110,8 @@ def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda:
     one if the block itself ends with KeyboardInterrupt, which may have interrupted the code that ends them.
 
     Files and folders of `unfinished` are removed. For commands whose output survives SIGKILL. Python raises
-    KeyboardInterrupt only between two steps of its own, and one call of Blender or NumPy may take longer. Without effect
-    if Ctrl-C is ignored, and outside the main thread.
+    KeyboardInterrupt only between two steps of its own, and one call of Blender or NumPy may take longer. Without
+    effect if Ctrl-C is ignored, and outside the main thread.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
         yield
