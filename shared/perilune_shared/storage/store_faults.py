@@ -1,13 +1,15 @@
 """Turn the exceptions of object stores into errors of one line with the address."""
 
 import contextlib
+import re
 from collections.abc import Iterator
 
 from perilune_shared.errors import UserError, one_line
 
 _LIBRARIES = ("aiohttp", "aiobotocore", "botocore", "fsspec", "gcsfs", "google", "requests", "s3fs", "urllib3")
 """Libraries below fsspec that raise exceptions of their own."""
-_ACCESS = ("credential", "token", "accessdenied", "forbidden", "signature", "access key", "403", "401")
+_ACCESS = re.compile(r"credential|token|accessdenied|forbidden|signature|access key|\b40[13]\b", re.I)
+"""The status as a word of its own: the number of a port may hold it."""
 _CREDENTIALS = {
     "s3": "credentials with access to it: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE",
     "gs": "credentials with access to it: GOOGLE_APPLICATION_CREDENTIALS, or `gcloud auth application-default login`",
@@ -37,7 +39,7 @@ def store_faults(address: str) -> Iterator[None]:
             raise
         if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in _LIBRARIES:
             raise
-        if isinstance(error, PermissionError) or any(word in text.lower() for word in _ACCESS):
+        if isinstance(error, PermissionError) or _ACCESS.search(text):
             expected = _CREDENTIALS.get(address.partition("://")[0], "access to it")
             raise UserError(address, "access", text, expected) from None
         expected = "a store that answers; run the same command again to resume"

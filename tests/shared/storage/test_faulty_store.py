@@ -2,13 +2,16 @@
 
 import os
 
+import pytest
 from tests.helpers import in_process
 from tests.helpers.faulty_proxy import FAULTS, FaultyProxy
 
 from perilune_shared.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.pack import pack
+from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
+from perilune_shared.storage.store_faults import store_faults
 from perilune_shared.validation.validate import validate
 
 
@@ -39,3 +42,17 @@ def test_a_store_that_vanishes_ends_a_command_with_one_line(little, s3_bucket, m
     assert gone.returncode == 2 and gone.stderr.strip().count("\n") == 0 and back.returncode == 0
     assert f"error: {s3_bucket}/packed/dataset.json: connection: got " in gone.stderr
     assert gone.stderr.endswith("expected a store that answers; run the same command again to resume\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("Could not connect to http://127.0.0.1:40321/bucket", "connection"),
+        ("An error occurred (403) when calling HeadObject: Forbidden", "access"),
+        ("401, message='Unauthorized'", "access"),
+    ],
+)
+def test_the_number_of_a_port_is_no_status(text, field):
+    with pytest.raises(UserError) as error, store_faults("s3://bucket"):
+        raise OSError(text)
+    assert error.value.field == field
