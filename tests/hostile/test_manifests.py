@@ -27,12 +27,12 @@ MANY_FRAMES = 200_000
 _FRAMES_OF_TRAJECTORY = 1000
 
 
-@pytest.fixture
 def words(output: str) -> str:
     """The output on one line: a title is wrapped where the path in it is long."""
     return " ".join(output.split())
 
 
+@pytest.fixture
 def dataset(tmp_path: Path) -> Dataset:
     """A small dataset of two scenes."""
     splits = {"train": 1, "val": 1}
