@@ -155,6 +155,7 @@ def test_attitude_noise_and_given_weights(script):
     assert "train darknet53-lstm-attitude" not in commands(script, experiment(script))
     assert experiment(script).runs == Path("runs/paper")
     assert experiment(script, part=script.Part.GPU).runs == Path("runs/paper-gpu")
+    assert experiment(script, ground=script.Ground.LUNAR).runs == Path("runs/paper-lunar")
 
 
 def test_what_trains_longer(script):

@@ -121,7 +121,7 @@ def stages() -> Values:
     """The values of all stages."""
     config = resolve(DatasetConfig, "dataset", "perilune_render", "tiny", None, ())
     plan = make_plan(config, "detect")
-    # Grown anew, since a cache may have been filled on another machine.
+    # Without the cache, which may have been filled on another machine.
     scene = grow_scene(config, plan.view, plan.scenes[0].seed)
     found = operations() | dict(arrays("terrain", scene))
     found["mesh vertices"] = vertices(scene.grid, scene.height_m)

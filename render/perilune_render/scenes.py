@@ -75,7 +75,7 @@ class RenderedFrame:
     """Pose of the camera."""
 
     def plot(self) -> "Picture":
-        """Return a picture with the ellipses of the labels: those of the selection `visible` green, others orange."""
+        """Return a picture with the ellipses of the labels: green if `visible` selects them, otherwise orange."""
         colours = [GREEN if each else ORANGE for each in selected(self.labels, SELECTIONS["visible"])]
         return with_ellipses(self.image, self.labels[ELLIPSE_COLUMNS].to_numpy(), colours)
 

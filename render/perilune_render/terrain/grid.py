@@ -20,7 +20,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
 _MOST_RINGS = 1_000_000
-"""Largest number of rings: those of the finest ground that fits in memory are fewer."""
+"""Largest number of rings. The finest ground that fits in memory has fewer."""
 FAR_GROWTH = 0.07
 """Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: the shadow
 of ground at a distance d enters the view only if it is about d tan(elevation of the Sun) high, and as wide."""

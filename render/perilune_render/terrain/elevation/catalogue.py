@@ -27,7 +27,7 @@ class Counts:
     used: int
     """They become labels."""
     measured: int
-    """The rims of so many of these are measured in the model, the others are those of the catalogue."""
+    """Number of these whose rims are measured in the model; the others have the catalogue's rims."""
     outside: int
     """Their centre or rim is outside the ground."""
     unmeasured: int
@@ -65,8 +65,8 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
     """The catalogue's craters that the model shows.
 
     These are the craters larger than `resolved_m` with centre and rim on the grid and on measured pixels of the model;
-    smaller craters are generated. Place and diameter are those of the crest in the model where it is found, unless the
-    configuration takes those of the catalogue. Age and fresh depth are unknown (NaN), wear is 0.
+    smaller craters are generated. The crest in the model gives place and diameter where it is found, unless the
+    configuration prefers the catalogue. Age and fresh depth are unknown (NaN), wear is 0.
 
     The columns are recognised (`perilune_shared.storage.tables.catalogues`) or stated in the configuration. Raises
     UserError with the line of an error, and if no crater can be used.

@@ -1,6 +1,7 @@
 """The part of a raster that a scene needs: small rasters whole, of large ones a window at the scene's resolution.
 
-A raster of the whole Moon is cut anew where the scene's ground lies across its left or right edge: its columns repeat.
+A raster of the whole Moon is cut at another meridian where the scene's ground lies across its left or right edge,
+since its columns repeat.
 """
 
 from __future__ import annotations
