@@ -1,0 +1,115 @@
+"""Sentences of the page: the first paragraph, the rule of the verdicts, the three causes, the deviations."""
+
+from perilune_train.records.markdown import number
+from perilune_train.report.paper.claimed import DETECTION, TARGET_AP
+from perilune_train.report.paper.rule import AS_FAST, MIN_TRAININGS
+from perilune_train.report.paper.runs import PaperRuns, nearest_share
+from perilune_train.report.paper.tables import numbers
+
+CAUSES = {
+    "loss": "**Loss.** In a common family of YOLO code 0.05 and 1 are the weights of means over boxes and cells. With "
+    "plain sums there are far more cells than boxes, and the boxes are hardly trained.",
+    "gates": "**Gates.** A plain CBAM module scales its input by about 0.25 at the start, and there are 23 of them. "
+    "Put into a frozen backbone that was trained without them, they leave the later layers next to no signal. Gates "
+    "from identity start at 1.",
+    "ground": "**Ground.** Our usual ground has many craters, many of them too faint to see, and the paper's rule of "
+    "labels takes them all. The curve above has the same network on sparser ground.",
+}
+"""By the first part of the keys of paper-causes.json."""
+
+DEVIATIONS = (
+    "Frames are rendered by perilune in place of PANGU. The paper does not publish its data, camera or Sun. The "
+    "headline ground is chosen by its difficulty for YOLOv3 alone.",
+    "The grey frame is repeated in three channels, as PANGU's images of a grey ground are.",
+    "Loss: `detect.loss.reduction=means` in place of the paper's sums over cells and boxes. Sums are an ablation.",
+    "YOLOv3 ignores predictors that overlap a label by an IoU above 0.5 without being its best one. Here they are "
+    "negative.",
+    "COCO is not used. In the rows after transfer a network of our own stands in for YOLOv3 trained on it.",
+    "Gates: plain CBAM is the paper's. Gates from identity are CBAM with twice the sigmoid, and their last weights "
+    "start at zero.",
+    "Optimiser (AdamW with warm-up and one cosine for detection), learning rate, batch and epochs of detection, and "
+    "the weight of empty cells in the objectness loss (1) are ours; the paper does not state them.",
+    "Craters with a radius just outside 2 to 50 px, or with their centre off the frame, are neither positive nor "
+    "negative in training. The usual account ignores detections on them; the strict one counts these as false.",
+    "A cell can place a centre up to half a cell outside itself. There is no class output. The initial objectness is "
+    "0.01 in every cell.",
+    "Navigation: in the paper the network gives the pose in the landing frame; motion between frames is a second "
+    "reading. The backbone starts from the detector. It is frozen in the coarse stage, and its features are stored.",
+    "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, and "
+    "the orientation error says nothing. Descents with attitude noise (ATTITUDE=1) measure it.",
+    "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
+    "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own, and "
+    "in the fine stage that of the backbone is a hundredth of the paper's 1e-4. Training sequences "
+    "are also of further views, warped over the ground plane.",
+    "Features of the backbone are standardised before the LSTM, and its batch statistics stay as in the detector. "
+    "Poses are evaluated in causal windows as long as the training's, not with a state carried over the descent.",
+    "The best epoch on validation is tested.",
+)
+
+
+def lead(runs: PaperRuns, share: str | None, *, given: bool) -> str:
+    """The paragraph; `share` is the equilibrium_share of the headline ground, `given` if the caller named it."""
+    return " ".join([_ground(runs, share, given), _account(runs), _trainings(runs)])
+
+
+def verdict_note() -> str:
+    """The rule of the verdicts, in words."""
+    return (
+        f"The rule is the same for both signs. With {MIN_TRAININGS} trainings or more of each network a claim *holds* "
+        "if every training with attention is better than every one without, and *does not hold* if every one is worse. "
+        "With one training of each, it holds or does not hold only if the 95 % intervals over trajectories are "
+        "separated; these intervals say nothing about another training. Otherwise it is *open*. Times count as equal "
+        f"within {100 * (AS_FAST - 1):.0f} % in either direction. A claim on gates holds if it is true of all of its "
+        "gates, does not hold if of none, and is open over fewer than five scenes; the experiment has one."
+    )
+
+
+def _ground(runs: PaperRuns, share: str | None, given: bool) -> str:
+    curve = runs.curve(share)
+    reason = (
+        "a ground of the paper's difficulty, chosen by YOLOv3 without attention alone, so that it favours neither "
+        "network"
+    )
+    if share is None:
+        return f"**Ground.** The headline is {reason}. The curve that chooses it was not run."
+    nearest = nearest_share(curve)
+    text = f"**Ground.** The headline ground has `equilibrium_share` {share}: {reason}."
+    if share == nearest:
+        ap = number(curve[share].get("val/ap50_paper"))
+        text += f" Of {len(curve)} grounds it has the validation AP ({ap}) nearest to the paper's {TARGET_AP:.3f}."
+    elif given:
+        better = "the curve was not run" if nearest is None else f"on the curve {nearest} is nearer to {TARGET_AP:.3f}"
+        text += f" It was given; {better}."
+    strict = nearest_share(curve, "strict/")
+    if strict is not None and strict != share:
+        ap = number(curve[strict].get("val/strict/ap50_paper"))
+        text += f" By the strict account it would be {strict} ({ap})."
+    return text
+
+
+def _account(runs: PaperRuns) -> str:
+    paper = DETECTION["YOLOv3"]
+    text = (
+        "**Account.** Labels follow the paper's rule, radii of 2 to 50 px. Headline figures are of the usual account, "
+        "which ignores detections that the labels cannot decide. The strict account counts a detected crater just "
+        "below 2 px as false. The paper must have used the strict one, since it names no ignored detections"
+    )
+    own = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
+    usual, strict, recall = (numbers(own, f"test/{key}") for key in ("precision", "strict/precision", "recall"))
+    if usual and strict and recall:
+        text += (
+            f" (precision {paper['precision']:.3f} at recall {paper['recall']:.3f}; here {usual[0]:.3f} usual and "
+            f"{strict[0]:.3f} strict at recall {recall[0]:.3f})"
+        )
+    return f"{text}. The usual one is the headline here, since a crater just below 2 px is not a false detection."
+
+
+def _trainings(runs: PaperRuns) -> str:
+    halves = [len(own) for own in runs.halves().values() if own]
+    if max(halves, default=0) < 2:
+        return "**Trainings.** Every figure rests on one training of each network."
+    counted = f"{min(halves)}" if len(set(halves)) == 1 else f"{min(halves)} to {max(halves)}"
+    return (
+        f"**Trainings.** At half width there are {counted} trainings of each network. All other figures, full width "
+        "and navigation included, rest on one training of each network."
+    )
