@@ -49,8 +49,7 @@ def package(tmp_path):
     package = tmp_path / "perilune_render"
     source = Path(perilune_render.__path__[0])
     shutil.copytree(source / "provenance", package / "provenance", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("__init__.py", "processor.py"):
-        shutil.copy(source / name, package)
+    shutil.copy(source / "__init__.py", package)
     (package / "caller.py").write_text(CALLER)
     (package / "callee.py").write_text(CALLEE.format(step=2))
     return package
