@@ -271,7 +271,7 @@ def section(table: Table, records: dict[str, Record]) -> str:
 def value(row: Figure, records: dict[str, Record]) -> str:
     """A figure with its unit, as text."""
     mark = " (transcribed)" if records[row.record].transcribed else ""
-    return f"{formatted(figure(row, records), row.digits)} {row.unit}".strip() + mark
+    return _unbroken(f"{formatted(figure(row, records), row.digits)} {row.unit}".strip()) + mark
 
 
 def interval(row: Figure, records: dict[str, Record]) -> str:
@@ -290,7 +290,12 @@ def goal_and_status(row: Row, records: dict[str, Record]) -> tuple[str, str]:
     measured = figure(row, records)
     met = measured <= limit if row.at_most is not None else measured >= limit
     sign = "≤" if row.at_most is not None else "≥"
-    return f"{sign} {limit:g} {row.unit}".strip(), "met" if met else "**missed**"
+    return _unbroken(f"{sign} {limit:g} {row.unit}".strip()), "met" if met else "**missed**"
+
+
+def _unbroken(text: str) -> str:
+    """A figure that stays on one line in a narrow cell, with no-break spaces."""
+    return text.replace(" ", "\u00a0")
 
 
 def figure(row: Figure, records: dict[str, Record]) -> float:

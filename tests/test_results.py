@@ -179,13 +179,14 @@ def record_of(**figures: object) -> dict[str, results.Record]:
 
 
 @pytest.mark.parametrize(
-    ("bound", "cells"), [("at_most", ("≤ 0.45 px", "**missed**")), ("at_least", ("≥ 0.45 px", "met"))]
+    ("bound", "cells"),
+    [("at_most", ("≤\u00a00.45\u00a0px", "**missed**")), ("at_least", ("≥\u00a00.45\u00a0px", "met"))],
 )
 def test_goals_and_intervals(bound, cells):
     records = record_of(x=0.5, x_low=0.4, x_high=0.6)
     row = results.Row(metric="m", record="r", keys=("x",), unit="px", **{bound: 0.45})
     assert results.goal_and_status(row, records) == cells
-    assert results.interval(row, records) == "0.40 to 0.60" and results.value(row, records) == "0.50 px"
+    assert results.interval(row, records) == "0.40 to 0.60" and results.value(row, records) == "0.50\u00a0px"
 
 
 def test_a_row_without_a_goal_says_so():

@@ -72,9 +72,12 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Rank the page in the search, and redirect links whose targets have another place in the site."""
+    """Rank the page in the search, set its width, and redirect links whose targets have another place in the site."""
     for folder, rank in SEARCH.items():
         if page.file.src_uri.startswith(folder):
             page.meta.setdefault("search", rank)
+    if "/" not in page.file.src_uri:
+        # The home page and the results have no neighbours to list.
+        page.meta.setdefault("hide", ["navigation"])
     # Notebooks become pages; the records of results are outside the folder of the documentation.
     return markdown.replace(".ipynb)", ".md)").replace("](../results/", "](results/")
