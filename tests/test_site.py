@@ -1,5 +1,6 @@
 """The site of the documentation: what its search finds first, and links that also work in the repository's own view."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,14 @@ def test_the_search_finds_recipes_before_the_interface_and_no_diaries(address, r
     shown = page(address)
     on_page_markdown("", page=shown)
     assert shown.meta.get("search") == rank
+
+
+@pytest.mark.parametrize("name", ["index.md", "results.md", "../README.md"])
+def test_links_of_the_first_pages_also_work_in_the_repository(name):
+    """There, generated pages do not exist."""
+    targets = re.findall(r"\]\(([^)#:]+)", (DOCS / name).read_text(encoding="utf-8"))
+    assert len(targets) > 10
+    assert [target for target in targets if not ((DOCS / name).parent / target).exists()] == []
 
 
 def test_links_of_the_repository_lead_to_pages_of_the_site():
