@@ -41,7 +41,7 @@ def scores_of(report: Report) -> set[float]:
 def test_the_frames_are_those_of_the_installed_detector(shown):
     report = gather("demo", "demo", *shown)
     assert scores_of(report) == {0.9}
-    assert "The installed detector finds 90 % of the labelled craters" in report.summary[2]
+    assert "The installed detector finds 90 % of the labelled craters" in report.summary[1]
     section = next(section for section in report.sections if section.key == "detection")
     assert any("is the installed detector" in line for line in section.lead)
 

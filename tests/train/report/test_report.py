@@ -163,8 +163,9 @@ def test_the_first_sentence_is_the_result_of_detection(report, page):
     result = "The detector demo finds 75 % of the labelled craters, and 75 % of its detections are craters"
     assert report.summary[1].startswith(result)
     assert summary_of(report).splitlines()[3].startswith(f"- {result}")
-    header = page.read_text().split("</header>")[0]
-    assert re.search(r'<p class="result">The preset tiny.*?<li>(.*?)</li>', header, re.S)[1].startswith(result)
+    header, main = page.read_text().split("</header>")
+    assert '<p class="result">The preset tiny' in header
+    assert re.search(r'<section id="results">.*?<li>(.*?)</li>', main, re.S)[1].startswith(result)
 
 
 def test_the_headline_of_the_explanation_is_last(report):
@@ -186,6 +187,7 @@ def test_results_come_before_datasets_and_provenance(page):
     titles = re.findall(r"<h2>(.*?)</h2>", page.read_text())
     assert titles == [
         "Look through the frames",
+        "Further results",
         "Crater detection",
         "Navigation",
         "Explanation",

@@ -194,7 +194,8 @@ def _headlines(opened: _Opened, folders: Folders) -> list[str]:
     lines = [_TRIAL] if any(recipe.preset == _TRIAL_PRESET for recipe in recipes) else []
     if lines and opened.detect and opened.detect[-1].name.endswith(INSTALLED):
         lines[0] += " The frames show the installed detector."
-    lines += [detection.headline(run) for run in opened.detect]
+    # The last run is that whose detections the frames show.
+    lines += [detection.headline(run) for run in reversed(opened.detect)]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
     lines += [navigation.headline(run) for run in opened.navigate]
     if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
