@@ -1,4 +1,4 @@
-"""Draw docs/pictures/small_preview.jpg, the picture of the README: the preview of `small`, 1280 pixels wide."""
+"""Draw docs/pictures/small_preview.jpg, a picture of the home page: the preview of `small`, 1280 pixels wide."""
 
 import tempfile
 from pathlib import Path

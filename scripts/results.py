@@ -5,11 +5,13 @@
 
 `record` keeps the JSON of a run or a benchmark as results/<name>.json, with the commit, hardware and command that the
 run recorded itself, and with hashes of that commit's sources: they stay valid in a shallow clone and after a squash of
-the history, when nobody can look the commit up. `write` (`make results`) puts the rows of results/headline.toml, with
-their figures from these records, into the pages. tests/test_results.py fails if they do not agree.
+the history, when nobody can look the commit up. `write` (`make results`) puts the tables and sentences of
+results/headline.toml, with their figures from these records, into the pages. tests/test_results.py fails if they do not
+agree.
 """
 
 import json
+import math
 import re
 import subprocess
 import tomllib
@@ -31,8 +33,8 @@ from perilune_shared.storage.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
-PAGES = {ROOT / "docs/results.md": False, ROOT / "README.md": True}
-"""Pages with a table between BEGIN and END, and whether it has only the rows for the README."""
+RESULTS_PAGE, README = ROOT / "docs/results.md", ROOT / "README.md"
+"""Pages with generated text between BEGIN and END."""
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 SOURCES = ("shared", "render", "train", "benchmarks", "scripts")
 """Folders with the code that makes figures."""
@@ -81,35 +83,61 @@ class Record(BaseModel):
         return self.source.startswith("transcribed from ")
 
 
-class Row(BaseModel):
-    """One headline figure as results/headline.toml describes it."""
+class Figure(BaseModel):
+    """One figure of a record, as results/headline.toml describes it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    metric: str
-    """What was measured, with any caveat that changes how the figure reads."""
+    record: str
+    """Name of the record in results/, without .json."""
+    keys: tuple[str, ...] = Field(min_length=1)
+    """The figure in the record, from the outermost key inwards; <key>_low and <key>_high beside it are its interval."""
     unit: str = ""
     """Unit of value, interval and goal."""
-    record: str = ""
-    """Name of the record in results/, without .json."""
-    keys: tuple[str, ...] = ()
-    """The figure in the record, from the outermost key inwards; <key>_low and <key>_high beside it are its interval."""
     digits: int = 2
     """Significant digits."""
+
+
+class Strength(Figure):
+    """One sentence of the README with a figure."""
+
+    text: str = Field(pattern=r"^[^{}]*\{\}[^{}]*$")
+    """The sentence, with {} in place of the figure."""
+
+
+class Row(Figure):
+    """One row of a table of docs/results.md."""
+
+    metric: str
+    """What was measured, with any caveat that changes how the figure reads."""
+    groups: tuple[str, ...] = ()
+    """Names that replace {group} in the keys: the row has the least favourable of their figures, which an average over
+    the groups would hide. Such a row needs a goal, since the goal says which figure is the least favourable."""
     at_most: float | None = None
     """Goal: the figure is at most this."""
     at_least: float | None = None
     """Goal: the figure is at least this."""
-    not_measured: str = ""
-    """Why there is no valid figure, in place of record and key."""
-    readme: bool = False
-    """Whether the README has this row."""
 
     @model_validator(mode="after")
-    def _figure_or_reason(self) -> "Row":
-        if bool(self.record and self.keys) == bool(self.not_measured):
-            raise ValueError(f"{self.metric}: got both or neither, expected record and keys, or not_measured")
+    def _one_goal(self) -> "Row":
+        if self.at_most is not None and self.at_least is not None:
+            raise ValueError(f"{self.metric}: got at_most and at_least, expected one goal at most")
+        if self.groups and self.at_most is None and self.at_least is None:
+            raise ValueError(f"{self.metric}: got groups without a goal, expected at_most or at_least")
         return self
+
+
+class Table(BaseModel):
+    """One table of docs/results.md."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str
+    """The heading above the table."""
+    terms: str
+    """The paragraph above the table, which defines the terms of its rows."""
+    row: list[Row]
+    """The rows, in order."""
 
 
 class Headline(BaseModel):
@@ -117,8 +145,10 @@ class Headline(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    row: list[Row]
-    """The rows of the table, in order."""
+    strength: list[Strength]
+    """Sentences of the README, in order."""
+    table: list[Table]
+    """Tables of docs/results.md, in order."""
 
 
 @app.command()
@@ -136,10 +166,9 @@ def record(
 
 @app.command()
 def write() -> None:
-    """Write the tables of the pages from the records."""
-    rows, records = read_rows(), read_records()
-    for page, for_readme in PAGES.items():
-        write_text(page, with_table(page.read_text(encoding="utf-8"), table(for_readme, rows, records)))
+    """Write the tables and sentences of the pages from the records."""
+    for page, text in generated_texts(read_headline(), read_records()).items():
+        write_text(page, with_text(page.read_text(encoding="utf-8"), text))
         print(page.relative_to(ROOT))
 
 
@@ -212,90 +241,91 @@ def read_records() -> dict[str, Record]:
     }
 
 
-def read_rows() -> list[Row]:
-    """The rows of the headline table."""
-    return Headline.model_validate(tomllib.loads((RESULTS / "headline.toml").read_text(encoding="utf-8"))).row
+def read_headline() -> Headline:
+    """The rows and sentences of results/headline.toml."""
+    return Headline.model_validate(tomllib.loads((RESULTS / "headline.toml").read_text(encoding="utf-8")))
 
 
-def with_table(page: str, text: str) -> str:
+def generated_texts(headline: Headline, records: dict[str, Record]) -> dict[Path, str]:
+    """The text that each page has between its marks."""
+    strengths = [f"- {each.text.format(value(each, records))}\n" for each in headline.strength]
+    return {RESULTS_PAGE: "\n".join(section(each, records) for each in headline.table), README: "".join(strengths)}
+
+
+def with_text(page: str, text: str) -> str:
     """A page with the text between its marks replaced."""
     before, rest = page.split(BEGIN)
     return f"{before}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}"
 
 
-def table(for_readme: bool, rows: list[Row], records: dict[str, Record]) -> str:
-    """The Markdown table of all rows, or the short one of the README."""
-    heads = (
-        ["Metric", "Value", "Goal"]
-        if for_readme
-        else ["Metric", "Value", "Interval", "Goal", "Commit", "Hardware", "Command"]
-    )
-    lines = [heads, ["---"] * len(heads)]
-    for row in rows:
-        if for_readme and row.readme:
-            lines.append([row.metric, value(row, records), goal(row, records)])
-        elif not for_readme:
-            figures = [value(row, records), interval(row, records), goal(row, records)]
-            lines.append([row.metric, *figures, *made_cells(row, records)])
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+def section(table: Table, records: dict[str, Record]) -> str:
+    """A heading, the terms, and the Markdown table, whose figures link to their records."""
+    lines = [["Quantity", "Measured", "Goal", "Status"], ["---"] * 4]
+    for row in table.row:
+        bounds = interval(row, records)
+        measured = f"[{value(row, records)}](../results/{row.record}.json){f' ({bounds})' if bounds else ''}"
+        lines.append([row.metric, measured, *goal_and_status(row, records)])
+    return f"## {table.title}\n\n{table.terms.strip()}\n\n" + "".join(f"| {' | '.join(each)} |\n" for each in lines)
 
 
-def value(row: Row, records: dict[str, Record]) -> str:
-    """The cell of the value."""
-    if row.not_measured:
-        return f"not measured since {row.not_measured}"
+def value(row: Figure, records: dict[str, Record]) -> str:
+    """A figure with its unit, as text."""
     mark = " (transcribed)" if records[row.record].transcribed else ""
-    return f"{formatted(row, figure(row, records))}{mark}"
+    return _unbroken(f"{formatted(figure(row, records), row.digits)} {row.unit}".strip()) + mark
 
 
-def interval(row: Row, records: dict[str, Record]) -> str:
-    """The cell of the interval: a dash where the record has none."""
-    if row.not_measured:
-        return "—"
-    near = enclosing_table(row, records)
-    low, high = (near.get(f"{row.keys[-1]}_{end}") for end in ("low", "high"))
-    return "—" if low is None or high is None else f"{formatted(row, low)} to {formatted(row, high)}"
+def interval(row: Figure, records: dict[str, Record]) -> str:
+    """The 95 % interval of a figure, as text: empty if the record has none."""
+    keys = keys_of_figure(row, records)
+    near = enclosing_table(row.record, keys, records)
+    low, high = (near.get(f"{keys[-1]}_{end}") for end in ("low", "high"))
+    return "" if low is None or high is None else f"{formatted(low, row.digits)} to {formatted(high, row.digits)}"
 
 
-def goal(row: Row, records: dict[str, Record]) -> str:
-    """The cell of the goal, which also says if the figure misses it."""
+def goal_and_status(row: Row, records: dict[str, Record]) -> tuple[str, str]:
+    """The cells of the goal, and of whether the figure meets it."""
     limit = row.at_most if row.at_most is not None else row.at_least
     if limit is None:
-        return "—"
-    text = f"{'≤' if row.at_most is not None else '≥'} {limit:g} {row.unit}".strip()
-    if row.not_measured:
-        return text
-    found = figure(row, records)
-    met = found <= limit if row.at_most is not None else found >= limit
-    return text if met else f"{text}, missed"
+        return "—", "no goal"
+    measured = figure(row, records)
+    met = measured <= limit if row.at_most is not None else measured >= limit
+    sign = "≤" if row.at_most is not None else "≥"
+    return _unbroken(f"{sign} {limit:g} {row.unit}".strip()), "met" if met else "**missed**"
 
 
-def made_cells(row: Row, records: dict[str, Record]) -> list[str]:
-    """The cells of commit, hardware and command."""
-    if row.not_measured:
-        return ["—", "—", "—"]
-    found = records[row.record]
-    load = "" if found.load is None else f", load {found.load:g}"
-    return [found.commit[:7], f"{found.hardware}{load}", f"`{found.command}`"]
+def _unbroken(text: str) -> str:
+    """A figure that stays on one line in a narrow cell, with no-break spaces."""
+    return text.replace(" ", "\u00a0")
 
 
-def enclosing_table(row: Row, records: dict[str, Record]) -> dict[str, Any]:
-    """The innermost table of a record that contains the figure of a row."""
-    found: Any = records[row.record].figures
-    for key in row.keys[:-1]:
-        found = found[int(key)] if isinstance(found, list) else found[key]
-    return found
-
-
-def figure(row: Row, records: dict[str, Record]) -> float:
+def figure(row: Figure, records: dict[str, Record]) -> float:
     """The figure of a row."""
-    return float(enclosing_table(row, records)[row.keys[-1]])
+    keys = keys_of_figure(row, records)
+    return float(enclosing_table(row.record, keys, records)[keys[-1]])
 
 
-def formatted(row: Row, number: float) -> str:
-    """A number with the row's digits and unit."""
-    text = f"{number:.{row.digits}g}"
-    return f"{float(text):,.15g} {row.unit}".strip()
+def keys_of_figure(row: Figure, records: dict[str, Record]) -> tuple[str, ...]:
+    """The keys of a figure in its record: of the groups of a row, those of the least favourable figure."""
+    if not isinstance(row, Row) or not row.groups:
+        return row.keys
+    candidates = [tuple(key.replace("{group}", group) for key in row.keys) for group in row.groups]
+    least_favourable = max if row.at_most is not None else min
+    return least_favourable(candidates, key=lambda keys: enclosing_table(row.record, keys, records)[keys[-1]])
+
+
+def enclosing_table(record: str, keys: tuple[str, ...], records: dict[str, Record]) -> dict[str, Any]:
+    """The innermost table of a record that contains a figure."""
+    table: Any = records[record].figures
+    for key in keys[:-1]:
+        table = table[int(key)] if isinstance(table, list) else table[key]
+    return table
+
+
+def formatted(number: float, digits: int) -> str:
+    """A number with this many significant digits."""
+    rounded = float(f"{number:.{digits}g}")
+    decimals = digits - 1 - math.floor(math.log10(abs(rounded))) if rounded else 0
+    return f"{rounded:,.{max(decimals, 0)}f}"
 
 
 if __name__ == "__main__":

@@ -88,4 +88,6 @@ def test_an_environment_of_another_python_is_named(tmp_path):
     python.chmod(0o755)
     done = make("setup", f"VENV={python.parents[1]}", "PYTHON=sh", check=False)
     assert done.returncode == 2
-    assert "got Python 3.12.1, expected Python 3.11" in done.stderr and "move" in done.stderr
+    assert "got Python 3.12.1, expected Python 3.11" in done.stderr
+    cure = f"mv {python.parents[1]} {python.parents[1]}-old  and then  make setup PYTHON=python3.11"
+    assert cure in done.stderr and len(done.stderr.splitlines()) == 2  # make adds a line of its own

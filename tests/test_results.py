@@ -1,6 +1,8 @@
 """docs/results.md and README.md have the figures of the records in results/, and each record says how it was made."""
 
+import fnmatch
 import json
+import re
 import subprocess
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +13,8 @@ from scripts import results
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 
-ROWS, RECORDS = results.read_rows(), results.read_records()
+HEADLINE, RECORDS = results.read_headline(), results.read_records()
+ROWS = [row for table in HEADLINE.table for row in table.row]
 FIGURES = {"mean_px": 0.25, "parts": {"a": 1}}
 
 
@@ -29,27 +32,43 @@ def written(folder: Path, **changes: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("page", results.PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [results.RESULTS_PAGE, results.README], ids=lambda page: page.name)
 def test_the_pages_agree_with_the_records(page):
     text = page.read_text(encoding="utf-8")
-    table = results.table(results.PAGES[page], ROWS, RECORDS)
-    assert results.with_table(text, table) == text, "run `make results`"
+    assert results.with_text(text, results.generated_texts(HEADLINE, RECORDS)[page]) == text, "run `make results`"
 
 
-def test_a_changed_figure_changes_the_tables():
-    """Of every row with a figure, so that the test above would notice."""
-    before = results.table(False, ROWS, RECORDS)
-    for row in ROWS:
-        if row.record:
-            records = {name: record.model_copy(deep=True) for name, record in RECORDS.items()}
-            near = results.enclosing_table(row, records)
-            near[row.keys[-1]] = 2 * near[row.keys[-1]] or 1  # also a figure of 0
-            assert results.table(False, ROWS, records) != before, row.metric
+@pytest.mark.parametrize("row", [*ROWS, *HEADLINE.strength], ids=lambda row: getattr(row, "metric", "strength"))
+def test_a_changed_figure_changes_the_pages(row):
+    """Of every row and sentence, so that the test above would notice."""
+    records = {name: record.model_copy(deep=True) for name, record in RECORDS.items()}
+    keys = results.keys_of_figure(row, records)
+    near = results.enclosing_table(row.record, keys, records)
+    # Less favourable, so that it is also the figure of a row of groups; 1 in place of 0.
+    near[keys[-1]] *= 0.5 if getattr(row, "at_least", None) is not None else 2
+    near[keys[-1]] = near[keys[-1]] or 1
+    page = results.README if isinstance(row, results.Strength) else results.RESULTS_PAGE
+    assert results.generated_texts(HEADLINE, records)[page] != results.generated_texts(HEADLINE, RECORDS)[page]
 
 
-def test_every_record_is_shown():
-    assert set(RECORDS) == {row.record for row in ROWS if row.record}
-    assert sum(row.readme for row in ROWS) == 8
+def test_every_record_is_in_a_table_or_described_on_a_page():
+    """A record that nobody can find is deleted, or gets its place."""
+    pages = "".join(page.read_text(encoding="utf-8") for page in (results.ROOT / "docs").rglob("*.md"))
+    described = {re.sub(r"^results/|\.json$", "", name) for name in re.findall(r"`([\w./*-]+\.json)`", pages)}
+    shown = {row.record for row in (*ROWS, *HEADLINE.strength)}
+    lost = [n for n in RECORDS if n not in shown and not any(fnmatch.fnmatch(n, each) for each in described if each)]
+    assert lost == []
+
+
+def test_the_readme_has_three_strengths_and_no_table():
+    assert len(HEADLINE.strength) == 3
+    assert not re.search(r"^\|", results.README.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def test_a_row_stands_alone():
+    """Its name can be read without the row above and without a scoring rule's private name."""
+    wrong = [row.metric for row in ROWS if re.search(r"\b(the same|account)\b", row.metric, re.IGNORECASE)]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("name", RECORDS)
@@ -143,15 +162,56 @@ def test_figures_without_a_record_of_the_run_are_refused(tmp_path):
         results.record([path], tmp_path)
 
 
-def test_a_row_has_a_figure_or_a_reason():
-    for fields in ({}, {"record": "a", "keys": ["b"], "not_measured": "it broke"}, {"record": "a"}):
-        with pytest.raises(ValueError, match="both or neither"):
-            results.Row(metric="m", **fields)
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        ({"at_most": 1, "at_least": 0}, "expected one goal at most"),
+        ({"groups": ["a", "b"]}, "got groups without a goal"),
+    ],
+)
+def test_a_row_has_one_goal_at_most_and_groups_need_one(goals, message):
+    with pytest.raises(ValueError, match=message):
+        results.Row(metric="m", record="r", keys=("x",), **goals)
 
 
-def test_goals_and_intervals():
-    record = RECORDS["train"].model_copy(update={"figures": {"x": 0.5, "x_low": 0.4, "x_high": 0.6}})
-    for bound, reported in (("at_most", "≤ 0.45 px, missed"), ("at_least", "≥ 0.45 px")):
-        row = results.Row(metric="m", record="r", keys=("x",), unit="px", **{bound: 0.45})
-        assert results.goal(row, {"r": record}) == reported
-        assert results.interval(row, {"r": record}) == "0.4 px to 0.6 px"
+def record_of(**figures: object) -> dict[str, results.Record]:
+    return {"r": RECORDS["train"].model_copy(update={"figures": figures})}
+
+
+@pytest.mark.parametrize(
+    ("bound", "cells"),
+    [("at_most", ("≤\u00a00.45\u00a0px", "**missed**")), ("at_least", ("≥\u00a00.45\u00a0px", "met"))],
+)
+def test_goals_and_intervals(bound, cells):
+    records = record_of(x=0.5, x_low=0.4, x_high=0.6)
+    row = results.Row(metric="m", record="r", keys=("x",), unit="px", **{bound: 0.45})
+    assert results.goal_and_status(row, records) == cells
+    assert results.interval(row, records) == "0.40 to 0.60" and results.value(row, records) == "0.50\u00a0px"
+
+
+def test_a_row_without_a_goal_says_so():
+    row = results.Row(metric="m", record="r", keys=("x",))
+    assert results.goal_and_status(row, record_of(x=1)) == ("—", "no goal")
+
+
+@pytest.mark.parametrize(("bound", "expected"), [("at_most", 0.9), ("at_least", 0.2)])
+def test_a_row_of_groups_has_the_least_favourable_one(bound, expected):
+    records = record_of(**{"region/a/x": 0.9, "region/b/x": 0.5, "region/c/x": 0.2})
+    row = results.Row(metric="m", record="r", keys=("region/{group}/x",), groups=("a", "b", "c"), **{bound: 0.5})
+    assert results.figure(row, records) == expected
+    assert results.goal_and_status(row, records)[1] == "**missed**"
+
+
+@pytest.mark.parametrize(
+    ("number", "digits", "text"),
+    [
+        (0.00476, 1, "0.005"),
+        (0.87044, 3, "0.870"),
+        (597.5, 2, "600"),
+        (0.9999, 2, "1.0"),
+        (30.0, 2, "30"),
+        (0.0, 2, "0"),
+    ],
+)
+def test_significant_digits(number, digits, text):
+    assert results.formatted(number, digits) == text

@@ -37,6 +37,17 @@ def generated_pages() -> dict[str, str]:
     return pages
 
 
+SEARCH = {
+    "how-to/": {"boost": 2},
+    "tutorials/": {"boost": 2},
+    "reference/python/": {"boost": 0.5},
+    "reference/configuration/": {"boost": 0.5},
+    "notebook/": {"exclude": True},
+}
+"""How the site's search ranks the pages of a folder: readers look for a recipe first, and the notebook is a record of
+earlier states. Here rather than in the front matter of each page, which the repository's own view of a page shows."""
+
+
 def on_config(config: Any) -> Any:
     """Append the pages of the notebook (docs/notebook) to the navigation, the latest first."""
     dated = [f"notebook/{path.name}" for path in sorted((DOCS / "notebook").glob("2*.md"), reverse=True)]
@@ -45,9 +56,11 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the generated pages, and replace each Jupyter notebook by a page."""
+    """Add the generated pages and the records of results, and replace each Jupyter notebook by a page."""
     for path, text in generated_pages().items():
         files.append(File.generated(config, path, content=text))
+    for record in sorted((DOCS.parent / "results").glob("*.json")):
+        files.append(File.generated(config, f"results/{record.name}", abs_src_path=str(record)))
     for notebook in [each for each in files if each.src_uri.endswith(".ipynb")]:
         files.remove(notebook)
         text, pictures = notebook_page(Path(notebook.abs_src_path))
@@ -58,6 +71,13 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Redirect links from Jupyter notebooks to their pages."""
-    return markdown.replace(".ipynb)", ".md)")
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Rank the page in the search, set its width, and redirect links whose targets have another place in the site."""
+    for folder, rank in SEARCH.items():
+        if page.file.src_uri.startswith(folder):
+            page.meta.setdefault("search", rank)
+    if "/" not in page.file.src_uri:
+        # The home page and the results have no neighbours to list.
+        page.meta.setdefault("hide", ["navigation"])
+    # Notebooks become pages; the records of results are outside the folder of the documentation.
+    return markdown.replace(".ipynb)", ".md)").replace("](../results/", "](results/")

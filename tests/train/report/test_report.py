@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from markupsafe import Markup
 from PIL import Image
 from tests.helpers.drawn_dataset import seal
 from tests.helpers.hostile import rewrite
@@ -21,9 +22,10 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of
 from perilune_train.cli import report as command
 from perilune_train.records.metrics_file import write_metrics
+from perilune_train.report import ground
 from perilune_train.report.ground import shaded_ground
 from perilune_train.report.page import SUMMARY, gather, json_block, write_report
-from perilune_train.report.pictures import drawing, svg_of
+from perilune_train.report.pictures import drawing, layers_of, svg_of
 from perilune_train.report.summary import summary_of
 
 
@@ -75,7 +77,8 @@ def test_each_figure_states_its_source(report, page):
     n_figures = len(re.findall(r"<figcaption>", text))
     assert n_figures > 12
     assert len(re.findall(r'<figcaption>(?:(?!</figcaption>).)*class="source"', text, re.S)) == n_figures
-    assert f"dataset {'ab' * 6}" in text and "ab" * 32 in text
+    # Hashes are in the folded provenance alone.
+    assert "ab" * 32 in text and "ab" * 6 not in text.split('<section id="provenance">')[0]
 
 
 def facts_of(text: str) -> dict[str, dict[str, str]]:
@@ -89,7 +92,7 @@ def test_each_figure_leads_to_command_configuration_seed_commit_versions_and_has
     text = page.read_text()
     facts = facts_of(text)
     sourced = re.findall(r"<(figcaption|caption)>(.*?)</\1>", text, re.S)
-    anchors = [re.findall(r'class="source"><a href="#(.*?)">', own) for _, own in sourced]
+    anchors = [re.findall(r'<a href="#(source-.*?)">', own) for _, own in sourced]
     assert len(anchors) > 15 and all(own and set(own) <= facts.keys() for own in anchors)
     expected = {"command", "SHA-256 of the configuration", "random seed", "commit", "versions", "date", "hardware"}
     assert all(expected <= own.keys() and all(own.values()) for own in facts.values())
@@ -148,21 +151,61 @@ def test_missing_parts_are_named_and_left_out(report_data, report_runs, page, tm
 
 def test_the_summary_has_the_figures(report):
     text = summary_of(report)
-    assert "- demo: AP 0.750, precision 0.750, recall 0.750, F1 0.750" in text
+    assert "- The detector demo finds 75 % of the labelled craters, and 75 % of its detections are craters" in text
     assert "| stack | 2.000 |" in text
     own = text.partition("- detect/demo")[2].partition("\n- ")[0]
     assert "\n  - versions: perilune\\_train " in own and "\n  - random seed: 0\n" in own
     assert "| gates see craters | 0.3 | - | - | holds | pcc\\_detect.png |" in text.replace("craters  |", "craters |")
 
 
-def test_the_headline_of_the_explanation_is_first(report, page):
+def test_the_first_sentence_is_the_result_of_detection(report, page):
     # After the line that says what the preset `tiny` is for.
-    assert report.summary[1] == f"demo: {HEADLINE}"
+    assert report.summary[0].startswith("The preset tiny")
+    result = "The detector demo finds 75 % of the labelled craters, and 75 % of its detections are craters"
+    assert report.summary[1].startswith(result)
+    assert summary_of(report).splitlines()[3].startswith(f"- {result}")
+    header, main = page.read_text().split("</header>")
+    assert '<p class="result">The preset tiny' in header
+    assert re.search(r'<section id="results">.*?<li>(.*?)</li>', main, re.S)[1].startswith(result)
+
+
+def test_the_headline_of_the_explanation_is_last(report):
+    assert report.summary[-1] == HEADLINE
     (section,) = (one for one in report.sections if one.title == "Explanation")
     assert section.lead[0] == HEADLINE and section.lead[1].startswith("Claims: ")
-    lines = summary_of(report).splitlines()
-    assert lines[3].replace("\\", "") == f"- demo: {HEADLINE}"
-    assert re.search(r"<h1>.*?<li>.*?<li>(.*?)</li>", page.read_text(), re.S)[1] == f"demo: {HEADLINE}"
+
+
+def test_claims_that_too_few_scenes_leave_undecided_are_one_sentence(report_data, report_runs, tmp_path):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    verdict = "undecided: fewer than 5 scenes"
+    text = f"Detector: the mask follows craters: {verdict}; removing what it attends to hurts: {verdict}."
+    write_metrics(runs / "explain/demo", {"headline": text})
+    (runs / "explain/demo/claims.json").write_text(json.dumps([{"claim": "a", "verdict": verdict}]))
+    assert gather("demo", "demo", report_data, runs).summary[-1] == f"What the attention masks show is {verdict}."
+
+
+def test_results_come_before_datasets_and_provenance(page):
+    titles = re.findall(r"<h2>(.*?)</h2>", page.read_text())
+    assert titles == [
+        "Look through the frames",
+        "Further results",
+        "Crater detection",
+        "Navigation",
+        "Explanation",
+        "Dataset for detection",
+        "Dataset for navigation",
+        "Not in this report",
+        "Provenance",
+    ]
+
+
+def test_the_first_start_of_a_run_is_named_without_folders_of_the_machine(report_data, report_runs, tmp_path):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    path = runs / "navigate/demo-stack/metrics.json"
+    start = "stages 1 to 5 of 5 from /home/somebody/runs/detect/demo/checkpoints/best.ckpt"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"network/backbone": start}))
+    leads = [line for section in gather("demo", "demo", report_data, runs).sections for line in section.lead]
+    assert "demo-stack started stages 1 to 5 of 5 from detect/demo/checkpoints/best.ckpt." in leads
 
 
 @pytest.mark.parametrize("headline", [None, "", 3])
@@ -171,7 +214,7 @@ def test_a_run_without_a_headline_shows_its_claims(report_data, report_runs, tmp
     write_metrics(runs / "explain/demo", {} if headline is None else {"headline": headline})
     report = gather("demo", "demo", report_data, runs)
     (section,) = (one for one in report.sections if one.title == "Explanation")
-    assert section.lead == ("Claims: 1; holds: 1.",) and report.summary[1].startswith("demo: AP")
+    assert section.lead == ("Claims: 1; holds: 1.",) and report.summary[-1].startswith("The navigator demo-stack")
 
 
 def test_hostile_names_stay_texts(hostile_page):
@@ -207,14 +250,67 @@ def test_svg_has_no_styles_and_the_colour_of_the_text():
 
 def test_the_side_of_a_bowl_that_faces_the_sun_is_bright():
     crater = pd.DataFrame({"x_m": [0.0], "y_m": [0.0], "diameter_m": [100.0], "depth_m": [10.0]})
-    east = np.array([np.cos(np.radians(30)), 0, np.sin(np.radians(30))])
-    image = shaded_ground(crater, east, 100.0, 100).astype(int)
+    west = np.array([np.cos(np.radians(30)), 0, np.sin(np.radians(30))])
+    image = shaded_ground(crater, west, 100.0, 100).astype(int)
     # The Sun is at positive x: the wall at negative x faces it. Slope of the parabola at half the radius: 0.2.
     flat = round(255 * 0.6)
     assert image[2, 2] == pytest.approx(flat, abs=2)
-    lit = 255 * 0.6 * (east[2] + 0.2 * east[0]) / np.hypot(1, 0.2) / east[2]
+    lit = 255 * 0.6 * (west[2] + 0.2 * west[0]) / np.hypot(1, 0.2) / west[2]
     assert image[50, 37] == pytest.approx(lit, abs=4)
     assert image[50, 62] < flat - 30
+
+
+def test_the_map_has_north_up(report_data, monkeypatch):
+    """X of the site runs west and Y south: both are drawn with the opposite sign."""
+    drawn = []
+    monkeypatch.setattr(ground, "svg_of", lambda figure, _: drawn.append(figure.axes[0]) or Markup(""))
+    dataset = open_dataset(str(report_data / "detect"))
+    ground.scene_map(dataset, "s004")
+    (axes,) = drawn
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("east (m)", "north (m)")
+    frames = dataset.table("frames", ["position_m"], scene_id="s004").to_pandas()
+    path = np.stack([np.asarray(one, np.float64) for one in frames["position_m"]])
+    np.testing.assert_allclose(sorted(axes.lines[0].get_xdata()), sorted(-path[:, 0]))
+    np.testing.assert_allclose(sorted(axes.lines[0].get_ydata()), sorted(-path[:, 1]))
+    # The image is that of the ground turned by half a turn, with its lowest row at the bottom.
+    craters = dataset.table("craters", ["x_m", "y_m", "diameter_m", "depth_m"], scene_id="s004").to_pandas()
+    image, half_m = axes.images[0], axes.images[0].get_extent()[1]
+    sun = np.asarray(dataset.table("frames", ["sun_direction"], scene_id="s004").to_pandas()["sun_direction"].iloc[0])
+    large = craters[craters["diameter_m"] >= 2.5 * 2 * half_m / image.get_array().shape[0]]
+    expected = shaded_ground(large, sun / np.linalg.norm(sun), half_m)
+    np.testing.assert_array_equal(image.get_array(), expected[::-1, ::-1])
+
+
+def drawn_on_paper() -> np.ndarray:
+    """A picture with a photograph, a letter, a coloured line and an area closed off by that line."""
+    picture = np.full((120, 160, 3), 255, np.uint8)
+    picture[10:70, 10:70] = np.random.default_rng(0).integers(0, 200, (60, 60, 1))
+    picture[80:90, 20:23] = 0  # black
+    picture[20:22, 80:140], picture[60:62, 80:140] = (0, 114, 178), (0, 114, 178)
+    picture[20:62, 80:82], picture[20:62, 138:140] = (0, 114, 178), (0, 114, 178)
+    return picture
+
+
+def test_the_layers_of_a_picture_are_the_picture_over_white():
+    picture = drawn_on_paper()
+    layers = layers_of(picture)
+    assert layers is not None
+    over = np.full(picture.shape, 255.0)
+    for layer in layers:
+        share = layer[..., 3:] / 255
+        over = over * (1 - share) + layer[..., :3] * share
+    np.testing.assert_allclose(over, picture, atol=2)
+
+
+def test_paper_is_transparent_and_ink_is_apart_from_photographs_and_colours():
+    content, ink = layers_of(drawn_on_paper())
+    assert content[100, 100, 3] == content[40, 100, 3] == 0  # also within the coloured line
+    assert (content[10:70, 10:70, 3] == 255).all() and content[20, 100, 3] == 255
+    assert ink[85, 21, 3] == 255 and (ink[10:70, 10:70, 3] == 0).all() and ink[20, 100, 3] == 0
+
+
+def test_a_photograph_without_paper_has_no_layers():
+    assert layers_of(drawn_on_paper()[10:70, 10:70]) is None
 
 
 def test_the_command(report_data, report_runs, tmp_path):

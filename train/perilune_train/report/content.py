@@ -55,18 +55,6 @@ class Provenance:
         edits = [("edits", self.edits)] if self.edits else []
         return (("source", self.source), *stated, *inputs, *edits)
 
-    @property
-    def line(self) -> str:
-        """One line below a figure: source, short hashes, commit and date."""
-        parts = [self.source]
-        if self.settings_sha256:
-            parts.append(f"configuration {self.settings_sha256[:12]}")
-        parts += [f"{name} {sha256[:12]}" for name, sha256 in self.inputs.items()]
-        if self.commit:
-            commit, _, modified = self.commit.partition(" ")
-            parts.append(f"commit {commit[:12]} {modified}".rstrip())
-        return " · ".join([*parts, *([self.date] if self.date else [])])
-
 
 @dataclass(frozen=True)
 class Figure:
@@ -183,7 +171,7 @@ class Report:
     title: str
     """Heading of the page."""
     summary: tuple[str, ...]
-    """Headline figures, one line each."""
+    """The result, then further results: one sentence each."""
     sections: tuple[Section, ...]
     """In the order of the page."""
     viewer: Viewer | None

@@ -17,8 +17,8 @@ from perilune_train.report.sources import INSTALLED, Run, sources_of
 
 _ROWS = {
     "ap50_paper": "AP",
-    "edge/ap50_paper": "AP, edge account",
-    "strict/ap50_paper": "AP, strict account",
+    "edge/ap50_paper": "AP, edge scoring rule",
+    "strict/ap50_paper": "AP, strict scoring rule",
     "precision": "precision",
     "recall": "recall",
     "f1": "F1",
@@ -52,9 +52,16 @@ def scores_section(scores: Sequence[Run]) -> Section:
 
 
 def headline(run: Run, prefix: str = "test/") -> str:
-    """AP, precision, recall and F1 of a run in one line."""
-    texts = [f"{title} {_value(run, prefix + key)}" for key, title in list(_ROWS.items())[:1] + list(_ROWS.items())[3:]]
-    return f"{run.name}: {', '.join(texts)}"
+    """How good a run is, in one sentence."""
+    precision, recall = (run.metrics.get(prefix + key) for key in ("precision", "recall"))
+    ap, f1 = (_value(run, prefix + key) for key in ("ap50_paper", "f1"))
+    who = "The installed detector" if run.name.endswith(INSTALLED) else f"The detector {run.name}"
+    if not isinstance(precision, int | float) or not isinstance(recall, int | float):
+        return f"{who} has AP {ap}."
+    return (
+        f"{who} finds {100 * recall:.0f} % of the labelled craters, and {100 * precision:.0f} % of its detections are "
+        f"craters (AP {ap}, F1 {f1})."
+    )
 
 
 def extremes(frames: LabelledFrames) -> list[FramePicture]:

@@ -1,5 +1,6 @@
 """The section of explanation: claims with verdicts, mosaics, bars with nulls, interventions; and the paper's page."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -38,9 +39,18 @@ def explanation_section(run: Run, key: str, title: str) -> Section:
 
 
 def headline_of(run: Run) -> str:
-    """What the run found on the gates, one text; empty for a run without one, as of rendered interventions."""
+    """What the run found on the gates, one text; empty for a run without one, as of rendered interventions.
+
+    If too few scenes leave every claim of it undecided, the text says this once.
+    """
     found = run.metrics.get("headline")
-    return one_line(found) if isinstance(found, str) else ""
+    if not isinstance(found, str):
+        return ""
+    verdicts = [claim["verdict"] for claim in read_claims(run.folder / CLAIMS_FILE)]
+    undecided = next((verdict for verdict in verdicts if verdict.startswith("undecided")), None)
+    if undecided is not None and not re.search(r"\b(holds|does not)\b", found):
+        return one_line(f"What the attention masks show is {undecided}.")
+    return one_line(found)
 
 
 def paper_section(folder: Path, run: Run) -> Section:

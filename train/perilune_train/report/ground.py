@@ -44,7 +44,7 @@ def shaded_ground(craters: pd.DataFrame, sun: Array, half_m: float, side_px: int
 
 
 def scene_map(dataset: Dataset, scene_id: str) -> Figure:
-    """The map of a scene under its own Sun, with the ground tracks of at most six of its trajectories."""
+    """The map of a scene under its own Sun, north up, with the ground tracks of at most six of its trajectories."""
     columns = ["trajectory_id", "frame_index", "position_m", "sun_direction"]
     frames = dataset.table("frames", columns, scene_id=scene_id).to_pandas()
     frames = frames.sort_values(["trajectory_id", "frame_index"])
@@ -57,15 +57,17 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
     tracks = list(frames.groupby("trajectory_id").indices.items())[:_MOST_TRACKS]
     with drawing(height_in=5.0) as figure:
         axes = figure.subplots()
-        image = shaded_ground(drawn, sun / np.linalg.norm(sun), half_m)
+        # Columns run west and rows south.
+        image = shaded_ground(drawn, sun / np.linalg.norm(sun), half_m)[::-1, ::-1]
         axes.imshow(image, cmap="gray", vmin=0, vmax=255, origin="lower", extent=(-half_m, half_m, -half_m, half_m))
         for number, (trajectory, rows) in enumerate(tracks):
             path = position[rows]
             colour, dash = COLOURS[(number + 4) % len(COLOURS)], DASHES[number]
-            axes.plot(path[:, 0], path[:, 1], color=colour, linestyle=dash, linewidth=2.4, label=plain(trajectory))
-            axes.plot(*path[0, :2], "o", color="white", markeredgecolor="black", markersize=6)
+            east, north = -path[:, 0], -path[:, 1]
+            axes.plot(east, north, color=colour, linestyle=dash, linewidth=2.4, label=plain(trajectory))
+            axes.plot(east[0], north[0], "o", color="white", markeredgecolor="black", markersize=6)
         axes.grid(False)
-        label_axes(axes, f"{plain(scene_id)} from above", "x, west (m)", "y, south (m)")
+        label_axes(axes, f"{plain(scene_id)} from above", "east (m)", "north (m)")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
         description = f"Shaded map of {scene_id} with the ground tracks of {len(tracks)} trajectories"
         html = svg_of(figure, description)

@@ -1,5 +1,6 @@
 """The section of navigation: trajectory, errors with bands, all methods compared."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -89,16 +90,27 @@ def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
 
 
 def headline(run: Run) -> str:
-    """The errors of a network in one line."""
+    """The errors of a network in one sentence, with the least error of a method without training."""
     position, angle = (
         _spread(run, f"test/{key}") for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg")
     )  # fmt: skip
     method = run.metrics.get("evaluation/method", run.name)
     if run.metrics.get("evaluation/target") == "pose":
         loses = run.metrics.get("evaluation/worse_than")
-        text = f"{run.name} ({method}): RMSE of the pose in the landing frame {position} m in position, {angle} degrees"
-        return f"{text}: worse than {loses}" if loses else text
-    return f"{run.name} ({method}): RMSE of a step {position} m in position, {angle} degrees in orientation"
+        text = (
+            f"The navigator {run.name} ({method}) has an r.m.s. error of {position} m and {angle} degrees in its poses"
+        )
+        return f"{text}, worse than {loses}." if loses else f"{text}."
+    text = f"The navigator {run.name} ({method}) has an r.m.s. error of {position} m and {angle} degrees in a step"
+    others = {
+        key.split("/")[1]: float(value)
+        for key, value in run.metrics.items()
+        if re.fullmatch("baseline/[^/]+/position_rmse_vector_m", key) and isinstance(value, int | float)
+    }
+    if not others:
+        return f"{text}."
+    best = min(others, key=lambda name: others[name])
+    return f"{text}; the best method without training, {best}, has {others[best]:.3f} m."
 
 
 def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
@@ -123,7 +135,9 @@ def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
 def _starts(runs: Sequence[Run]) -> list[str]:
     """A line for each run that did not start from random weights."""
     starts = {run.name: str(run.metrics.get("network/backbone", "from scratch")) for run in runs}
-    return [f"{name} started {start}." for name, start in starts.items() if not start.startswith("from scratch")]
+    # A path of the machine that trained says nothing to a reader of the page: its last folders are those of the run.
+    shown = {name: re.sub(r"(?<=\s)/\S*/(?=(?:[^/\s]+/){3}[^/\s]+$)", "", start) for name, start in starts.items()}
+    return [f"{name} started {start}." for name, start in shown.items() if not start.startswith("from scratch")]
 
 
 def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
@@ -148,7 +162,10 @@ def landing_headline(rows: pd.DataFrame) -> str:
     """The filter's errors in one line, from its table of draws."""
     own = run_summary(rows)
     over, end = number(own["position_rmse_m"]), number(own["position_end_rmse_m"])
-    return f"landing (installed detector, filter): position RMSE {over} m over the descents, {end} m at their end"
+    return (
+        f"The filter with the installed detector has an r.m.s. error of position of {over} m over the test descents, "
+        f"and of {end} m at their end."
+    )
 
 
 def read_landing(folder: Path) -> pd.DataFrame:
@@ -232,7 +249,7 @@ def _trajectory(
     figures = []
     for title, view, x, y in (
         ("From the side", _along(true[0]), "distance over ground from the start (m)", "altitude (m)"),
-        ("From above", lambda path: (path[:, 0], path[:, 1]), "x, west (m)", "y, south (m)"),
+        ("From above", lambda path: (-path[:, 0], -path[:, 1]), "east (m)", "north (m)"),
     ):
         with drawing(height_in=4.2) as figure:
             axes = figure.subplots()

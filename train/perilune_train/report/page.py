@@ -100,7 +100,8 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
             source = provenance_of_dataset(own) if detect is None else detect.provenance
             frames = frames or labelled_frames(split, found, source)
         sections.append(dataset_section(own, f"dataset-{len(sections)}", split))
-    sections += _run_sections(folders, opened, frames, runs)
+    # The datasets are described after what was reached with them.
+    sections = [*_run_sections(folders, opened, frames, runs), *sections]
     if not sections:
         raise UserError(dataset, "report", "no dataset and no finished run", f"the datasets and runs of a {kind}")
     viewer = _viewer(frames, opened)
@@ -185,17 +186,21 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 
 
 def _headlines(opened: _Opened, folders: Folders) -> list[str]:
-    """What `tiny` is for, then a line for each run: what the gates show, the landing, the networks."""
+    """The result in sentences, the first for the page's first line: detection, navigation, landing, explanation.
+
+    What the preset `tiny` is for comes before all figures.
+    """
     recipes = [recipe for one in opened.datasets.values() for recipe in one.info.recipes.values()]
     lines = [_TRIAL] if any(recipe.preset == _TRIAL_PRESET for recipe in recipes) else []
     if lines and opened.detect and opened.detect[-1].name.endswith(INSTALLED):
         lines[0] += " The frames show the installed detector."
-    lines += [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
-    if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
-        lines.append(navigation.landing_headline(navigation.read_landing(folders.landing)))
+    # The last run is that whose detections the frames show.
     lines += [detection.headline(run) for run in reversed(opened.detect)]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
-    return lines + [navigation.headline(run) for run in opened.navigate]
+    lines += [navigation.headline(run) for run in opened.navigate]
+    if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
+        lines.append(navigation.landing_headline(navigation.read_landing(folders.landing)))
+    return lines + [found for run in opened.explain if (found := explanation.headline_of(run))]
 
 
 def _provenance(sections: Sequence[Section], viewer: Viewer | None) -> tuple[Provenance, ...]:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import matplotlib
 import numpy as np
 from markupsafe import Markup
@@ -54,6 +55,14 @@ _STYLE = {
 }
 _LARGEST_SIDE_PX = 1400
 _QUALITY = 82
+_WHITE = 250
+_LEAST_PAPER_SHARE = 0.01
+_LEAST_PATCH_PX = 60
+"""Smallest white area beyond a line that is paper: bright spots of photographs beside paper are mostly smaller."""
+_STROKE_PX = 13
+"""Largest width of a line or letter on paper."""
+_LARGEST_INK_SPREAD = 24
+"""Largest difference between the channels of a grey pixel, of 255: compressed greys are not exactly grey."""
 _numbers = itertools.count()
 ElementTree.register_namespace("", _SVG)
 ElementTree.register_namespace("xlink", _LINK)
@@ -145,7 +154,11 @@ def img(uri: str, description: str) -> Markup:
 
 
 def picture_of(path: Path, description: str) -> Markup:
-    """A run's PNG as an `img` element, reduced to at most 1400 px. Raises UserError if it is damaged or too large."""
+    """A run's PNG as HTML, reduced to at most 1400 px. Raises UserError if it is damaged or too large.
+
+    White paper around its content becomes transparent, and black ink on the paper a second image, which the page
+    inverts in dark colours.
+    """
     try:
         with Image.open(path, formats=["PNG"]) as picture:
             if picture.width * picture.height > LARGEST_IMAGE_PX:
@@ -155,7 +168,57 @@ def picture_of(path: Path, description: str) -> Markup:
         raise UserError(path, "picture", error, f"a PNG of at most {LARGEST_IMAGE_PX} pixels") from None
     # A dimension too large for the page is reduced; a small picture is not enlarged.
     colours.thumbnail((_LARGEST_SIDE_PX, 4 * _LARGEST_SIDE_PX))
-    return img(image_uri(colours), description)
+    layers = layers_of(np.asarray(colours))
+    if layers is None:
+        return img(image_uri(colours), description)
+    content, ink = (image_uri(Image.fromarray(layer)) for layer in layers)
+    element = Markup('<span class="layers">{}<img class="ink" src="{}" alt=""></span>')
+    return element.format(img(content, description), ink)
+
+
+def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
+    """Split a picture (height, width, 3) on white paper into two layers (height, width, 4): content, and black ink.
+
+    Over white, the layers together are the picture. Returns None if there is no paper.
+    """
+    paper = _paper(colours)
+    if paper is None:
+        return None
+    values = colours.astype(np.float64)
+    # The least share of a colour that gives the pixel over white. Black ink has it; coloured lines have a larger one,
+    # since they would be too dark over black.
+    least = (255 - values.min(axis=2)) / 255
+    share = np.where(paper, np.sqrt(least), 1.0)
+    pure = 255 - (255 - values) / np.maximum(share, 1 / 255)[..., None]
+    content = np.dstack([np.clip(pure, 0, 255), 255 * share])
+    is_ink = paper & (np.ptp(colours, axis=2) <= _LARGEST_INK_SPREAD)
+    ink = np.zeros_like(content)
+    ink[..., 3] = np.where(is_ink, 255 * least, 0)
+    content[is_ink] = 0
+    return content.round().astype(np.uint8), ink.round().astype(np.uint8)
+
+
+def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
+    """Where a picture (height, width, 3) is white paper, or a thin line or letter on it (height, width).
+
+    Photographs and filled shapes are none of it. Paper begins with each large white area, and goes on beyond lines.
+    Returns None if there is no large white area.
+    """
+    _, parts, facts, _ = cv2.connectedComponentsWithStats((colours.min(axis=2) >= _WHITE).astype(np.uint8))
+    area = facts[:, cv2.CC_STAT_AREA]
+    area[0] = 0  # all that is not white
+    known = area >= _LEAST_PAPER_SHARE * parts.size
+    if not known.any():
+        return None
+    shape = cv2.getStructuringElement(cv2.MORPH_RECT, (_STROKE_PX, _STROKE_PX))
+    while True:
+        near = np.unique(parts[cv2.dilate(known[parts].astype(np.uint8), shape) > 0])
+        added = near[~known[near] & (area[near] >= _LEAST_PATCH_PX)]
+        if not len(added):
+            break
+        known[added] = True
+    # Closing adds the lines and letters, and keeps the straight edges of photographs.
+    return cv2.morphologyEx(known[parts].astype(np.uint8), cv2.MORPH_CLOSE, shape).astype(bool)
 
 
 def plain(text: object) -> str:

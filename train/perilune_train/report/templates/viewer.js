@@ -18,6 +18,16 @@
   addEventListener("beforeprint", () => { opened = [...closed()]; opened.forEach((one) => { one.open = true; }); });
   addEventListener("afterprint", () => { opened.forEach((one) => { one.open = false; }); });
 
+  // A link to something in a closed part opens the part.
+  function reveal() {
+    let inside = element(decodeURIComponent(location.hash.slice(1)));
+    const target = inside;
+    for (; inside; inside = inside.parentElement) if (inside.tagName === "DETAILS") inside.open = true;
+    if (target) target.scrollIntoView();
+  }
+  addEventListener("hashchange", reveal);
+  if (location.hash) reveal();
+
   const block = element("frames-data");
   if (!block) return;
   const { frames, masks } = JSON.parse(block.textContent);
