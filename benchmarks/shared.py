@@ -26,7 +26,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.threads import cores_in_affinity
 
@@ -43,7 +43,7 @@ def training() -> Step:
     """Steps of detector training: batches of four frames of 256 px, the network of `small`."""
     import torch
 
-    from perilune_shared.config import resolve
+    from perilune_shared.config.resolve import resolve
     from perilune_train.detect.config import DetectConfig
     from perilune_train.models.yolo import YOLOv3
     from perilune_train.training.fair_threads import FairThreads
@@ -86,14 +86,14 @@ def detection() -> Step:
 
 def _frames(engine: str) -> Step:
     """Frames of the first scene of `small` by one thread; each core has a process, as in `perilune-render dataset`."""
-    from perilune_render.config import DatasetConfig
+    from perilune_render.config.dataset import DatasetConfig
     from perilune_render.dataset.shots import planned_shot
-    from perilune_render.engines import open_engine
+    from perilune_render.engines.frame_source import FrameSource
+    from perilune_render.engines.open_engine import open_engine
     from perilune_render.flight.plan import make_plan
-    from perilune_render.frame_source import FrameSource
     from perilune_render.labels.frame_labels import RimCircles
     from perilune_render.terrain.cache import cached_scene
-    from perilune_shared.config import resolve
+    from perilune_shared.config.resolve import resolve
 
     settings = (f"dataset.render.engine={engine}", "dataset.render.threads=1")
     config = resolve(DatasetConfig, "dataset", "perilune_render", "small", None, settings)
@@ -128,10 +128,10 @@ def filtering() -> Step:
     from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
     from perilune_shared.geometry.gravity import gravity_mps2
     from perilune_shared.geometry.inertial_grades import GRADES
-    from perilune_train.navigate.craters.catalogue import Catalogue
-    from perilune_train.navigate.filter.lander import Lander, Surroundings
-    from perilune_train.navigate.filter.propagate import Increments, InertialNoise, start_sigmas
-    from perilune_train.navigate.filter.state import State
+    from perilune_train.landing.craters.catalogue import Catalogue
+    from perilune_train.landing.filter.lander import Lander, Surroundings
+    from perilune_train.landing.filter.propagate import Increments, InertialNoise, start_sigmas
+    from perilune_train.landing.filter.state import State
 
     rng, grade = np.random.default_rng(0), GRADES["tactical"]
     places = np.column_stack([rng.uniform(-2000, 2000, (2000, 2)), np.zeros(2000)])

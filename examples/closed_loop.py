@@ -25,23 +25,23 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from perilune_shared.client import SceneClient
+from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, quaternion_from_matrix, rotation_vectors
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_errors import drawn_errors
 from perilune_shared.geometry.inertial_grades import GRADES
-from perilune_shared.progress import say
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
-from perilune_train.navigate.craters.catalogue import Catalogue, CatalogueErrors, with_errors
-from perilune_train.navigate.craters.sightings import Sightings
-from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
-from perilune_train.navigate.filter.propagate import Increments, InertialNoise, start_sigmas
-from perilune_train.navigate.filter.state import State
+from perilune_train.landing.craters.catalogue import Catalogue, CatalogueErrors, with_errors
+from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
+from perilune_train.landing.filter.propagate import Increments, InertialNoise, start_sigmas
+from perilune_train.landing.filter.state import State
 from perilune_train.shipped.models import shipped_run
 from perilune_train.training.runs import RunFolder
 

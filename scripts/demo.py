@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
@@ -24,17 +24,17 @@ if __name__ == "__main__":
 
 import typer
 
-from perilune_render.config import DatasetConfig
-from perilune_shared.command_line import run_command_line
-from perilune_shared.config import Section, resolve
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.resolve import Section, resolve
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import EXIT_INTERRUPTED, UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import write_text
 from perilune_shared.threads import usable_cores
 from perilune_train.detect.config import DetectConfig
-from perilune_train.evaluation.metrics_file import has_metrics
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.navigate.config import NavigateConfig
+from perilune_train.motion.config import NavigateConfig
+from perilune_train.records.metrics_file import has_metrics
 
 BIN = Path(sys.executable).parent
 SECTIONS: dict[str, tuple[type[Section], str]] = {

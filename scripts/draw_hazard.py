@@ -6,7 +6,7 @@ scripts/draw_hazard.py data/hazard/nav scene-0000/trajectory-0000/000004
 import sys
 from pathlib import Path
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.

@@ -3,13 +3,13 @@
 import tempfile
 from pathlib import Path
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
     end_at_interrupt()
 
-import perilune_render.processor  # noqa: F401, I001 - before NumPy
+import perilune_render.provenance.processor  # noqa: F401, I001 - before NumPy
 import cv2
 
 from perilune_render.cli.main import app

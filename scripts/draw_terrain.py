@@ -7,7 +7,7 @@ Scenes and frames are made by perilune_render.
 import argparse
 from pathlib import Path
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
@@ -20,15 +20,15 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from perilune_render.blender.renderer import Renderer
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.sensor import FixedPattern, develop
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.craters import profile
 from perilune_render.terrain.scene import Scene
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.storage.files import written_aside

@@ -22,7 +22,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
@@ -30,15 +30,15 @@ if __name__ == "__main__":
 
 import typer
 
-from perilune_render.config import DatasetConfig
-from perilune_shared.config import resolve
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import EXIT_INTERRUPTED, UserError
 from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.transfer import check_start
-from perilune_train.evaluation.metrics_file import read_metrics
-from perilune_train.navigate.config import NavigateConfig
-from perilune_train.paper.claimed import DETECTION
+from perilune_train.motion.config import NavigateConfig
+from perilune_train.records.metrics_file import read_metrics
+from perilune_train.report.paper.claimed import DETECTION
 
 PROTOCOL = Path("configs/paper_protocol.yaml")
 ATTITUDE_DEG = 1.0
@@ -305,7 +305,7 @@ def program(name: str) -> list[str]:
     installed = Path(sys.executable).parent / name
     if installed.is_file():
         return [str(installed)]
-    module = {"perilune-render": "perilune_render.cli.main", "perilune-train": "perilune_train.cli"}[name]
+    module = {"perilune-render": "perilune_render.cli.main", "perilune-train": "perilune_train.cli.main"}[name]
     return [sys.executable, "-c", f"from {module} import main; main()"]
 
 
@@ -596,7 +596,7 @@ def _finished(run: Path) -> Callable[[], bool]:
 
 def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
     """Seconds of the long steps that are left, from a few training steps on this machine, by title."""
-    from perilune_train.paper.probe import detect_seconds, navigate_seconds
+    from perilune_train.report.paper.probe import detect_seconds, navigate_seconds
 
     size_px = int(resolve(DatasetConfig, "dataset", "perilune_render", one.preset, PROTOCOL).camera.width_px)
     detect = resolve(DetectConfig, "detect", "perilune_train", one.preset, PROTOCOL, _sets(one, "detect"))
@@ -829,7 +829,7 @@ def _hours(seconds: float) -> str:
 
 
 if __name__ == "__main__":
-    from perilune_shared.command_line import run_command_line
+    from perilune_shared.console.command_line import run_command_line
 
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(main)

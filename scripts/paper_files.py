@@ -14,7 +14,7 @@ import tarfile
 from pathlib import Path
 from typing import Annotated
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
@@ -138,6 +138,6 @@ def unpack(
 
 
 if __name__ == "__main__":
-    from perilune_shared.command_line import run_command_line
+    from perilune_shared.console.command_line import run_command_line
 
     run_command_line(app)

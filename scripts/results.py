@@ -16,7 +16,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
@@ -25,7 +25,7 @@ if __name__ == "__main__":
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
 

@@ -15,7 +15,7 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.
@@ -24,11 +24,11 @@ if __name__ == "__main__":
 import typer
 from model_card import Shipment, model_card
 
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
-from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
-from perilune_train.navigate.covariance import FILE as COVARIANCE
+from perilune_train.motion.covariance import FILE as COVARIANCE
+from perilune_train.records.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.shipped.models import BENCHMARK, CARD, WEIGHTS
 from perilune_train.training.half_weights import precision_of, write_bytewise, write_half
 from perilune_train.training.runs import RunFolder, load_weights

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
     # Not where another module imports this one.

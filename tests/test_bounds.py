@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import perilune_render
 import perilune_shared
 import perilune_train
-from perilune_render.config_values import Span, Within
-from perilune_shared.config import Section
+from perilune_render.config.values import Span, Within
+from perilune_shared.config.resolve import Section
 
 _OTHERS = ("bpy", "ray")
 

@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 import perilune_render.cli.main
 import perilune_shared
 import perilune_shared.cli.main
-import perilune_train.cli
+import perilune_train.cli.main
 
 PROGRAMS = {
     "perilune-manifest": perilune_shared.cli.main.app,
     "perilune-render": perilune_render.cli.main.app,
-    "perilune-train": perilune_train.cli.app,
+    "perilune-train": perilune_train.cli.main.app,
 }
 HEAVY = {"pandas", "pyarrow", "numpy", "scipy", "matplotlib", "PIL", "cv2", "numba", "torch", "lightning", "bpy"}
 
@@ -70,7 +70,7 @@ def test_a_dataset_opens_without_a_command_line():
     assert {"pandas", "pyarrow"} <= found and not found & {"rich", "typer", "matplotlib", "torch"}
 
 
-@pytest.mark.parametrize("module", ["perilune_shared.cli.main", "perilune_render.cli.main", "perilune_train.cli"])
+@pytest.mark.parametrize("module", ["perilune_shared.cli.main", "perilune_render.cli.main", "perilune_train.cli.main"])
 def test_a_command_line_starts_without_heavy_libraries(module):
     assert not loaded(f"import {module}") & HEAVY
 

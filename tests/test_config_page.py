@@ -5,11 +5,11 @@ import itertools
 import pytest
 
 from perilune_render.cli.main import main as render_main
-from perilune_render.config import DatasetConfig
-from perilune_shared.config import Section, resolve
-from perilune_shared.config_page import annotated_yaml
-from perilune_train.cli import SECTIONS
-from perilune_train.cli import main as train_main
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.page import annotated_yaml
+from perilune_shared.config.resolve import Section, resolve
+from perilune_train.cli.main import SECTIONS
+from perilune_train.cli.main import main as train_main
 from tests.helpers import in_process
 
 MODELS = [("dataset", DatasetConfig, "perilune_render"), *((name, m, "perilune_train") for name, m in SECTIONS.items())]

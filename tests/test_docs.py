@@ -15,11 +15,11 @@ from scripts.pages.command_page import commands
 from scripts.pages.hooks import PROGRAMS, generated_pages, on_config
 from scripts.pages.notebook_page import notebook_page
 
-from perilune_render.config import DatasetConfig
-from perilune_shared.config import resolve
-from perilune_shared.config_page import annotated_yaml, keys
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.page import annotated_yaml, keys
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.schema import TABLES
-from perilune_train.cli import SECTIONS
+from perilune_train.cli.main import SECTIONS
 
 TOP = Path(__file__).parent.parent
 DOCS = TOP / "docs"

@@ -54,7 +54,7 @@ def test_blender_is_imported_in_one_folder_only():
         paths += (ROOT / folder).rglob("*.py")
     users = [path for path in paths if imported(path) & BLENDER]
     assert users
-    assert all(path.is_relative_to(ROOT / "render/perilune_render/blender") for path in users), users
+    assert all(path.is_relative_to(ROOT / "render/perilune_render/engines/blender") for path in users), users
 
 
 def test_no_file_imports_torchvision_or_agpl():
@@ -115,13 +115,13 @@ def test_the_distributions_have_one_version():
 
 BYPASSES = {
     r"(?<![\w.])print|\.print|typer\.echo|click\.echo|Console|std(out|err)\.write": {
-        "shared/perilune_shared/terminal.py",
+        "shared/perilune_shared/console/terminal.py",
         # Before a program's imports.
-        "shared/perilune_shared/command_line.py",
+        "shared/perilune_shared/console/command_line.py",
     },
     r"\.to_csv|csv\.writer|DictWriter": {"shared/perilune_shared/export/foreign_text.py"},
     r"\.to_html|\.to_markdown|\.savefig": {
-        "train/perilune_train/evaluation/pictures.py",
+        "train/perilune_train/records/pictures.py",
         "train/perilune_train/report/pictures.py",
         # Its texts are our own.
         "shared/perilune_shared/export/card_pictures.py",
@@ -149,7 +149,7 @@ def test_text_reaches_terminals_pages_and_tables_through_one_function_each():
 
 
 MARKDOWN_WRITERS = {
-    "train/perilune_train/evaluation/markdown.py",
+    "train/perilune_train/records/markdown.py",
     # Both pages put every text into code spans, and have a comment or a head that is no Markdown.
     "shared/perilune_shared/export/hugging_face.py",
     "shared/perilune_shared/export/card.py",
@@ -159,7 +159,7 @@ MARKDOWN_WRITERS = {
 """Files that write pages without `write_markdown`."""
 
 OWN_MODULES = [
-    "perilune_shared.config",
+    "perilune_shared.config.resolve",
     "perilune_render.cli.main",
     "perilune_train.detect.train.run",
     "tests.test_house",

@@ -16,11 +16,11 @@ import pytest
 import torch
 import typer
 
-from perilune_render.config import DatasetConfig
-from perilune_shared.config import resolve
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.navigate.config import NavigateConfig
+from perilune_train.motion.config import NavigateConfig
 from perilune_train.training.runs import load_weights, save_weights
 
 ROOT = Path(__file__).parent.parent
@@ -254,8 +254,8 @@ spec = importlib.util.spec_from_file_location("paper_script", sys.argv[1])
 script = importlib.util.module_from_spec(spec)
 sys.modules["paper_script"] = script
 spec.loader.exec_module(script)
-from perilune_shared.command_line import run_command_line
-own = "import time; from perilune_shared.command_line import run_command_line as run; " \
+from perilune_shared.console.command_line import run_command_line
+own = "import time; from perilune_shared.console.command_line import run_command_line as run; " \
     "import pathlib; pathlib.Path('begun').touch(); run(lambda **_: time.sleep(60))"
 plan = [script.Step(title, [sys.executable, "-c", own], lambda: False) for title in ("a", "page")]
 script.steps = lambda _: plan

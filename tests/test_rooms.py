@@ -11,34 +11,39 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors cgroups threads interrupts run_record terminal progress content yaml_text command_line "
-        "config_errors config config_page storage pictures geometry client dataset labels validation editing export cli"
+        "errors cgroups threads console run_record content config storage pictures geometry client dataset labels "
+        "validation editing export cli"
     ),
+    "shared/perilune_shared/console": "interrupts terminal progress command_line",
+    "shared/perilune_shared/config": "yaml_text errors resolve page",
     "render/perilune_render": (
-        "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene "
-        "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
-        "heightfield engines outputs dataset preview server scenes jobs cli"
+        "config streams provenance terrain flight poses imaging labels engines outputs dataset preview server scenes "
+        "jobs cli"
     ),
     "perilune/perilune": "parts datasets",
-    "render/perilune_render/cli": "options sun dataset frames spice serve status survey counterfactual main program",
+    "render/perilune_render/config": "values cameras terrain survey counterfactual scene outputs dataset",
+    "render/perilune_render/engines": "frame_source blender heightfield open_engine",
+    "render/perilune_render/cli": "options sun dataset frames spice serve status survey counterfactual main",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
         "level_ground cache export"
     ),
     "render/perilune_render/jobs": (
-        "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
+        "job records identity steps work_list report scene_renderer worker local in_process ray_actors run status "
+        "estimate"
     ),
     "train/perilune_train": (
-        "config cli_options compiled data evaluation models training shipped detect navigate explain paper report cli "
-        "program"
+        "config compiled data records models training shipped detect motion landing explain report cli"
     ),
+    "train/perilune_train/cli": "options detect navigate explain report main",
     "train/perilune_train/detect": (
-        "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
+        "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy"
     ),
-    "train/perilune_train/navigate": (
-        "config geometry data network pose relative craters filter fly evaluate covariance train evaluate_run "
-        "compare_runs benchmark map methods monte_carlo deploy cli"
+    "train/perilune_train/motion": (
+        "config geometry data network pose classical metrics covariance train finished_run compare_runs benchmark "
+        "deploy"
     ),
+    "train/perilune_train/landing": "craters filter fly map methods monte_carlo",
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""
 
@@ -104,14 +109,14 @@ SHARED_ROOMS = [
 @pytest.mark.parametrize(
     ("blocked", "modules"),
     [
-        (["torch", "lightning", "bpy"], ["perilune_train.detect.evaluate", "perilune_train.evaluation"]),
+        (["torch", "lightning", "bpy"], ["perilune_train.detect.evaluate", "perilune_train.records"]),
         (["torch", "lightning", "bpy", "typer", "rich"], SHARED_ROOMS),
         (
             ["lightning", "bpy"],
-            ["perilune_train.detect.images", "perilune_train.detect.deploy", "perilune_train.navigate.deploy"],
+            ["perilune_train.detect.images", "perilune_train.detect.deploy", "perilune_train.motion.deploy"],
         ),
         (["bpy", "typer", "rich"], ["perilune_render.flight", "perilune_render.imaging", "perilune_render.labels"]),
-        (["bpy", "typer", "rich"], ["perilune_render.frame_source", "perilune_render.dataset.develop"]),
+        (["bpy", "typer", "rich"], ["perilune_render.engines.frame_source", "perilune_render.dataset.develop"]),
     ],
 )
 def test_a_room_needs_no_more_than_it_says(blocked, modules):

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import pytest
 from pydantic import BaseModel
 
-from perilune_render.config import DatasetConfig
-from perilune_shared.config import Section, resolve
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.resolve import Section, resolve
 from perilune_shared.errors import UserError
-from perilune_train.cli import SECTIONS
+from perilune_train.cli.main import SECTIONS
 
 MODELS = [("dataset", DatasetConfig, "perilune_render"), *((name, m, "perilune_train") for name, m in SECTIONS.items())]
 WRONG = (

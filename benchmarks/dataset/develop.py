@@ -12,13 +12,13 @@ import time
 from pathlib import Path
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.develop import develop_dataset
-from perilune_render.jobs.here import Here
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
-from perilune_shared.config import resolve
-from perilune_shared.terminal import progress_bar
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 
 SETTINGS = (
     "dataset.render.exr=true",

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.figures import write_figures
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.index import index_rows, seal
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import count_rows, open_dataset
@@ -24,7 +25,6 @@ from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.editing.pack import pack
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage.store import open_store
-from perilune_shared.terminal import progress_bar
 
 N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
 """Scenes of one trajectory each, frames per scene, labels per frame, craters per scene."""

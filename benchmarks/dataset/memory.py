@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
-from perilune_render.jobs.here import Here
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 
 WARM_UP = 200
 """Number of frames before the first measurement counts."""

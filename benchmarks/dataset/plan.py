@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import check_plan
 from perilune_render.terrain.grid import graded_grid
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 
 PLANS = {"1000 scenes": (1000, 100, 100, "frame"), "100000 scenes": (100_000, 1, 100, "scene")}
 """Numbers of scenes, of trajectories per scene and of frames per trajectory, and the unit of the split."""

@@ -19,28 +19,28 @@ from typing import Any
 from unittest import mock
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.scene_renderer import SceneRenderer
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.storage.store import open_store
 
 PREPARATION = {
     "generate or read the ground": "perilune_render.jobs.scene_renderer.cached_scene",
-    "arrays for the rays": "perilune_render.heightfield.engine.surface_of",
-    "raster of largest heights": "perilune_render.heightfield.engine.tops_of",
-    "horizon towards the Sun": "perilune_render.heightfield.engine.horizon_of",
+    "arrays for the rays": "perilune_render.engines.heightfield.engine.surface_of",
+    "raster of largest heights": "perilune_render.engines.heightfield.engine.tops_of",
+    "horizon towards the Sun": "perilune_render.engines.heightfield.engine.horizon_of",
 }
 """Steps for each scene."""
 FRAME = {
-    "rays, shadow rays, shading": "perilune_render.heightfield.engine.see",
-    "photometry": "perilune_render.heightfield.engine.reflected",
-    "random numbers of the samples": "perilune_render.heightfield.engine.HeightfieldEngine._drawn",
-    "points of the Sun's disc": "perilune_render.heightfield.engine.disc_places",
-    "sensor": "perilune_render.frame_source.FrameSource.develop",
+    "rays, shadow rays, shading": "perilune_render.engines.heightfield.engine.see",
+    "photometry": "perilune_render.engines.heightfield.engine.reflected",
+    "random numbers of the samples": "perilune_render.engines.heightfield.engine.HeightfieldEngine._drawn",
+    "points of the Sun's disc": "perilune_render.engines.heightfield.engine.disc_places",
+    "sensor": "perilune_render.engines.frame_source.FrameSource.develop",
     "PNG": "perilune_render.dataset.frame_files.png_bytes",
     "write and hash files": "perilune_render.dataset.trajectory.write_frame",
-    "labels": "perilune_render.frame_source.FrameSource.labels",
+    "labels": "perilune_render.engines.frame_source.FrameSource.labels",
     "share of real ground": "perilune_render.dataset.trajectory.real_ground_share",
     "rows of labels": "perilune_render.dataset.trajectory.tables.label_table",
     "inertial measurements and ranges": "perilune_render.dataset.trajectory.tables.measurement_tables",

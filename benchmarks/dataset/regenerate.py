@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import get_args
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.regenerate import State, regenerate, spread
-from perilune_render.jobs.here import Here
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
-from perilune_shared.config import resolve
-from perilune_shared.terminal import progress_bar
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 
 SETTINGS = ("dataset.detect.n_scenes=3", "dataset.detect.trajectories_per_scene=1", "dataset.detect.n_frames=10")
 

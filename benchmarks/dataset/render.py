@@ -15,20 +15,20 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import write_figures
-from perilune_render.blender import bpy
-from perilune_render.blender.renderer import Renderer, one_ray_a_pixel, quiet, render_through
-from perilune_render.blender.stage import aim
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import planned_shot
+from perilune_render.engines.blender import bpy
+from perilune_render.engines.blender.renderer import Renderer, one_ray_a_pixel, quiet, render_through
+from perilune_render.engines.blender.stage import aim
+from perilune_render.engines.frame_source import FrameSource
 from perilune_render.flight.plan import make_plan
-from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.exr import read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.config import resolve
-from perilune_shared.terminal import progress_bar
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 
 N_FRAMES = 38
 

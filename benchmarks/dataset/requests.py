@@ -35,12 +35,12 @@ def counted(cache: str, n_scenes: int, n_trajectories: int, n_frames: int) -> Co
     """Render one dataset with a new cache of scenes; returns the number of requests by method."""
     from aiobotocore.endpoint import AioEndpoint
 
-    from perilune_render.config import DatasetConfig
+    from perilune_render.config.dataset import DatasetConfig
     from perilune_render.jobs import records
-    from perilune_render.jobs.here import Here
+    from perilune_render.jobs.in_process import Here
     from perilune_render.jobs.job import Job
     from perilune_render.jobs.run import render_job
-    from perilune_shared.config import resolve
+    from perilune_shared.config.resolve import resolve
 
     records._INTERVAL_S = 3600.0
     found: Counter[str] = Counter()

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 # Sets how the libraries compute, before NumPy is imported.
-import perilune_render.processor
+import perilune_render.provenance.processor
 
 import cv2  # isort: skip
 import numba  # isort: skip
@@ -28,16 +28,16 @@ import scipy.ndimage  # isort: skip
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name  # type: ignore[import-untyped]  # isort: skip
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.frame_files import png_bytes
 from perilune_render.dataset.shots import planned_shot
-from perilune_render.engines import open_engine
+from perilune_render.engines.frame_source import FrameSource
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.plan import Plan, make_plan
-from perilune_render.frame_source import FrameSource
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.storage.files import write_bytes
 
 Values = dict[str, np.ndarray]
@@ -164,8 +164,8 @@ def main() -> None:
     found = stages()
     features = get_host_cpu_features()
     print(f"processor {get_host_cpu_name()}: {', '.join(name for name in FEATURES if features.get(name))}")
-    if not perilune_render.processor.IN_FORCE:
-        print("NumPy was loaded before the settings of perilune_render.processor")
+    if not perilune_render.provenance.processor.IN_FORCE:
+        print("NumPy was loaded before the settings of perilune_render.provenance.processor")
     for name, values in found.items():
         print(f"{hash_of(values)}  {name}")
     stream = io.BytesIO()

@@ -15,11 +15,11 @@ import pyarrow as pa
 from rich.progress import Progress
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.jobs.estimate import estimate
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.local import LocalWorkers
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.index import INDEX, read_index, write_index
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.storage.store import open_store

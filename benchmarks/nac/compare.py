@@ -18,8 +18,8 @@ from benchmarks.figures import write_figures
 from benchmarks.nac import statistics as st
 from benchmarks.nac.plots import draw_curves
 from benchmarks.nac.sun import sun_over, time_of
-from perilune_render.blender.renderer import Renderer
-from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig
+from perilune_render.config.dataset import CameraConfig, DatasetConfig, FlightConfig
+from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import FixedPattern, develop
@@ -27,12 +27,12 @@ from perilune_render.labels.drawing import write_sheet
 from perilune_render.labels.frame_labels import RimCircles, label_frame
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.command_line import run_command_line
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array, sun_direction
-from perilune_shared.terminal import progress_bar
 
 FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)

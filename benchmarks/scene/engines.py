@@ -15,18 +15,18 @@ import cv2
 import numpy as np
 
 from benchmarks.figures import write_figures
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.shots import planned_shot
-from perilune_render.engines import open_engine
+from perilune_render.engines.frame_source import Frame, FrameSource, Shot
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.plan import make_plan
-from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import Exposure, expected
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
-from perilune_shared.config import resolve
-from perilune_shared.terminal import progress_bar
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.threads import usable_cores
 
 ENGINES = ("cycles", "heightfield")

@@ -22,17 +22,17 @@ import numpy as np
 
 from benchmarks.figures import write_figures
 from benchmarks.scene import rings
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.imaging.resampling import refined, resample
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.storage.files import written_aside
-from perilune_shared.terminal import progress_bar
 
 ALTITUDES_M = (200.0, 400.0, 800.0, 1500.0)
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0)

@@ -18,21 +18,21 @@ import numpy as np
 
 from benchmarks.figures import write_figures
 from benchmarks.scene.tracking import klt_residuals_px
-from perilune_render.blender import bpy
-from perilune_render.blender.renderer import Renderer, quiet
-from perilune_render.blender.stage import aim
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import planned_shot
+from perilune_render.engines.blender import bpy
+from perilune_render.engines.blender.renderer import Renderer, quiet
+from perilune_render.engines.blender.stage import aim
+from perilune_render.engines.frame_source import Frame, FrameSource
 from perilune_render.flight.plan import TrajectoryPlan, make_plan
-from perilune_render.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.levels import cut_levels, level_index
-from perilune_shared.config import resolve
-from perilune_shared.terminal import progress_bar
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 
 SETTINGS = (
     "dataset.camera.width_px=1024",

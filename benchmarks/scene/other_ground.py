@@ -19,11 +19,11 @@ import typer
 
 from benchmarks.figures import write_figures
 from benchmarks.scene.other_ground_detector import render, score
-from perilune_render.config_terrain import TerrainConfig
+from perilune_render.config.terrain import TerrainConfig
 from perilune_render.terrain.elevation.catalogue import RealCraters, read_catalogue
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_render.terrain.grid import Grid
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, selenographic_from_site
 

@@ -19,7 +19,7 @@ from perilune_train.detect.evaluate.matching import EDGE, Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_split
-from perilune_train.evaluation.metrics_file import Metrics
+from perilune_train.records.metrics_file import Metrics
 from perilune_train.shipped.models import shipped_run
 from perilune_train.training.runs import RunFolder
 

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from perilune_render.blender import bpy
-from perilune_render.blender.renderer import configure, render_through
-from perilune_render.blender.stage import aim, mesh_from_arrays, sunlit_stage
-from perilune_render.config import LightConfig, RenderConfig
+from perilune_render.config.dataset import LightConfig, RenderConfig
+from perilune_render.engines.blender import bpy
+from perilune_render.engines.blender.renderer import configure, render_through
+from perilune_render.engines.blender.stage import aim, mesh_from_arrays, sunlit_stage
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles, label_frame
 from perilune_shared.geometry.camera import Camera, camera_from_site

@@ -18,10 +18,10 @@ import numpy as np
 import psutil
 
 from benchmarks.figures import write_figures
-from perilune_render.server.pangu_messages import IMAGE, VERSION
-from perilune_render.server.pangu_wire import double_bytes, unsigned
+from perilune_render.server.pangu.messages import IMAGE, VERSION
+from perilune_render.server.pangu.wire import double_bytes, unsigned
 from perilune_shared.client import SceneClient
-from perilune_shared.yaml_text import to_yaml_text
+from perilune_shared.config.yaml_text import to_yaml_text
 
 SCENE = {
     "name": "bench-serve",

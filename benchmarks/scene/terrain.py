@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import write_figures
-from perilune_render.blender.renderer import Renderer
-from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_terrain import CratersConfig
-from perilune_render.config_values import Span
+from perilune_render.config.dataset import DatasetConfig, FlightConfig
+from perilune_render.config.terrain import CratersConfig
+from perilune_render.config.values import Span
+from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.view import view_envelope
@@ -28,9 +28,9 @@ from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.geometry.frames import sun_direction
-from perilune_shared.terminal import progress_bar
 
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000)
 

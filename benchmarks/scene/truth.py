@@ -13,9 +13,9 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from benchmarks.figures import write_figures
-from perilune_render.blender.renderer import Renderer
-from perilune_render.config import DatasetConfig, KindConfig, RenderConfig
-from perilune_render.config_terrain import BouldersConfig, TerrainConfig
+from perilune_render.config.dataset import DatasetConfig, KindConfig, RenderConfig
+from perilune_render.config.terrain import BouldersConfig, TerrainConfig
+from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.exr import exr_bytes, read_radiance
 from perilune_render.imaging.radiance import Radiance

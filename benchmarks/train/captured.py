@@ -17,7 +17,7 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_train.data.frames import FrameStore
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.labels import FrameLabels

@@ -20,7 +20,7 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.geometry.frames import Array
 from perilune_shared.labels.selection import limited_contrast, read_labels, selected

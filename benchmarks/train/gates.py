@@ -16,16 +16,16 @@ import typer
 from matplotlib.figure import Figure
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import open_detector
-from perilune_train.evaluation.pictures import save_figure
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.inputs import labelled_frames
 from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.page.claims import LEAST_DEVIATION
+from perilune_train.records.pictures import save_figure
 from perilune_train.training.runs import RunFolder
 
 _KEYS = {"ap": "val/ap50_paper", "ap_strict": "val/strict/ap50_paper"}

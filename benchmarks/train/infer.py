@@ -18,8 +18,8 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
-from perilune_shared.terminal import progress_bar
+from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.terminal import progress_bar
 from perilune_train.detect.deploy.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.export import load_trained
 from perilune_train.detect.deploy.files import write_onnx

@@ -20,7 +20,7 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_train.detect.deploy.engines import has_bf16, openvino_core
 from perilune_train.detect.deploy.files import write_onnx
 from perilune_train.detect.deploy.flight_detector import FlightDetector

@@ -17,11 +17,11 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_single
-from perilune_train.navigate.methods.flights import default_sigmas, mounting_of
-from perilune_train.navigate.monte_carlo.run import GRADE, Job, all_draws, sites_of
-from perilune_train.navigate.monte_carlo.summary import run_summary
+from perilune_train.landing.methods.flights import default_sigmas, mounting_of
+from perilune_train.landing.monte_carlo.run import GRADE, Job, all_draws, sites_of
+from perilune_train.landing.monte_carlo.summary import run_summary
 from perilune_train.shipped.models import shipped_run
 
 _TIMED_DRAWS = 20

@@ -22,7 +22,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 
 PROTOCOL = Path("configs/paper_protocol.yaml")
 _COLUMNS = {

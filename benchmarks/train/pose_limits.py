@@ -21,14 +21,14 @@ import typer
 from torch import Tensor, nn
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_single
 from perilune_train.models.navigator import Recurrent, StackNavigator, cell_means
-from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
-from perilune_train.navigate.evaluate.floors import mean_poses
-from perilune_train.navigate.pose import causal_outputs
-from perilune_train.navigate.train.stored import stored_features
-from perilune_train.navigate.train.views import other_views
+from perilune_train.motion.data.trajectories import Trajectory, load_trajectories
+from perilune_train.motion.metrics.floors import mean_poses
+from perilune_train.motion.pose import causal_outputs
+from perilune_train.motion.train.stored import stored_features
+from perilune_train.motion.train.views import other_views
 from perilune_train.training.runs import RunFolder, choose_device, load_weights
 
 _GRID, _PAIRS, _BATCH, _RATE, _SUMMARY = 4, 16, 8, 5e-3, 512

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_train.detect.deploy.export import load_trained

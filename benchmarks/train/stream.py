@@ -22,14 +22,14 @@ from pathlib import Path
 import torch
 
 from benchmarks.figures import write_figures
+from perilune_shared.config.yaml_text import to_yaml_text
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.yaml_text import to_yaml_text
-from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.data.stream import Stream
-from perilune_train.navigate.data.trajectories import load_trajectories
-from perilune_train.navigate.evaluate.metrics import motion_errors, summary
-from perilune_train.navigate.network import load_navigator, predict
-from perilune_train.navigate.train.task import NavigationTask
+from perilune_train.motion.config import NavigateConfig
+from perilune_train.motion.data.stream import Stream
+from perilune_train.motion.data.trajectories import load_trajectories
+from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.network import load_navigator, predict
+from perilune_train.motion.train.task import NavigationTask
 from perilune_train.training.fit import fit
 from perilune_train.training.runs import RunFolder
 

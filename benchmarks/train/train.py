@@ -28,8 +28,8 @@ from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
 from benchmarks.figures import write_figures
-from perilune_shared.command_line import run_command_line
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.threads import usable_cores
 from perilune_train.detect.config import DetectConfig

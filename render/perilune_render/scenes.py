@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 import pandas as pd
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.rig import rig_of
@@ -22,8 +22,8 @@ from perilune_render.flight.view import view_of
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.provenance.recipe import config_of
 from perilune_render.server.world import View, World, open_world, world_over
-from perilune_shared.config import PRESETS, resolve
-from perilune_shared.config_errors import nearest
+from perilune_shared.config.errors import nearest
+from perilune_shared.config.resolve import PRESETS, resolve
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError, one_line

@@ -4,8 +4,8 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from perilune_shared.config import PRESETS, Section, resolve
-from perilune_shared.config_page import Key, keys
+from perilune_shared.config.page import Key, keys
+from perilune_shared.config.resolve import PRESETS, Section, resolve
 
 UNITS = {
     "_e_per_s": "e/s",

@@ -14,10 +14,10 @@ from scripts.pages.notebook_page import notebook_page
 from scripts.pages.pangu_page import pangu_page
 
 from perilune_render.cli.main import app as render
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_shared.cli.main import app as manifest
-from perilune_train.cli import SECTIONS
-from perilune_train.cli import app as train
+from perilune_train.cli.main import SECTIONS
+from perilune_train.cli.main import app as train
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
 PROGRAMS = {"perilune-render": render, "perilune-manifest": manifest, "perilune-train": train}

@@ -1,6 +1,6 @@
 """The table of PANGU's messages, from the server's own list."""
 
-from perilune_render.server.pangu_messages import FIRST_SETTING, MESSAGES
+from perilune_render.server.pangu.messages import FIRST_SETTING, MESSAGES
 
 _HEAD = """# PANGU's messages
 

@@ -9,7 +9,7 @@ from perilune_shared.geometry.frames import Array
 
 
 class FlatEngine:
-    """Renders the plane z = 0 of O_L; an engine for `perilune_render.frame_source`."""
+    """Renders the plane z = 0 of O_L; an engine for `perilune_render.engines.frame_source`."""
 
     def __init__(self, law: str, camera: Camera, sun: Array):
         self.law, self.camera, self.sun = law, camera, sun

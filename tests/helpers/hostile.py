@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from perilune_shared.cli import main as cli
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.packed import SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.schema import TABLES, complete

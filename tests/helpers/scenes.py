@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, KindConfig
+from perilune_render.config.dataset import DatasetConfig, KindConfig
 from perilune_render.terrain.boulders import Boulders
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.craters.rims import Rims, measure_rims

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_train.evaluation.provenance import Provenance, TerrainUse, Use, split_terrain
+from perilune_train.records.provenance import Provenance, TerrainUse, Use, split_terrain
 from perilune_train.training import runs
 
 

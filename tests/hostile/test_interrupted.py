@@ -21,7 +21,7 @@ from tests.hostile.commands import make_inputs
 ROOT = Path(__file__).parent.parent.parent
 BEGUN = """
 import sys, runpy
-from perilune_shared.interrupts import end_at_interrupt
+from perilune_shared.console.interrupts import end_at_interrupt
 end_at_interrupt()
 print("begun", flush=True)
 """
@@ -108,7 +108,7 @@ LARGE = {
 def test_a_server_in_a_large_request_ends_with_one_line(folder, after_s):
     (folder / "large.yaml").write_text(yaml.safe_dump({"dataset": LARGE}))
     words = ["serve", "--preset", "tiny", "--scene", "large.yaml", "--port", "0", "--native-port", "0"]
-    command = [sys.executable, "-c", "from perilune_render.cli.program import main; main()", *words]
+    command = [sys.executable, "-c", "from perilune_render.cli import main; main()", *words]
     process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stderr is not None
     for line in process.stderr:
@@ -140,7 +140,7 @@ def test_every_script_listens_before_it_imports_libraries():
         imports = [line for line in lines if line.startswith(("import ", "from "))]
         third = [n for n, line in enumerate(lines) if line.startswith(("import ", "from ")) and not _is_standard(line)]
         first = lines[third[0]] if third else ""
-        if imports and third and first != "from perilune_shared.interrupts import end_at_interrupt":
+        if imports and third and first != "from perilune_shared.console.interrupts import end_at_interrupt":
             missing.append(name)
     assert missing == []
 

@@ -19,7 +19,7 @@ from rasterio.windows import Window
 import perilune_train.detect.images.evaluate
 import perilune_train.detect.images.predict  # noqa: F401
 from perilune_shared.errors import UserError
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 from perilune_train.detect.benchmark.submission import read_submission
 from perilune_train.detect.images.labelled import read_images
 from perilune_train.detect.images.read import LARGEST_PIXELS, read_grey

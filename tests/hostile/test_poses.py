@@ -8,11 +8,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import perilune_train.navigate.fly.run  # noqa: F401
+import perilune_train.landing.fly.run  # noqa: F401
 from perilune_render.cli.main import main as render
-from perilune_train.cli import main as train
+from perilune_train.cli.main import main as train
 from tests.hostile.measured import refused
-from tests.train.navigate.fly.descent_files import options, write_descent
+from tests.train.landing.fly.descent_files import options, write_descent
 
 NAMES = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 DOWN = (0.0, 0.0, 800.0, 0.0, 1.0, 0.0, 0.0)

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-import perilune_render.blender.renderer
+import perilune_render.engines.blender.renderer
 import perilune_render.jobs.local
 import perilune_render.terrain.scene
 from perilune_render.cli.main import main as render
-from perilune_train.cli import main as train
+from perilune_train.cli.main import main as train
 from perilune_train.detect.train import run as detect_training
-from perilune_train.navigate.train import run as navigate_training
+from perilune_train.motion.train import run as navigate_training
 from tests.helpers.drawn_dataset import build_dataset
 from tests.hostile.measured import refused
 

@@ -7,11 +7,11 @@ import pytest
 
 from perilune_render.cli.main import main as render
 from perilune_shared.storage.tables import parquet  # noqa: F401 (else its import counts as memory)
-from perilune_train.cli import main as train
-from perilune_train.navigate.fly import run  # noqa: F401
+from perilune_train.cli.main import main as train
+from perilune_train.landing.fly import run  # noqa: F401
 from tests.helpers.elevation_models import PLACED, POLAR, rough, write
 from tests.hostile.measured import accepted, refused
-from tests.train.navigate.fly.descent_files import options, write_descent
+from tests.train.landing.fly.descent_files import options, write_descent
 
 WORD = "x" * 1_000_000
 MB = 150.0

@@ -15,15 +15,15 @@ import pytest
 import safetensors.torch
 import torch
 
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.inference import detector
 from perilune_train.detect.train import transfer
 from perilune_train.models import darknet_weights
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.navigate.network import build
+from perilune_train.motion.network import build
 from perilune_train.training.runs import read_saved, save_weights
 from tests.hostile.measured import Outcome, refused
 
@@ -284,7 +284,7 @@ NAVIGATORS: dict[str, tuple[dict, str]] = {
 @pytest.mark.parametrize("name", NAVIGATORS)
 def test_navigators(name: str, tmp_path: Path) -> None:
     """Through the export, which opens a run's navigator."""
-    from perilune_train.navigate.deploy import export
+    from perilune_train.motion.deploy import export
 
     assert export
     changes, naming = NAVIGATORS[name]

@@ -9,7 +9,7 @@ from tests.helpers import in_process
 from tests.helpers.stored_run import THRESHOLD, store_run
 
 import perilune
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 
 
 @pytest.fixture(scope="module")

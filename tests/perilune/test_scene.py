@@ -9,9 +9,9 @@ from PIL import Image
 from tests.helpers.elevation_models import hilly_raster
 
 import perilune
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.scenes import TERRAINS
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.geometry.frames import matrix_from_quaternion
 
 ROOT = Path(__file__).parents[2]

@@ -3,8 +3,8 @@
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_terrain import BouldersConfig, TerrainConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.geometry.camera import Camera

@@ -6,8 +6,8 @@ import pytest
 from tests.helpers import elevation_models
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_values import Span
+from perilune_render.config.dataset import DatasetConfig, FlightConfig
+from perilune_render.config.values import Span
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.trajectories import fly
 from perilune_render.flight.view import view_envelope
@@ -18,7 +18,7 @@ from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.level_ground import averaged, on_level
 from perilune_render.terrain.levels import check_levels, cut_levels, level_index
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory, approach_deg

@@ -11,7 +11,7 @@ import pytest
 from perilune_shared import cgroups, threads
 from perilune_shared.errors import UserError
 
-PROGRAMS = ("perilune_shared.cli.main", "perilune_render.cli.main", "perilune_train.cli")
+PROGRAMS = ("perilune_shared.cli.main", "perilune_render.cli.main", "perilune_train.cli.main")
 
 
 @pytest.fixture

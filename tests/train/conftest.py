@@ -8,13 +8,13 @@ import torch
 from tests.helpers import in_process
 from tests.helpers.drawn_dataset import build_dataset
 
-from perilune_train.cli import main
-from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.train.run import navigate_run
+from perilune_train.cli.main import main
+from perilune_train.motion.config import NavigateConfig
+from perilune_train.motion.train.run import navigate_run
 
 DRAWING = {
     "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),
-    "perilune_train.navigate.evaluate.report": ("draw_trajectory", "draw_errors", "draw_pose_errors"),
+    "perilune_train.motion.metrics.report": ("draw_trajectory", "draw_errors", "draw_pose_errors"),
 }
 """Functions that write pictures, by the module that calls them."""
 

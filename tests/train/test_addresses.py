@@ -11,19 +11,19 @@ from tests.helpers.s3_server import uploaded
 from tests.helpers.stored_run import store_run
 from tests.helpers.terrain_record import store_record
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing import pack as packing
 from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
-from perilune_train.evaluation.provenance import training_provenance
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.run import explain_run
 from perilune_train.models.navigator import StackNavigator
+from perilune_train.records.provenance import training_provenance
 from perilune_train.training.runs import save_weights
 
 _STACK = {

@@ -9,7 +9,7 @@ import pytest
 from tests.helpers import in_process
 from typer.testing import CliRunner
 
-from perilune_train.cli import app, main
+from perilune_train.cli.main import app, main
 
 
 def call(*arguments, cwd=None):

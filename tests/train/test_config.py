@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from perilune_shared.config import PRESETS, resolve
+from perilune_shared.config.resolve import PRESETS, resolve
 from perilune_train.detect.config import DetectConfig
 
 

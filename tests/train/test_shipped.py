@@ -13,7 +13,7 @@ from tests.helpers import in_process
 from tests.helpers.stored_run import THRESHOLD, store_run
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 from perilune_train.shipped import models
 from perilune_train.training.half_weights import write_half
 from perilune_train.training.runs import RunFolder, load_weights

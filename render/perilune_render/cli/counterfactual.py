@@ -8,13 +8,13 @@ import typer
 
 import perilune_shared as ps
 from perilune_render.cli.dataset import How, made_or_exit
-from perilune_render.config_counterfactual import CounterfactualConfig
-from perilune_shared.config import resolve_over
+from perilune_render.config.counterfactual import CounterfactualConfig
+from perilune_shared.config.resolve import resolve_over
+from perilune_shared.console.progress import say
+from perilune_shared.console.terminal import answer
 from perilune_shared.dataset.names import Split
 from perilune_shared.errors import UserError
-from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
-from perilune_shared.terminal import answer
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,12 +23,12 @@ from perilune_render.cli.options import (
     with_unit,
 )
 from perilune_render.cli.sun import warn_of_suns
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.console.interrupts import ended_by_interrupt
+from perilune_shared.console.terminal import answer, progress_bar, say
 from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
-from perilune_shared.interrupts import ended_by_interrupt
 from perilune_shared.storage.store import Store, open_store
-from perilune_shared.terminal import answer, progress_bar, say
 
 if TYPE_CHECKING:
     from perilune_render.jobs.job import Job
@@ -242,7 +242,7 @@ def _print_failures(error: "RenderingFailed") -> None:
 def _executor(how: How, early: "Worker | None") -> "MakeExecutor":
     if how.workers == 0:
         # Imports Blender, which takes seconds.
-        from perilune_render.jobs.here import Here
+        from perilune_render.jobs.in_process import Here
 
         return Here
     if how.executor == "ray":

@@ -8,13 +8,13 @@ import typer
 from perilune_render.cli.dataset import How, first_worker, made_or_exit
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
 from perilune_render.cli.sun import warn_of_sun
-from perilune_render.config import DatasetConfig
-from perilune_render.config_cameras import CameraConfig
-from perilune_shared.config import resolve_over
+from perilune_render.config.cameras import CameraConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.resolve import resolve_over
+from perilune_shared.console.terminal import answer
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
-from perilune_shared.terminal import answer
 
 Scene = Annotated[
     Path | None,

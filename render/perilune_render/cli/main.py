@@ -30,12 +30,12 @@ from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
 from perilune_render.cli.sun import warn_of_sun, warn_of_suns
 from perilune_render.cli.survey import survey
-from perilune_render.config import DatasetConfig
-from perilune_shared.command_line import new_program, run_command_line
-from perilune_shared.config import resolve, to_yaml
-from perilune_shared.config_page import annotated_yaml
+from perilune_render.config.dataset import DatasetConfig
+from perilune_shared.config.page import annotated_yaml
+from perilune_shared.config.resolve import resolve, to_yaml
+from perilune_shared.console.command_line import new_program, run_command_line
+from perilune_shared.console.terminal import answer, answer_page, progress_bar
 from perilune_shared.errors import EXIT_USER_ERROR, UserError
-from perilune_shared.terminal import answer, answer_page, progress_bar
 
 app = new_program(
     "perilune-render",

@@ -5,13 +5,13 @@ from typing import Annotated, Literal
 
 import typer
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_cameras import CameraConfig
-from perilune_render.config_terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig, HeightUnit
-from perilune_shared.config import resolve
+from perilune_render.config.cameras import CameraConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig, HeightUnit
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import say
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import say
 
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""

@@ -6,9 +6,9 @@ import typer
 
 from perilune_render.cli.frames import CameraFile, Scene, read_camera
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config.scene import SceneConfig
+from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
-from perilune_shared.progress import say
 
 if TYPE_CHECKING:
     from perilune_render.server.world import World
@@ -65,8 +65,8 @@ def serve(
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
     from perilune_render.server.grounds import Grounds
     from perilune_render.server.native.serve import Native, native_address
-    from perilune_render.server.pangu_serve import greets, serve_pangu
-    from perilune_render.server.pangu_session import Conventions, Session
+    from perilune_render.server.pangu.serve import greets, serve_pangu
+    from perilune_render.server.pangu.session import Conventions, Session
     from perilune_render.server.serve import Connection, Interface, Limits, Server
     from perilune_render.server.world import open_world
 

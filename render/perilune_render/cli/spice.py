@@ -7,9 +7,9 @@ import typer
 
 from perilune_render.cli.frames import Scene
 from perilune_render.cli.options import Dem, Preset, Setting, Unit, resolved_config, with_unit
+from perilune_shared.console.terminal import answer
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
-from perilune_shared.terminal import answer
 
 
 def spice(

@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 
+from perilune_shared.console.terminal import answer_page
 from perilune_shared.storage.store import open_store
-from perilune_shared.terminal import answer_page
 
 
 def status(

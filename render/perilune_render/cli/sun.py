@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_terrain import TerrainConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.terrain import TerrainConfig
+from perilune_shared.console.terminal import say
 from perilune_shared.dataset.names import Kind
-from perilune_shared.terminal import say
 
 _LARGEST_SUN_LATITUDE_DEG = 1.54
 """Largest distance of the Sun from the Moon's equator: the tilt of the Moon's axis to the ecliptic, degrees."""

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.finish import remove_work
 from perilune_render.dataset.work import FOLDER
 from perilune_render.flight.plan import Plan

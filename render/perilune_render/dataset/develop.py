@@ -12,22 +12,23 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import begin_or_resume, first_difference, open_finished, writing
 from perilune_render.dataset.finish import finish
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.work import OF_SCENE, commit, committed, write_scene
+from perilune_render.engines.frame_source import FrameSource
 from perilune_render.flight.rig import Rig, rig_of
-from perilune_render.frame_source import FrameSource
+from perilune_render.flight.sub_poses import RowPoses
 from perilune_render.imaging.exr import local_exr, read_radiance
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.provenance.recipe import recorded_settings, settings_of
 from perilune_render.provenance.versions import imaging_versions
-from perilune_render.sub_poses import RowPoses
-from perilune_shared.config import resolve_over
+from perilune_shared.config.resolve import resolve_over
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
 from perilune_shared.dataset.names import SCENE_FILE_KINDS
@@ -36,7 +37,6 @@ from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
-from perilune_shared.progress import Progress
 from perilune_shared.storage.store import Address, Store, open_store
 
 

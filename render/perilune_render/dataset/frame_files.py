@@ -5,7 +5,7 @@ import hashlib
 import cv2
 import numpy as np
 
-from perilune_render.frame_source import Frame, FrameSource
+from perilune_render.engines.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import exr_bytes
 from perilune_render.outputs.of_scene import Beside
 from perilune_shared.dataset.names import ImageKind, SceneFileKind, frame_path

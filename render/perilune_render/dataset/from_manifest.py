@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config.dataset import DatasetConfig, FlightConfig
 from perilune_render.dataset.begin import camera_records, new_info
 from perilune_render.flight.motion import Motion, draw_motion
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan

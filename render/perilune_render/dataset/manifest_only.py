@@ -2,7 +2,7 @@
 
 import pyarrow as pa
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import new_info
 from perilune_render.flight.plan import make_plan
@@ -11,11 +11,11 @@ from perilune_render.outputs.hazard import check_hazard
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
+from perilune_shared.console.interrupts import interrupts_held
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.names import IMAGE_KINDS, Kind, frame_path, scene_file_path
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.editing.writer import new_dataset
-from perilune_shared.interrupts import interrupts_held
-from perilune_shared.progress import Progress
 from perilune_shared.storage.store import Address
 
 

@@ -15,31 +15,31 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_cameras import CameraConfig
+from perilune_render.config.cameras import CameraConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.tables import ground_tables
-from perilune_render.engines import open_engine
+from perilune_render.engines.frame_source import FrameSource
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import view_of
-from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import local_exr, read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.provenance.recipe import config_of, same_source, settings_of
 from perilune_render.terrain.cache import cached_scene
-from perilune_shared.config import resolve_over
+from perilune_shared.config.resolve import resolve_over
+from perilune_shared.console.interrupts import interrupts_held
+from perilune_shared.console.progress import Progress
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.names import ImageKind
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.nominal_trajectory import approach_deg
-from perilune_shared.interrupts import interrupts_held
-from perilune_shared.progress import Progress
 from perilune_shared.storage.locks import locked
 from perilune_shared.storage.png import png_header
 from perilune_shared.storage.store import Address, Store, open_store

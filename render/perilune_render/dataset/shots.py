@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from perilune_render.engines.frame_source import Shot
 from perilune_render.flight.plan import TrajectoryPlan
-from perilune_render.frame_source import Shot
 from perilune_render.streams import camera_seed
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.frames import matrix_from_quaternion

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike
 
-from perilune_render.config import DatasetConfig, InstrumentsConfig
+from perilune_render.config.dataset import DatasetConfig, InstrumentsConfig
 from perilune_render.flight.altimeter import measure_ranges, measure_ranges_of_frames
 from perilune_render.flight.inertial import measured, true_increments
 from perilune_render.flight.plan import ScenePlan, TrajectoryPlan

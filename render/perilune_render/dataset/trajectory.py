@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import pyarrow as pa
 
-from perilune_render.config import DatasetConfig, InstrumentsConfig
+from perilune_render.config.dataset import DatasetConfig, InstrumentsConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.real_ground import real_ground_share
 from perilune_render.dataset.shots import planned_shot
 from perilune_render.dataset.work import commit
+from perilune_render.engines.frame_source import Frame, FrameSource, Shot
 from perilune_render.flight.plan import TrajectoryPlan
-from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.imaging.darkness import is_dark
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.outputs.of_scene import SceneOutputs

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config import InstrumentsConfig
+from perilune_render.config.dataset import InstrumentsConfig
 from perilune_render.flight.motion import Motion
 from perilune_render.flight.trajectories import Flight
 from perilune_render.streams import stream

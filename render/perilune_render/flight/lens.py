@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from perilune_render.config_cameras import CameraConfig
+from perilune_render.config.cameras import CameraConfig
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 

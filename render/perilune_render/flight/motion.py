@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config import FlightConfig
+from perilune_render.config.dataset import FlightConfig
 from perilune_render.flight.smooth_process import SmoothProcess
 from perilune_render.streams import stream
 from perilune_shared.errors import UserError

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, KindConfig, SunConfig
+from perilune_render.config.dataset import DatasetConfig, KindConfig, SunConfig
 from perilune_render.flight.rig import MountedCamera, Rig, rig_of
 from perilune_render.flight.trajectories import Flight, fly
 from perilune_render.flight.view import rig_envelope

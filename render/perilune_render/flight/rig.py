@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_cameras import MountingConfig
+from perilune_render.config.cameras import MountingConfig
+from perilune_render.config.dataset import DatasetConfig, FlightConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.trajectories import Flight
 from perilune_shared.errors import UserError

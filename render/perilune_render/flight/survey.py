@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_survey import SurveyConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.survey import SurveyConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan
 from perilune_render.flight.rig import mounted
 from perilune_render.flight.trajectories import Flight

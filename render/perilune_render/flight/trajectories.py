@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config import FlightConfig
+from perilune_render.config.dataset import FlightConfig
 from perilune_render.flight.motion import Motion, draw_motion
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, quaternion_from_matrix
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_scene import HIGHEST_M, SceneConfig
+from perilune_render.config.dataset import DatasetConfig, FlightConfig
+from perilune_render.config.scene import HIGHEST_M, SceneConfig
 from perilune_render.flight.rig import Rig
 from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_shared.errors import UserError

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from perilune_render.imaging.radiance import Radiance
-from perilune_shared.progress import say
+from perilune_shared.console.progress import say
 
 _LEAST_SUNLIT = 0.01
 

@@ -5,11 +5,11 @@ phase angle. The reflectance factor is the radiance over that of a perfectly dif
 Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the plate lit from the zenith. The phase
 angle equals i + e in the principal plane only.
 
-`perilune_render.heightfield.light` has a compiled copy of Hapke's law; a test compares the bits.
+`perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law; a test compares the bits.
 
 Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
-that `perilune_render.blender.nodes` can call them with symbols and build shader nodes from the same code. Sources:
-docs/reference/sources.md.
+that `perilune_render.engines.blender.nodes` can call them with symbols and build shader nodes from the same code.
+Sources: docs/reference/sources.md.
 """
 
 from collections.abc import Callable

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from scipy.special import ive
 
-from perilune_render.config import SensorConfig
+from perilune_render.config.dataset import SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import resample, resample_nearest
 from perilune_render.streams import stream

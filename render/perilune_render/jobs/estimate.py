@@ -18,9 +18,9 @@ from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.run import MakeExecutor, RenderingFailed
 from perilune_render.jobs.work_list import WorkList
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.index import INDEX
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.progress import Progress
 from perilune_shared.storage.store import Address, open_store
 
 _N_FRAMES = 10

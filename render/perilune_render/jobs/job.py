@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.begin import new_info
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.provenance.recipe import recipe_of

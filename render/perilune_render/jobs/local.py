@@ -16,8 +16,8 @@ from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 from perilune_render.jobs.worker import Worker, start_worker
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.cgroups import memory_left_bytes
+from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
-from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
 from perilune_shared.threads import usable_cores
 

@@ -18,10 +18,10 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
 from perilune_render.jobs.worker import ONE_THREAD
-from perilune_render.processor import SETTINGS
+from perilune_render.provenance.processor import SETTINGS
+from perilune_shared.console.interrupts import interrupts_held
+from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError, ends_run
-from perilune_shared.interrupts import interrupts_held
-from perilune_shared.progress import say
 from perilune_shared.storage.store import Store
 
 

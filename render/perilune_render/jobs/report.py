@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 from perilune_render.imaging.darkness import warn_of_dark_frames
 from perilune_render.jobs.job import Job
+from perilune_shared.console.progress import Progress, say
 from perilune_shared.errors import one_line, shortened
-from perilune_shared.progress import Progress, say
 
 
 class Report:

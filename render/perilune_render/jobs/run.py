@@ -10,9 +10,9 @@ from perilune_render.jobs import records, steps
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import Progress
 from perilune_shared.storage.locks import remove_temporary_files
 from perilune_shared.storage.store import Address, Store, open_store
 

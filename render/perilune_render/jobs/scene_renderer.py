@@ -9,9 +9,9 @@ from perilune_render.dataset.begin import check_code
 from perilune_render.dataset.frame_files import file_columns
 from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import FOLDER, write_scene
-from perilune_render.engines import open_engine
+from perilune_render.engines.frame_source import FrameSource
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.pose_checks import check_trajectories
-from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.records import RunningRecord
 from perilune_render.labels.frame_labels import RimCircles
@@ -20,8 +20,8 @@ from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.preview.site_horizon import shadow_warnings
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
+from perilune_shared.console.interrupts import interrupts_held
 from perilune_shared.dataset.names import scene_file_path
-from perilune_shared.interrupts import interrupts_held
 from perilune_shared.storage.store import Store
 
 

@@ -109,7 +109,7 @@ def main() -> None:
 
 
 def _serve(connection: Connection, engine: str) -> None:
-    from perilune_render.engines import load_engine
+    from perilune_render.engines.open_engine import load_engine
     from perilune_render.jobs.scene_renderer import SceneRenderer
 
     load_engine(engine)

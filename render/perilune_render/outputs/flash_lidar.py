@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_outputs import FlashLidarConfig
-from perilune_render.frame_source import Shot
-from perilune_render.heightfield.query import first_returns
-from perilune_render.heightfield.surface import Surface
+from perilune_render.config.outputs import FlashLidarConfig
+from perilune_render.engines.frame_source import Shot
+from perilune_render.engines.heightfield.query import first_returns
+from perilune_render.engines.heightfield.surface import Surface
 from perilune_render.imaging.exr import channel_bytes
 from perilune_render.streams import stream
 from perilune_shared.geometry.camera import Camera

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_outputs import HazardConfig
-from perilune_render.heightfield.query import first_hits, heights_m
-from perilune_render.heightfield.surface import Surface
+from perilune_render.config.outputs import HazardConfig
+from perilune_render.engines.heightfield.query import first_hits, heights_m
+from perilune_render.engines.heightfield.surface import Surface
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.boulders import highest_points
 from perilune_render.terrain.grid import Grid

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_outputs import FlashLidarConfig
-from perilune_render.frame_source import Frame
-from perilune_render.heightfield.surface import Surface, surface_of
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.outputs import FlashLidarConfig
+from perilune_render.engines.frame_source import Frame
+from perilune_render.engines.heightfield.surface import Surface, surface_of
 from perilune_render.outputs.flash_lidar import flash
 from perilune_render.outputs.hazard import HazardMap, hazard_map
 from perilune_render.terrain.scene import Scene

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_scene import HIGHEST_M, SceneConfig, ViewConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.scene import HIGHEST_M, SceneConfig, ViewConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, seen_by
 from perilune_render.flight.pose_checks import ground_in_view
 from perilune_render.flight.rig import MountedCamera, Rig, rig_of

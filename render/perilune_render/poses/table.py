@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perilune_shared.config_errors import nearest
+from perilune_shared.config.errors import nearest
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 from perilune_shared.storage.tables.columns import Columns, Kind

@@ -5,14 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.real_ground import draw_outline, outline_m
 from perilune_render.dataset.shots import planned_shot
-from perilune_render.engines import open_engine
+from perilune_render.engines.frame_source import FrameSource
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.flight.pose_checks import check_trajectories
-from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.labels.drawing import draw_labels, enlarge, padded, write_sheet
 from perilune_render.labels.frame_labels import RimCircles
@@ -22,9 +22,9 @@ from perilune_render.preview.site_map import LARGEST_WIDTH, site_map
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import ElevationModel
 from perilune_render.terrain.scene import Scene, check_ground, model_of
+from perilune_shared.console.progress import say
 from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import SELECTIONS
-from perilune_shared.progress import say
 from perilune_shared.storage.files import write_bytes
 
 _N_FRAMES = 4

@@ -7,8 +7,8 @@ import numpy as np
 from scipy import ndimage
 
 from perilune_render.dataset.real_ground import outline_m
-from perilune_render.heightfield.query import first_hits
-from perilune_render.heightfield.surface import surface_of
+from perilune_render.engines.heightfield.query import first_hits
+from perilune_render.engines.heightfield.surface import surface_of
 from perilune_render.terrain.elevation.model import ElevationModel, raster_places
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.level_ground import averaged

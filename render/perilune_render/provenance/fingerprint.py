@@ -18,14 +18,13 @@ import perilune_shared
 
 FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
 """Folder of each package, by its name."""
-_SETTINGS = "perilune_render.config"
+_SETTINGS = "perilune_render.config."
 """Prefix of the modules of settings. Their values are in the recipe, so the hash omits defaults, bounds and checks."""
 _NO_EFFECT = (
     "perilune_render.provenance.caches",
-    "perilune_shared.interrupts",
-    "perilune_shared.config",
+    "perilune_shared.config.",
+    "perilune_shared.console.",
     "perilune_shared.errors",
-    "perilune_shared.progress",
     "perilune_shared.storage.files",
 )
 """Modules that read settings, store results, or report errors and progress, and so change no result."""

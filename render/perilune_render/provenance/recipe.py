@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from perilune_render.config import DatasetConfig, SensorConfig
-from perilune_render.config_terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig
+from perilune_render.config.dataset import DatasetConfig, SensorConfig
+from perilune_render.config.terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig
 from perilune_render.provenance.versions import all_versions, ground_versions
-from perilune_shared.config import resolve_over
+from perilune_shared.config.resolve import resolve_over
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError

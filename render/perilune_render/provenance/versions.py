@@ -5,10 +5,10 @@ from importlib import metadata
 
 import perilune_render
 import perilune_shared
-from perilune_render import processor
+from perilune_render.provenance import processor
 from perilune_render.provenance.caches import kept_fingerprint
 
-_SETTINGS = "perilune_render.processor:SETTINGS"
+_SETTINGS = "perilune_render.provenance.processor:SETTINGS"
 GROUND = (
     _SETTINGS,
     "perilune_render.flight.view:rig_envelope",
@@ -16,11 +16,11 @@ GROUND = (
     "perilune_render.terrain.scene:grow_scene",
 )
 """Code that generates ground, craters and boulders."""
-RENDERING = (_SETTINGS, "perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
+RENDERING = (_SETTINGS, "perilune_render.flight.plan:make_plan", "perilune_render.engines.blender.renderer:Renderer")
 """Code that plans trajectories and renders radiance."""
 IMAGING = (
     _SETTINGS,
-    "perilune_render.frame_source:",
+    "perilune_render.engines.frame_source:",
     "perilune_render.dataset.shots:",
     "perilune_render.dataset.frame_files:frame_contents",
     "perilune_render.dataset.tables:",
@@ -38,7 +38,7 @@ LIBRARIES = {
     "trimesh": ("trimesh", "trimesh"),
 }
 """Recorded name and distribution of each library that affects results, by import name."""
-RAYS = (*RENDERING[:2], "perilune_render.heightfield.engine:HeightfieldEngine")
+RAYS = (*RENDERING[:2], "perilune_render.engines.heightfield.engine:HeightfieldEngine")
 """Code that plans trajectories and renders radiance with the engine `heightfield`."""
 OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune_render.outputs.hazard_raster:")
 """Code that makes hazard maps and images of the flash lidar."""

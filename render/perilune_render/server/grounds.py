@@ -8,8 +8,8 @@ import queue
 import threading
 from collections.abc import Callable
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.scene import SceneConfig
 from perilune_render.flight.plan import ScenePlan, drawn_scene
 from perilune_render.server.world import World
 from perilune_render.terrain.cache import cached_scene

@@ -7,27 +7,27 @@ from functools import cached_property
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables
-from perilune_render.engines import open_engine
+from perilune_render.engines.frame_source import Frame, FrameSource, Shot
+from perilune_render.engines.heightfield.query import first_hits, heights_m
+from perilune_render.engines.heightfield.surface import Surface, surface_of
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS, Poses, check_places, check_poses
 from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
-from perilune_render.frame_source import Frame, FrameSource, Shot
-from perilune_render.heightfield.query import first_hits, heights_m
-from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.poses.plan import scene_seed
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.scene import Scene, check_ground
+from perilune_shared.console.progress import say
 from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, sun_direction
-from perilune_shared.progress import say
 
 _MOST_SOURCES = 8
 _PREPARED_AT_M = 500.0
@@ -124,7 +124,7 @@ class World:
         check_poses(_poses(view.position_m, view.rotation_camera_from_site), pinhole, self.scene, "request")
 
     def hits(self, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
-        """Distances (N,) and normals (N, 3) of the first hits (`perilune_render.heightfield.query.first_hits`)."""
+        """Distances (N,) and normals (N, 3) of the first hits (`heightfield.query.first_hits`)."""
         return first_hits(self.surface, origins_m, directions, boulders=boulders)
 
     def heights_m(self, x_m: Array, y_m: Array, *, boulders: bool = True) -> Array:

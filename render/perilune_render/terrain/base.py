@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_terrain import ReliefConfig, TerrainConfig
+from perilune_render.config.terrain import ReliefConfig, TerrainConfig
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.craters.profile import REACH
 from perilune_render.terrain.elevation.model import (

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from perilune_render.config_terrain import BouldersConfig
+from perilune_render.config.terrain import BouldersConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.grid import Grid

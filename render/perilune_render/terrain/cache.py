@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.provenance.caches import cache_home
 from perilune_render.provenance.versions import ground_versions
 from perilune_render.terrain.boulders import Boulders

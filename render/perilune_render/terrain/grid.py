@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_terrain import TerrainConfig
+from perilune_render.config.terrain import TerrainConfig
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.errors import UserError

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from perilune_render.config_terrain import BouldersConfig
+from perilune_render.config.terrain import BouldersConfig
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import corners

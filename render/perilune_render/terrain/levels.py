@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_terrain import LARGEST_SPACING_PX, TerrainConfig
+from perilune_render.config.terrain import LARGEST_SPACING_PX, TerrainConfig
 from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_render.terrain.grid import Grid, graded_grid, grid_of
 from perilune_shared.errors import UserError

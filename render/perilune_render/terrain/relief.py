@@ -8,7 +8,7 @@ place.
 
 import numpy as np
 
-from perilune_render.config_terrain import ReliefConfig
+from perilune_render.config.terrain import ReliefConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import RMS_SLOPE, add_waves

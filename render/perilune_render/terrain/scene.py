@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig
-from perilune_render.config_terrain import TerrainConfig
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.terrain import TerrainConfig
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.base import base_of
 from perilune_render.terrain.boulders import Boulders, check_boulders, draw_boulders
@@ -27,9 +27,9 @@ from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.levels import check_levels
 from perilune_render.terrain.relief import check_waves
+from perilune_shared.console.progress import say
 from perilune_shared.geometry.curvature import drop_m
 from perilune_shared.geometry.frames import Array
-from perilune_shared.progress import say
 
 _ROUGHNESS_M = 100.0
 """Wavelength below which relief is added on top of the craters, metres."""

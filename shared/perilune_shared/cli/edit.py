@@ -5,9 +5,9 @@ from typing import Annotated
 import typer
 
 import perilune_shared as ps
+from perilune_shared.console.terminal import answer, answer_table, progress_bar
 from perilune_shared.dataset.names import ImageChoice, ImageMode, SplitUnit
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import answer, answer_table, progress_bar
 
 EXIT_DIFFERENT = 1
 

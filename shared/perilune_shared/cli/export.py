@@ -6,8 +6,8 @@ import typer
 
 import perilune_shared as ps
 from perilune_shared.cli.edit import DatasetArgument, LinkOption
+from perilune_shared.console.terminal import answer, progress_bar
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import answer, progress_bar
 
 ExportFormat = Literal["coco", "yolo", "tum", "kitti", "croissant", "huggingface"]
 _WITH_LABELS = ("coco", "yolo", "huggingface")
@@ -45,7 +45,7 @@ def export(
     link: LinkOption = False,
 ) -> None:
     """Write labels, trajectories or metadata in formats of other tools."""
-    from perilune_shared.config_errors import nearest
+    from perilune_shared.config.errors import nearest
     from perilune_shared.dataset.keys import check_keys
     from perilune_shared.dataset.names import SPLITS
     from perilune_shared.export.coco import export_coco

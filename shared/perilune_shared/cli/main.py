@@ -10,9 +10,9 @@ import typer
 import perilune_shared as ps
 from perilune_shared.cli import edit, export
 from perilune_shared.cli.edit import DatasetArgument
-from perilune_shared.command_line import new_program, run_command_line
+from perilune_shared.console.command_line import new_program, run_command_line
+from perilune_shared.console.terminal import answer, answer_table, progress_bar
 from perilune_shared.errors import EXIT_USER_ERROR, one_line, shortened
-from perilune_shared.terminal import answer, answer_table, progress_bar
 
 app = new_program(
     "perilune-manifest",

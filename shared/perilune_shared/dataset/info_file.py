@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from perilune_shared.config_errors import expected_of, formatted
+from perilune_shared.config.errors import expected_of, formatted
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError, shortened

@@ -2,12 +2,12 @@
 
 import pyarrow as pa
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.editing.rewrite import check_source
 from perilune_shared.editing.writer import new_dataset, with_column
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.png import png_header
 from perilune_shared.storage.store import Address
 

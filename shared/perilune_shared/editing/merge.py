@@ -5,6 +5,7 @@ from collections.abc import Container, Sequence
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.manifest import Dataset, check_single
 from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.dataset.names import SCENE_FILE_KINDS, ImageMode, frame_id_of
@@ -13,7 +14,6 @@ from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.rewrite import check_source, state_of, without_derived_rows
 from perilune_shared.editing.writer import SceneTables, check_scene, new_dataset, of_trajectories, with_column
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address
 
 _TERRAIN_TABLES = ("scenes", "craters", "boulders")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.info_file import INFO_NAME, checked_info, read_object
 from perilune_shared.dataset.manifest import Dataset
@@ -18,7 +19,6 @@ from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.editing.writer import new_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address, Store, open_store
 
 _ADDED_IN_4 = {"labels": ("scene_id", "split")}

@@ -6,6 +6,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import SCENE_FILE_KINDS, SPLITS
@@ -15,7 +16,6 @@ from perilune_shared.dataset.schema import TABLES
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.editing.writer import DatasetWriter, new_dataset, with_column, with_new_paths
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address
 
 MOST_FRAMES_WRITTEN = 100_000

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.keys import check_keys
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
@@ -11,7 +12,6 @@ from perilune_shared.dataset.names import ImageMode, ImageState
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.writer import SceneTables, new_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address, Store, open_store
 from perilune_shared.validation.files import check_files
 

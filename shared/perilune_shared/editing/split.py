@@ -3,13 +3,13 @@
 import numpy as np
 import pyarrow as pa
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import ImageMode, SplitUnit
 from perilune_shared.editing.flights import terrains_and_flights
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.editing.writer import SceneTables, with_column
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address
 
 

@@ -7,13 +7,13 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.expression import Condition, columns_of
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import ImageMode
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.editing.writer import SceneTables
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.index import index_rows, read_index, seal
 from perilune_shared.dataset.info_file import INFO_NAME, read_info
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.parts import Written
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.locks import locked
 from perilune_shared.storage.store import Store, open_store

@@ -12,6 +12,7 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
@@ -23,7 +24,6 @@ from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.export.citation import citation_of
 from perilune_shared.export.foreign_text import code_span
 from perilune_shared.export.stats import summary
-from perilune_shared.progress import Progress
 
 CARD_NAME = "README.md"
 _PICTURE_NAME = "card.png"

@@ -7,11 +7,11 @@ installation; the tests read the head with it.
 
 from typing import Any
 
+from perilune_shared.config.yaml_text import to_yaml_text
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import FOLDER, shards_of
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.yaml_text import to_yaml_text
 
 _TASKS = {"detect": "object-detection", "nav": "other"}
 _HUB_LICENCES = {

@@ -13,13 +13,13 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import SceneRows, by_selection, scenes_of
 from perilune_shared.labels.thresholds import SELECTIONS
-from perilune_shared.progress import Progress
 from perilune_shared.storage.png import png_header
 
 if TYPE_CHECKING:

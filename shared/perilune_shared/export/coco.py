@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import (
@@ -24,7 +25,6 @@ from perilune_shared.export.rows import (
     frame_sizes,
     scenes_of,
 )
-from perilune_shared.progress import Progress
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
@@ -22,7 +23,6 @@ from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, OPTIONAL_TABLES,
 from perilune_shared.errors import UserError
 from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.citation import citation_of, table_hashes
-from perilune_shared.progress import NO_PROGRESS, Progress
 
 CROISSANT_NAME = "croissant.json"
 # mlcroissant does not support the registered media type, application/vnd.apache.parquet.

@@ -13,13 +13,13 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import IMAGE_KINDS, SPLITS
 from perilune_shared.dataset.packed import IMAGE, LABEL, features_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.export.card_head import head_of
 from perilune_shared.export.rows import Choice, SceneRows, count_frames, scenes_of
-from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address

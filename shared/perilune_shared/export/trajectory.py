@@ -13,10 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.export.rows import count_scenes, scenes_of
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
-from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address

@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.export.coco import are_in_image
 from perilune_shared.export.rows import Choice, clipped_boxes, count_scenes, frame_sizes, scenes_of
-from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from perilune_shared.config.yaml_text import parse_yaml
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import NO_DISTORTION, Camera, Distortion
 from perilune_shared.geometry.frames import Array
-from perilune_shared.yaml_text import parse_yaml
 
 _LARGEST_FILE_BYTES = 100_000
 _MATRIX = ("camera_matrix", "k", "cameramatrix", "intrinsic_matrix", "m1", "mtx")

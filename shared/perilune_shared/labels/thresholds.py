@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from perilune_shared.config import Section
+from perilune_shared.config.resolve import Section
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, le=1e9)]

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
+from perilune_shared.console.interrupts import unfinished
 from perilune_shared.errors import UserError
-from perilune_shared.interrupts import unfinished
 from perilune_shared.storage.locks import lock
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")

@@ -19,8 +19,8 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from perilune_shared.console.interrupts import interrupts_held, unfinished
 from perilune_shared.errors import UserError
-from perilune_shared.interrupts import interrupts_held, unfinished
 
 LOCK_NAME = ".perilune.lock"
 """Lock file in a folder that is written in place."""

@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset import index
 from perilune_shared.dataset.index import INDEX, read_index
 from perilune_shared.dataset.info_file import INFO_NAME, has_own_hash, read_info
@@ -19,7 +20,6 @@ from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SUFFIXES, ImageKind, SceneFileKind
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE
 from perilune_shared.validation.faults import MOST_OF_COLUMN, Fault, FaultList, more_faults
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pyarrow as pa
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.names import IMAGE_KINDS
 from perilune_shared.errors import UserError
-from perilune_shared.progress import Progress
 from perilune_shared.storage.png import png_header
 from perilune_shared.validation.faults import Fault
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.packed import FOLDER, open_shard, packed_rows, shard_name, split_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError
-from perilune_shared.progress import Progress
 from perilune_shared.validation.faults import Fault
 from perilune_shared.validation.images import png_faults
 

@@ -12,13 +12,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.dataset.manifest import Dataset, count_rows
 from perilune_shared.dataset.names import SCENE_FILE_KINDS, is_whole
 from perilune_shared.dataset.schema import KEYS, OPTIONAL_TABLES, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
-from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.validation.cameras import camera_faults
 from perilune_shared.validation.faults import Fault, FaultList, part_faults
 from perilune_shared.validation.files import file_faults

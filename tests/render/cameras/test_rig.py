@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from perilune_render.config_cameras import CameraConfig
+from perilune_render.config.cameras import CameraConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.rig import MountedCamera
+from perilune_render.flight.sub_poses import moved
 from perilune_render.flight.trajectories import Flight
-from perilune_render.sub_poses import moved
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import (
     matrix_from_quaternion,

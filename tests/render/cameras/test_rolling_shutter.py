@@ -7,8 +7,8 @@ import pytest
 from tests.helpers import in_process
 
 from perilune_render.cli.main import main
+from perilune_render.flight.sub_poses import moved, row_times_s
 from perilune_render.imaging.exr import read_exr
-from perilune_render.sub_poses import moved, row_times_s
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.camera import camera_from_site
 from perilune_shared.geometry.frames import matrix_from_quaternion

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import KindConfig
+from perilune_render.config.dataset import KindConfig
 from perilune_render.flight.counterfactual import choose_apart, part_of
 from perilune_render.flight.plan import make_plan
 from perilune_shared.errors import UserError

@@ -8,14 +8,14 @@ from rich.progress import Progress
 from tests.helpers.drawn_dataset import build_dataset
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import KindConfig
-from perilune_render.config_terrain import TerrainConfig
+from perilune_render.config.dataset import KindConfig
+from perilune_render.config.terrain import TerrainConfig
 from perilune_render.dataset.begin import begin_or_resume, new_info
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.regenerate import png_outlier_share, regenerate
 from perilune_render.flight.plan import make_plan
 from perilune_render.jobs import steps
-from perilune_render.jobs.here import Here
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source

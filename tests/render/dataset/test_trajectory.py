@@ -6,11 +6,11 @@ import pytest
 from tests.helpers.flat_engine import FlatEngine
 from tests.helpers.scenes import config_with, flat_scene, round_craters
 
-from perilune_render.config import CameraConfig, KindConfig
+from perilune_render.config.dataset import CameraConfig, KindConfig
 from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import committed
+from perilune_render.engines.frame_source import FrameSource
 from perilune_render.flight.plan import make_plan
-from perilune_render.frame_source import FrameSource
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.storage.store import open_store

@@ -18,7 +18,7 @@ def from_name(name):
 metadata.Distribution.from_name = from_name
 sys.modules["bpy"] = None
 try:
-    import perilune_render.blender.renderer
+    import perilune_render.engines.blender.renderer
 except ImportError:
     from perilune_render.cli.main import main
     main()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from tests.sampling import every
 
-from perilune_render.config import FlightConfig
+from perilune_render.config.dataset import FlightConfig
 from perilune_render.flight.inertial import GRADES, measured, true_increments
 from perilune_render.flight.motion import draw_motion
 from perilune_shared.geometry.frames import matrix_from_rotation_vector

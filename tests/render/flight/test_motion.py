@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_render.config import FlightConfig
+from perilune_render.config.dataset import FlightConfig
 from perilune_render.flight.motion import draw_motion
 from perilune_shared.errors import UserError
 

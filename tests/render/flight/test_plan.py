@@ -6,8 +6,8 @@ from tests.helpers import in_process
 from tests.helpers.scenes import config_with
 
 from perilune_render.cli.main import main
-from perilune_render.config import KindConfig
-from perilune_render.config_cameras import CameraConfig, DistortionConfig
+from perilune_render.config.cameras import CameraConfig, DistortionConfig
+from perilune_render.config.dataset import KindConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.plan import make_plan
 from perilune_render.streams import derived_seed, stream
@@ -80,8 +80,8 @@ def test_a_plan_of_ten_million_frames_draws_a_flight_when_it_is_used():
 
 
 def test_the_papers_protocol_has_its_numbers():
-    from perilune_render.config import DatasetConfig
-    from perilune_shared.config import resolve
+    from perilune_render.config.dataset import DatasetConfig
+    from perilune_shared.config.resolve import resolve
 
     config = resolve(DatasetConfig, "dataset", "perilune_render", "paper")
     assert (config.detect.n_scenes, config.detect.trajectories_per_scene, config.detect.n_frames) == (1, 343, 100)

@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.scenes import config_with, flat_scene
 
 from perilune_render.cli.main import main
-from perilune_render.config import KindConfig
+from perilune_render.config.dataset import KindConfig
+from perilune_render.engines.heightfield.query import heights_m
+from perilune_render.engines.heightfield.surface import surface_of
 from perilune_render.flight import pose_checks
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.flight.trajectories import fly
-from perilune_render.heightfield.query import heights_m
-from perilune_render.heightfield.surface import surface_of
 from perilune_render.terrain.boulders import Boulders, tops_m
 from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError

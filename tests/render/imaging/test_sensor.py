@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perilune_render.config import SensorConfig
+from perilune_render.config.dataset import SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import FixedPattern, develop, expected, expose, motion_px, psf_kernel
 from perilune_shared.geometry.camera import Camera

@@ -3,11 +3,11 @@
 import pytest
 from rich.progress import Progress
 
-from perilune_render.config import DatasetConfig
-from perilune_render.jobs.here import Here
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 
 # What processes, shards and stores do to a rendering does not depend on its engine. test_other_processor.py and
 # test_render.py compare datasets that Blender rendered in several processes.

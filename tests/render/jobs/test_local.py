@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from perilune_render.dataset.work import committed
 from perilune_render.jobs import local, worker
-from perilune_render.jobs.here import Here
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.local import LocalWorkers
 from perilune_render.jobs.run import RenderingFailed, render_job
 from perilune_render.jobs.scene_renderer import SceneRenderer

@@ -13,7 +13,7 @@ from tests.helpers import in_process
 
 from perilune_render.cli.main import main
 from perilune_render.jobs.estimate import estimate
-from perilune_render.jobs.here import Here
+from perilune_render.jobs.in_process import Here
 from perilune_render.jobs.run import Shard
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")

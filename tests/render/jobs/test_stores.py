@@ -10,11 +10,11 @@ from tests.helpers.flat_engine import FlatEngine
 from tests.helpers.scenes import config_with, flat_scene, round_craters
 
 from perilune_render.cli.main import main
-from perilune_render.config import CameraConfig, KindConfig
+from perilune_render.config.dataset import CameraConfig, KindConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import write_scene
-from perilune_render.frame_source import FrameSource
+from perilune_render.engines.frame_source import FrameSource
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.local import LocalWorkers
 from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard

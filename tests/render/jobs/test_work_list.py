@@ -3,7 +3,7 @@
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import KindConfig
+from perilune_render.config.dataset import KindConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 

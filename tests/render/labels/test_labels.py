@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perilune_render.config import LabelsConfig, SensorConfig
+from perilune_render.config.dataset import LabelsConfig, SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
 from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast

@@ -10,7 +10,7 @@ import yaml
 from tests.helpers import in_process
 
 from perilune_render.cli.main import main
-from perilune_render.config_outputs import FlashLidarConfig
+from perilune_render.config.outputs import FlashLidarConfig
 from perilune_render.imaging.exr import CHANNELS, read_exr
 from perilune_render.outputs.flash_lidar import lidar_camera
 from perilune_shared.dataset.manifest import open_dataset

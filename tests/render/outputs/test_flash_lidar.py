@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from tests.helpers.scenes import flat_scene
 
-from perilune_render.config_outputs import FlashLidarConfig
-from perilune_render.frame_source import Shot
-from perilune_render.heightfield.surface import surface_of
+from perilune_render.config.outputs import FlashLidarConfig
+from perilune_render.engines.frame_source import Shot
+from perilune_render.engines.heightfield.surface import surface_of
 from perilune_render.imaging.exr import read_exr
 from perilune_render.outputs.flash_lidar import flash, lidar_camera
 

@@ -8,9 +8,9 @@ import rasterio
 from pydantic import ValidationError
 from tests.helpers.scenes import flat_scene
 
-from perilune_render.config_outputs import HazardConfig
-from perilune_render.heightfield.query import heights_m
-from perilune_render.heightfield.surface import surface_of
+from perilune_render.config.outputs import HazardConfig
+from perilune_render.engines.heightfield.query import heights_m
+from perilune_render.engines.heightfield.surface import surface_of
 from perilune_render.outputs.hazard import LAYERS, check_hazard, hazard_map
 from perilune_render.outputs.hazard_raster import hazard_tiff
 from perilune_render.terrain.boulders import Boulders, highest_points

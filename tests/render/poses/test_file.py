@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from tests.helpers.scenes import config_with, flat_scene
 
-from perilune_render.config_scene import SceneConfig, ViewConfig
+from perilune_render.config.scene import SceneConfig, ViewConfig
 from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.poses.file import read_poses
 from perilune_render.poses.plan import given_plan

@@ -10,7 +10,7 @@ from tests.helpers import in_process
 from tests.helpers.scenes import config_with
 
 from perilune_render.cli.main import main
-from perilune_render.config_scene import SceneConfig, ViewConfig
+from perilune_render.config.scene import SceneConfig, ViewConfig
 from perilune_render.poses.file import read_poses
 from perilune_render.poses.plan import given_plan
 from perilune_shared.dataset.manifest import open_dataset

@@ -8,14 +8,14 @@ from tests.helpers import in_process
 from tests.helpers.scenes import config_with
 
 from perilune_render.cli.main import main
-from perilune_render.config import RenderConfig, SensorConfig
-from perilune_render.config_scene import SceneConfig, ViewConfig
-from perilune_render.config_terrain import BouldersConfig, CratersConfig, ReliefConfig, TerrainConfig
-from perilune_render.config_values import Span
-from perilune_render.engines import open_engine
+from perilune_render.config.dataset import RenderConfig, SensorConfig
+from perilune_render.config.scene import SceneConfig, ViewConfig
+from perilune_render.config.terrain import BouldersConfig, CratersConfig, ReliefConfig, TerrainConfig
+from perilune_render.config.values import Span
+from perilune_render.engines.frame_source import FrameSource, Shot
+from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.flight.view import scene_view
-from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.imaging.exr import read_radiance
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expose

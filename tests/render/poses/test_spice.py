@@ -23,11 +23,11 @@ from tests.render.poses.spice_kernels import (
 )
 
 from perilune_render.cli.main import main
+from perilune_render.flight.sub_poses import moved
 from perilune_render.poses import spice as spice_module
 from perilune_render.poses.axes import camera_axes
 from perilune_render.poses.file import read_poses
 from perilune_render.poses.spice import SpiceSource
-from perilune_render.sub_poses import moved
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_quaternion

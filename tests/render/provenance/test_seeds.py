@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig, KindConfig, SunConfig
-from perilune_render.config_terrain import BouldersConfig, TerrainConfig
+from perilune_render.config.dataset import CameraConfig, DatasetConfig, FlightConfig, KindConfig, SunConfig
+from perilune_render.config.terrain import BouldersConfig, TerrainConfig
 from perilune_render.dataset.begin import new_info
 from perilune_render.dataset.from_manifest import plan_from_manifest
 from perilune_render.dataset.tables import ground_tables
@@ -15,7 +15,7 @@ from perilune_render.flight.plan import make_plan
 from perilune_render.flight.view import view_envelope
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.config import PRESETS, resolve
+from perilune_shared.config.resolve import PRESETS, resolve
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import recipes_of

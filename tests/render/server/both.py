@@ -9,8 +9,8 @@ from tests.render.server.conftest import FIELD_OF_VIEW_DEG, SIZE, Client
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.native.serve import Native
-from perilune_render.server.pangu_serve import greets, serve_pangu
-from perilune_render.server.pangu_session import Session
+from perilune_render.server.pangu.serve import greets, serve_pangu
+from perilune_render.server.pangu.session import Session
 from perilune_render.server.serve import Interface, Limits, Server
 from perilune_shared.client import SceneClient
 from perilune_shared.geometry.frames import sun_direction

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import CameraConfig, RenderConfig
-from perilune_render.config_scene import SceneConfig, ViewConfig
-from perilune_render.config_terrain import TerrainConfig
+from perilune_render.config.dataset import CameraConfig, RenderConfig
+from perilune_render.config.scene import SceneConfig, ViewConfig
+from perilune_render.config.terrain import TerrainConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import scene_view
 from perilune_render.poses.plan import scene_seed, trajectory_seed
-from perilune_render.server.pangu_serve import greets, serve_pangu
-from perilune_render.server.pangu_session import Conventions, Session
+from perilune_render.server.pangu.serve import greets, serve_pangu
+from perilune_render.server.pangu.session import Conventions, Session
 from perilune_render.server.serve import Interface, Limits, Server
 from perilune_render.server.world import World
 from perilune_render.terrain.scene import grow_scene

@@ -5,8 +5,8 @@ import pytest
 from tests.helpers.scenes import config_with
 from tests.render.poses.test_horizon import SMOOTH, level_view
 
-from perilune_render.config import CameraConfig, RenderConfig
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config.dataset import CameraConfig, RenderConfig
+from perilune_render.config.scene import SceneConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import view_envelope
 from perilune_render.server.world import View, open_world

@@ -4,7 +4,7 @@ import trimesh
 from scipy.spatial import KDTree
 from tests.helpers.scenes import round_craters
 
-from perilune_render.config_terrain import BouldersConfig, CratersConfig
+from perilune_render.config.terrain import BouldersConfig, CratersConfig
 from perilune_render.terrain.boulders import boulder_mesh, draw_boulders, rock
 from perilune_render.terrain.craters.population import draw_craters
 from perilune_render.terrain.grid import Grid

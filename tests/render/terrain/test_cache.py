@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import FlightConfig
+from perilune_render.config.dataset import FlightConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.terrain import cache
 from perilune_render.terrain.scene import grow_scene

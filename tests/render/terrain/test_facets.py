@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.terrain.cache import cached_scene
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.geometry.camera import camera_from_site
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import FlightConfig
+from perilune_render.config.dataset import FlightConfig
 from perilune_render.flight.trajectories import fly
 from perilune_render.flight.view import reach_m, view_envelope
 from perilune_render.terrain.envelope import ViewEnvelope

@@ -7,9 +7,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_terrain import CratersConfig
-from perilune_render.config_values import Span
+from perilune_render.config.dataset import DatasetConfig, FlightConfig
+from perilune_render.config.terrain import CratersConfig
+from perilune_render.config.values import Span
 from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.craters.population import ORIGINS, draw_craters
 from perilune_render.terrain.craters.profile import REACH, crest_radius, profile_tables, wear_row
@@ -17,7 +17,7 @@ from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_render.terrain.size_frequency import EQUILIBRIA, Minimum, NeukumProduction
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.geometry.camera import Camera
 
 EVEN = Grid.even(1500, 1500)

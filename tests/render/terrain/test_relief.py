@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_render.config_terrain import ReliefConfig
+from perilune_render.config.terrain import ReliefConfig
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import RMS_SLOPE, add_waves
 from perilune_render.terrain.relief import add_relief

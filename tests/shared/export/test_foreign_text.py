@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 from tests.helpers.pages import Elements, shown
 
-from perilune_shared import terminal
+from perilune_shared.console import terminal
 from perilune_shared.export.foreign_text import code_span, for_csv, for_html, for_markdown, write_csv
 
 HOSTILE = [

@@ -174,7 +174,7 @@ def test_a_missing_bucket_is_an_error_of_one_line(s3_environment):
 
 _READ = """
 import sys
-from perilune_shared.command_line import run_command_line
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.storage.store import open_store
 run_command_line(lambda: print(open_store(sys.argv[1]).read("a.txt")))
 """

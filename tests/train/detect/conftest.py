@@ -2,7 +2,7 @@
 
 import pytest
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.run import run_detect
 from perilune_train.training.runs import RunFolder

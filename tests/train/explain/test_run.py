@@ -14,10 +14,9 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.labels.selection import read_labels, selected
 from perilune_shared.labels.thresholds import SELECTIONS
-from perilune_train.cli import main
-from perilune_train.detect.cli.evaluate import config_of_run
+from perilune_train.cli.detect import config_of_run
+from perilune_train.cli.main import main
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.evaluation.provenance import training_provenance
 from perilune_train.explain import run as explained
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.tables import TABLES
@@ -26,6 +25,7 @@ from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.page.pictures import CAPTIONS
 from perilune_train.explain.run import explain_run
 from perilune_train.models.navigator import StackNavigator
+from perilune_train.records.provenance import training_provenance
 from perilune_train.shipped.models import shipped_run
 from perilune_train.training.runs import RunFolder, save_weights
 

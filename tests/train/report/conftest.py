@@ -12,12 +12,12 @@ from PIL import Image
 from tests.helpers import in_process
 from tests.helpers.drawn_dataset import build_dataset
 
-from perilune_shared.command_line import run_command_line
-from perilune_shared.config import to_yaml
+from perilune_shared.config.resolve import to_yaml
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_train.cli.report import report as report_of_command_line
 from perilune_train.detect.config import DetectConfig
-from perilune_train.evaluation.metrics_file import write_metrics
-from perilune_train.report.command import report as report_of_command_line
+from perilune_train.records.metrics_file import write_metrics
 from perilune_train.report.content import Report
 from perilune_train.report.page import SUMMARY, gather, html_of
 from perilune_train.report.summary import summary_of

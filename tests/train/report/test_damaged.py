@@ -9,12 +9,12 @@ import pytest
 from tests.train.report.conftest import report_command
 
 from perilune_shared.errors import UserError
-from perilune_train.paper.detections import read_detections
 from perilune_train.report.detection import detection_section
 from perilune_train.report.explanation import explanation_section
 from perilune_train.report.frames import read_masks
 from perilune_train.report.navigation import navigation_section
 from perilune_train.report.page import write_report
+from perilune_train.report.paper.detections import read_detections
 from perilune_train.report.sources import read_run
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from tests.train.report.conftest import make_data, make_runs
 
-from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.records.metrics_file import write_metrics
 from perilune_train.report.content import Report
 from perilune_train.report.page import gather
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from perilune_train.evaluation.metrics_file import write_metrics
-from perilune_train.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
+from perilune_train.records.metrics_file import write_metrics
 from perilune_train.report.content import Report, Section
 from perilune_train.report.page import gather, html_of
+from perilune_train.report.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
 
 
 def section(report: Report, key: str) -> Section:

@@ -2,9 +2,9 @@
 
 import pytest
 
-from perilune_shared.config import Section
+from perilune_shared.config.resolve import Section
 from perilune_shared.errors import UserError
-from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training import begin as begin_module
 from perilune_train.training.begin import check_settings, hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder

@@ -13,11 +13,11 @@ import torch
 from torch import nn
 
 import perilune_train
-from perilune_shared.config import Section
+from perilune_shared.config.resolve import Section
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 from perilune_train.data.epochs import EpochBatches, batch_loader
-from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training import fit as fitting
 from perilune_train.training import runs
 from perilune_train.training.begin import start_run

@@ -12,10 +12,10 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.png import png_header
-from perilune_shared.terminal import progress_bar
 from perilune_shared.threads import usable_cores
 from perilune_train.data.shares import ALONE, Share
 

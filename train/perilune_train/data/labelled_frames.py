@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils import data as torch_data
 
-from perilune_shared.config_errors import nearest
+from perilune_shared.config.errors import nearest
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
 from perilune_shared.dataset.manifest import Dataset, check_single
 from perilune_shared.dataset.names import SPLITS

@@ -11,11 +11,11 @@ from perilune_shared.storage.tables.read import read_table
 from perilune_train.detect.evaluate.figures import draw_curves
 from perilune_train.detect.evaluate.metrics import Curve
 from perilune_train.detect.evaluate.report import CURVE_FILE
-from perilune_train.evaluation.markdown import number, table, write_markdown
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
-from perilune_train.evaluation.provenance import Status, TerrainCheck
-from perilune_train.evaluation.spread import read_spread
+from perilune_train.records.markdown import number, table, write_markdown
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
+from perilune_train.records.provenance import Status, TerrainCheck
+from perilune_train.records.spread import read_spread
 
 _COLUMNS = {
     "ap50_paper": "AP",

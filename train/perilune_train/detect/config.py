@@ -4,8 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from perilune_shared.config import Section
-from perilune_shared.config_errors import nearest
+from perilune_shared.config.errors import nearest
+from perilune_shared.config.resolve import Section
 from perilune_shared.labels.thresholds import SELECTIONS, Selection
 from perilune_train.config import Attention, Count, Device, Epochs, Fraction, Precision, Rate, Seed, Strategy, Weight
 

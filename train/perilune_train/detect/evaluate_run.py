@@ -20,9 +20,9 @@ from perilune_train.detect.finished_run import check_output, chosen_threshold
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_split
 from perilune_train.detect.train.threshold import threshold_on_validation
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import read_metrics, write_metrics
-from perilune_train.evaluation.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import read_metrics, write_metrics
+from perilune_train.records.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
 from perilune_train.training import runs
 
 

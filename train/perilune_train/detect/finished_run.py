@@ -3,10 +3,10 @@
 import math
 from pathlib import Path
 
-from perilune_shared.config import parse_setting, read_config_file, resolve_over
+from perilune_shared.config.resolve import parse_setting, read_config_file, resolve_over
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
+from perilune_train.records.metrics_file import METRICS_FILE, read_metrics
 
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from perilune_shared.config import Section
+from perilune_shared.config.resolve import Section
 from perilune_train.config import Device, Seed
 
 _Several = Annotated[int, Field(ge=2, le=100_000)]

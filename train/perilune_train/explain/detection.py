@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from perilune_shared.terminal import say
+from perilune_shared.console.terminal import say
 from perilune_train.data.frames import normalised
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.inference.detector import Detector

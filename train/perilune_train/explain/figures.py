@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.explain.evidence.removal import removal_summary
 from perilune_train.explain.evidence.tables import Evidence
 from perilune_train.explain.page.correlation_claims import beating_gates
 from perilune_train.explain.page.intervention_claims import forced_harm, removal_row
+from perilune_train.records.metrics_file import Metrics
 
 _COUNTED = {"detect": ("pcc1_craterness", "pcc1_partial"), "navigate": ("pcc4", "pcc4_minus_pcc3")}
 """Measures whose gates that beat every null are counted, by task."""

@@ -13,7 +13,7 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.explain.correlation.ground_truth import ground_truth_mask
 from perilune_train.explain.correlation.homography import true_homography
-from perilune_train.navigate.data import trajectories as navigation
+from perilune_train.motion.data import trajectories as navigation
 
 RUN_PAIRS = 8
 """Consecutive pairs of a run, which starts from the initial state of the LSTM, as in training; fewer over short

@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from perilune_shared.terminal import say
+from perilune_shared.console.terminal import say
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import pair_values
 from perilune_train.explain.detection import SHALLOW_STAGES
@@ -26,7 +26,7 @@ from perilune_train.explain.inputs import Pairs, evenly_spaced
 from perilune_train.explain.maps.baselines import baseline_maps
 from perilune_train.explain.maps.masks import Masks, navigator_masks, stacked_input
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.navigate.network import build, target_of
+from perilune_train.motion.network import build, target_of
 
 TASK = "navigate"
 

@@ -11,8 +11,6 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import Detector, open_detector
-from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.inputs import (
     LabelledFrames,
@@ -24,8 +22,10 @@ from perilune_train.explain.inputs import (
     pairs_of_descent,
 )
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.navigate.data.trajectories import load_split
-from perilune_train.navigate.network import load_navigator
+from perilune_train.motion.data.trajectories import load_split
+from perilune_train.motion.network import load_navigator
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.provenance import check_terrain, protocol_of, read_provenance
 from perilune_train.training.runs import choose_device, load_weights
 
 

@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from perilune_shared.console.terminal import say_page
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import say_page
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
 from perilune_train.detect.train.guide import GUIDED
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.explain import detection, navigation
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import PCC1_SIGN
@@ -31,6 +29,8 @@ from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.claim import Claim
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.runs import RunFolder
 

@@ -9,8 +9,8 @@ import torch
 from pydantic import Field, ValidationError, model_validator
 from torch import nn
 
-from perilune_shared.config import Section
-from perilune_shared.config_errors import user_error_of
+from perilune_shared.config.errors import user_error_of
+from perilune_shared.config.resolve import Section
 from perilune_shared.errors import UserError
 from perilune_train.config import Attention
 

@@ -9,7 +9,7 @@ import numpy as np
 from perilune_shared.errors import one_line
 from perilune_shared.storage.tables.limits import RUN_TABLE
 from perilune_shared.storage.tables.read import read_table
-from perilune_train.evaluation.spread import MIN_UNITS, read_spread
+from perilune_train.records.spread import MIN_UNITS, read_spread
 from perilune_train.report.content import Figure, FramePicture, Section, Table
 from perilune_train.report.frames import LabelledFrames
 from perilune_train.report.pictures import COLOURS, DASHES, drawing, label_axes, picture_of, plain, svg_of

@@ -9,10 +9,10 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError, one_line
-from perilune_train.evaluation.markdown import number
-from perilune_train.evaluation.spread import read_spread
-from perilune_train.navigate.evaluate.floors import FLOORS
-from perilune_train.navigate.monte_carlo.summary import by_trajectory, run_summary
+from perilune_train.landing.monte_carlo.summary import by_trajectory, run_summary
+from perilune_train.motion.metrics.floors import FLOORS
+from perilune_train.records.markdown import number
+from perilune_train.records.spread import read_spread
 from perilune_train.report.content import Figure, Provenance, Section, Table
 from perilune_train.report.pictures import COLOURS, DASHES, drawing, label_axes, logarithmic, picture_of, plain, svg_of
 from perilune_train.report.sources import Run, sources_of

@@ -18,13 +18,13 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import DetectSplit, load_split
-from perilune_train.evaluation.markdown import write_markdown
-from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
-from perilune_train.paper.detections import read_detections
+from perilune_train.records.markdown import write_markdown
+from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.report import detection, explanation, navigation
 from perilune_train.report.content import Provenance, Report, Section, Viewer
 from perilune_train.report.dataset import dataset_section
 from perilune_train.report.frames import MASKS_FILE, LabelledFrames, labelled_frames, viewer_of
+from perilune_train.report.paper.detections import read_detections
 from perilune_train.report.sources import (
     INSTALLED,
     SCORE_FILE,

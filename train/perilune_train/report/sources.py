@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from perilune_shared.config import read_config_file
+from perilune_shared.config.resolve import read_config_file
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
-from perilune_train.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
+from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.report.content import Provenance
+from perilune_train.report.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
 
 Kind = Literal["demo", "paper", "benchmark"]
 SCORE_FILE = "benchmark.json"

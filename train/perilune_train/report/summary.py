@@ -3,7 +3,7 @@
 from markupsafe import Markup
 
 from perilune_shared.export.foreign_text import for_markdown
-from perilune_train.evaluation.markdown import table
+from perilune_train.records.markdown import table
 from perilune_train.report.content import Report
 
 

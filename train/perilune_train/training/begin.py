@@ -9,14 +9,14 @@ from typing import Any, Literal
 
 import torch
 
-from perilune_shared.config import Section, read_config_file, to_yaml
+from perilune_shared.config.resolve import Section, read_config_file, to_yaml
+from perilune_shared.console.terminal import say
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_shared.storage.locks import LOCK_NAME, locked
 from perilune_shared.storage.store import Address, open_store
-from perilune_shared.terminal import say
 from perilune_train.training.runs import RunFolder, is_first_process
 
 State = Literal["new", "resume", "finished"]

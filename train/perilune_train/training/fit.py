@@ -13,8 +13,8 @@ from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import progress_bar
 from perilune_shared.threads import warn_if_crowded
 from perilune_train.config import Precision
 from perilune_train.data.lost import DataLost

@@ -12,8 +12,8 @@ from torch import nn
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
 from perilune_train.config import Precision
-from perilune_train.evaluation.metrics_file import METRICS_FILE, has_metrics
-from perilune_train.evaluation.provenance import RECORD
+from perilune_train.records.metrics_file import METRICS_FILE, has_metrics
+from perilune_train.records.provenance import RECORD
 from perilune_train.training.checkpoint_file import (
     MOST_STATE_BYTES,
     MOST_WEIGHT_BYTES,

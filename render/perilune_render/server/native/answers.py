@@ -7,15 +7,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config.scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.lens import camera_of
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World
 from perilune_shared.client import CRATER_COLUMNS
-from perilune_shared.config import Section
-from perilune_shared.config_errors import expected_of, formatted
+from perilune_shared.config.errors import expected_of, formatted
+from perilune_shared.config.resolve import Section
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_terrain import CratersConfig
+from perilune_render.config.terrain import CratersConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.craters.profile import fresh_depth_m, fresh_rim_height_m
 from perilune_render.terrain.grid import Grid

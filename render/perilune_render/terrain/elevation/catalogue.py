@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perilune_render.config_terrain import CatalogueColumnsConfig, TerrainConfig
+from perilune_render.config.terrain import CatalogueColumnsConfig, TerrainConfig
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.elevation.crests import measure_crests
 from perilune_render.terrain.elevation.model import ElevationModel, raster_places, resolved_m

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perilune_render.config_terrain import METRES_PER_UNIT, ElevationConfig
+from perilune_render.config.terrain import METRES_PER_UNIT, ElevationConfig
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
 from perilune_shared.storage.rasters import RasterFiles, label_text

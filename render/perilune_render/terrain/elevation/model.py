@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from perilune_render.config_terrain import ElevationConfig, Outside
+from perilune_render.config.terrain import ElevationConfig, Outside
 from perilune_render.terrain.elevation.continuation import continued, distance_in_holes_m, margin_m, mean_slope
 from perilune_render.terrain.elevation.height_band import height_band
 from perilune_render.terrain.elevation.quantisation import smoothed, step_of

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perilune_render.config_terrain import ElevationConfig
+from perilune_render.config.terrain import ElevationConfig
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
 from perilune_shared.storage.rasters import refuse_grids

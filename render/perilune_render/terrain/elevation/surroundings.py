@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_terrain import CratersConfig, ReliefConfig
+from perilune_render.config.terrain import CratersConfig, ReliefConfig
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.craters.population import draw_craters
 from perilune_render.terrain.craters.stamp import stamp_craters

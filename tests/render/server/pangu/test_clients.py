@@ -6,7 +6,7 @@ import time
 from tests.render.server.conftest import Running
 
 from perilune_render.server.notes import Notes
-from perilune_render.server.pangu_session import Conventions
+from perilune_render.server.pangu.session import Conventions
 from perilune_render.server.serve import Limits
 
 

@@ -11,10 +11,10 @@ from tests.render.server.conftest import Running
 from tests.render.server.pangu.valid import VALID
 from tests.render.server.pangu.words import DOWN_1000
 
-from perilune_render.server import pangu_serve
-from perilune_render.server import pangu_wire as wire
-from perilune_render.server.pangu_answers import answer
-from perilune_render.server.pangu_messages import ECHO, ERROR, GOODBYE, IMAGE, MESSAGES, QUIT
+from perilune_render.server.pangu import serve as pangu_serve
+from perilune_render.server.pangu import wire
+from perilune_render.server.pangu.answers import answer
+from perilune_render.server.pangu.messages import ECHO, ERROR, GOODBYE, IMAGE, MESSAGES, QUIT
 from perilune_render.server.serve import Limits
 
 LONGEST_S = 5.0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tests.render.server.pangu.words import DOWN_1000, doubles, floats
 
-from perilune_render.server import pangu_wire as wire
-from perilune_render.server.pangu_answers import answer
-from perilune_render.server.pangu_messages import MESSAGES
+from perilune_render.server.pangu import wire
+from perilune_render.server.pangu.answers import answer
+from perilune_render.server.pangu.messages import MESSAGES
 
 
 def test_every_setting_is_acknowledged_and_every_request_answered(client, world):

@@ -8,8 +8,8 @@ import pytest
 from tests.render.server.conftest import SIZE
 from tests.render.server.pangu.words import DOUBLES, DOWN_1000, as_doubles, as_float, floats
 
-from perilune_render.server import pangu_wire as wire
-from perilune_render.server.pangu_view import rotation_from_angles, rotation_from_quaternion, sun_from_angles
+from perilune_render.server.pangu import wire
+from perilune_render.server.pangu.view import rotation_from_angles, rotation_from_quaternion, sun_from_angles
 
 
 def test_a_client_sets_a_viewpoint_and_gets_its_image(client, world):

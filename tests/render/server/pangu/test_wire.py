@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.render.server.pangu.words import DOUBLES, FLOATS, doubles, floats
 
-from perilune_render.server import pangu_wire as wire
+from perilune_render.server.pangu import wire
 
 
 @pytest.mark.parametrize(("value", "word"), FLOATS.items())

@@ -12,7 +12,7 @@ from tests.helpers.elevation_models import HILLY, POLAR, hilly, hilly_raster, mo
 from tests.helpers.scenes import config_with
 
 from perilune_render.cli.main import main
-from perilune_render.config_terrain import ElevationConfig
+from perilune_render.config.terrain import ElevationConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.provenance.recipe import recorded_settings
 from perilune_render.terrain import cache

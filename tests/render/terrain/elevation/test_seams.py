@@ -5,7 +5,7 @@ import pytest
 import rasterio
 from tests.helpers.elevation_models import MOON, moon_raster, smooth_moon, write
 
-from perilune_render.config_terrain import ElevationConfig
+from perilune_render.config.terrain import ElevationConfig
 from perilune_render.terrain.elevation import window
 from perilune_render.terrain.elevation.model import base_heights, read_elevation
 from perilune_render.terrain.grid import Grid

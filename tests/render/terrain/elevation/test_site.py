@@ -7,7 +7,7 @@ from tests.helpers import in_process
 from tests.helpers.elevation_models import POLAR, write
 
 from perilune_render.cli.main import main
-from perilune_render.config_terrain import ElevationConfig, TerrainConfig
+from perilune_render.config.terrain import ElevationConfig, TerrainConfig
 from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import base_heights, raster_places, read_elevation
 from perilune_render.terrain.grid import Grid

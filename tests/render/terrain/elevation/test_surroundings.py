@@ -6,7 +6,7 @@ import rasterio
 from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import config_with
 
-from perilune_render.config_terrain import CratersConfig, ReliefConfig
+from perilune_render.config.terrain import CratersConfig, ReliefConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.craters.population import draw_craters
 from perilune_render.terrain.craters.stamp import stamp_craters

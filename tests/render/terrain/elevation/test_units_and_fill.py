@@ -9,7 +9,7 @@ from rasterio.shutil import copy
 from tests.helpers.elevation_models import HILLY, MOON, POLAR, hilly, hilly_raster, rough, write
 from tests.shared.storage.raster_files import isis_cube, pds3
 
-from perilune_render.config_terrain import ElevationConfig
+from perilune_render.config.terrain import ElevationConfig
 from perilune_render.terrain.elevation.model import base_heights, height_of_site_m, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError

@@ -13,8 +13,8 @@ from tests.helpers.terrain_record import store_record, uses_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.subset import subset
-from perilune_train.cli import main
-from perilune_train.evaluation.benchmark_parts import part_names
+from perilune_train.cli.main import main
+from perilune_train.records.benchmark_parts import part_names
 
 BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tests.helpers.hostile import rewrite
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing import pack as packing
 from perilune_shared.editing.pack import pack

@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.cli import app
+from perilune_train.cli.main import app
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.flight_detector import FlightDetector
 from perilune_train.detect.finished_run import config_of_run
-from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training import runs
 
 onnx = pytest.importorskip("onnx", reason="the extra `export` is not installed")

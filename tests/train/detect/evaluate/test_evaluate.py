@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.cli import app
+from perilune_train.cli.main import app
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.labels import FrameLabels

@@ -15,7 +15,7 @@ from perilune_train.detect.evaluate.figures import choose_frames
 from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections, Matches
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.report import write_evaluation
-from perilune_train.evaluation.spread import Spread, draw_resamples, read_spread
+from perilune_train.records.spread import Spread, draw_resamples, read_spread
 
 
 def circles(*rows):

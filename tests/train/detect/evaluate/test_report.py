@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from perilune_train.detect.evaluate.report import spread_note
-from perilune_train.evaluation.spread import draw_resamples
+from perilune_train.records.spread import draw_resamples
 
 
 @pytest.mark.parametrize(

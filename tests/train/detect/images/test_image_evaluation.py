@@ -10,7 +10,7 @@ from tests.helpers.stored_run import THRESHOLD, settings_of, store_run
 from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
-from perilune_train.cli import app
+from perilune_train.cli.main import app
 from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.images.evaluate import ImageSettings, evaluate_detections_in_images, evaluate_images

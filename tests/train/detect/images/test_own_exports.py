@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.export.coco import export_coco
 from perilune_shared.export.yolo import export_yolo
-from perilune_train.cli import app
+from perilune_train.cli.main import app
 
 LEAST_PX = 4.0
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M
-from perilune_train.cli import app
+from perilune_train.cli.main import app
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference
 from perilune_train.detect.images.predict import PredictSettings, predict_images

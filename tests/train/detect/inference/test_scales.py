@@ -6,7 +6,7 @@ import pytest
 import torch
 from tests.helpers.stored_run import settings_of, store_run
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.boxes import suppress

@@ -3,7 +3,7 @@
 import os
 import signal
 
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 from perilune_train.detect.train.task import DetectTask
 
 KILLED_AT = (1, 2)

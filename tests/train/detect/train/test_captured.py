@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.batches import network_input, training_loader

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig

@@ -10,9 +10,9 @@ import pytest
 import torch
 from tests.helpers import in_process
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
-from perilune_train.cli import main
+from perilune_train.cli.main import main
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.run import run_detect
 
@@ -97,7 +97,7 @@ def test_lightning_starts_the_processes_without_torchrun(few, tmp_path):
     command = ["detect", "train", "--preset", "tiny", "--name", "two", "--dataset", str(few), "--out", str(tmp_path)]
     settings = (*SETTINGS[:2], "detect.devices=2", "detect.epochs=1", "detect.batch_size=2")
     command += [part for setting in settings for part in ("--set", setting)]
-    program = [sys.executable, "-m", "perilune_train.cli"]
+    program = [sys.executable, "-m", "perilune_train.cli.main"]
     done = subprocess.run([*program, *command], env=ALONE, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     saved = state(tmp_path / "detect" / "two" / "checkpoints" / "last.ckpt")

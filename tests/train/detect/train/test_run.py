@@ -8,11 +8,11 @@ import pytest
 import torch
 from tests.train.detect.conftest import QUICK
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
+from perilune_shared.config.yaml_text import parse_yaml
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
-from perilune_shared.yaml_text import parse_yaml
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import load_detector

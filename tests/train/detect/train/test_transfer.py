@@ -10,10 +10,10 @@ from tests.helpers import darknet_by_hand as by_hand
 from tests.sampling import every
 from typer.testing import CliRunner
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.cli import app
+from perilune_train.cli.main import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.train.network import build_network

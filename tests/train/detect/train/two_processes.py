@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from perilune_shared.config import resolve
+from perilune_shared.config.resolve import resolve
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import batches
 from perilune_train.detect.evaluate import report

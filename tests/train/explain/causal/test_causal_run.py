@@ -14,10 +14,10 @@ from tests.helpers.terrain_record import store_record
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.evaluation.provenance import training_provenance
 from perilune_train.explain.causal.run import CAPTIONS, causal_run
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.models.navigator import StackNavigator
+from perilune_train.records.provenance import training_provenance
 from perilune_train.training.runs import save_weights
 
 _STACK = {

@@ -7,8 +7,8 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, c
 from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_train.explain.correlation.homography import true_homography, warped_to_first
 from perilune_train.explain.correlation.pearson import pearson
-from perilune_train.navigate.data.trajectories import load_split
-from perilune_train.navigate.geometry import apply_homography
+from perilune_train.motion.data.trajectories import load_split
+from perilune_train.motion.geometry import apply_homography
 
 _TURN = matrix_from_quaternion([0.99, 0.05, -0.08, 0.1])
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, Score
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.report import bin_tables, spread_cell, spread_note
-from perilune_train.evaluation.benchmark_parts import part_names
-from perilune_train.evaluation.markdown import number, table
+from perilune_train.records.benchmark_parts import part_names
+from perilune_train.records.markdown import number, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
 _RULES = {

@@ -13,11 +13,11 @@ from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import chosen_threshold
-from perilune_train.evaluation.benchmark_parts import Part, open_parts
-from perilune_train.evaluation.markdown import write_markdown
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
-from perilune_train.evaluation.provenance import TerrainCheck, check_terrain, read_provenance
+from perilune_train.records.benchmark_parts import Part, open_parts
+from perilune_train.records.markdown import write_markdown
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import Metrics, write_metrics
+from perilune_train.records.provenance import TerrainCheck, check_terrain, read_provenance
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
 _PICTURES = ("report.md", "precision_recall.png", "precision_recall.parquet", "bins.png", "detections.png")

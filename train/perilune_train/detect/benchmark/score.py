@@ -15,9 +15,9 @@ from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import EDGE, Detections, Matches
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
-from perilune_train.evaluation.benchmark_parts import Part
-from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.spread import Spread, spreads
+from perilune_train.records.benchmark_parts import Part
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.spread import Spread, spreads
 
 RULES = ("visible", "paper")
 """Selections of labels; the second is the paper's rule."""

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from perilune_shared.console.terminal import say, say_page
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import say, say_page
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
@@ -24,17 +24,17 @@ from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.evaluation.markdown import write_markdown
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.provenance import (
+from perilune_train.models.size import multiply_adds
+from perilune_train.models.yolo import YOLOv3
+from perilune_train.records.markdown import write_markdown
+from perilune_train.records.marks import mark_files
+from perilune_train.records.provenance import (
     Provenance,
     TerrainCheck,
     check_calibration,
     read_provenance,
     split_terrain,
 )
-from perilune_train.models.size import multiply_adds
-from perilune_train.models.yolo import YOLOv3
 from perilune_train.training.runs import RunFolder, load_weights
 
 FORMATS = ("onnx", "openvino")

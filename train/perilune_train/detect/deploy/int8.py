@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.terminal import progress_bar
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input

@@ -16,7 +16,7 @@ from perilune_train.detect.data.frame_facts import FrameFacts
 from perilune_train.detect.evaluate.bootstrap import at_threshold_resampled, average_precisions
 from perilune_train.detect.evaluate.matching import Matches, Overlaps
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
-from perilune_train.evaluation.spread import Resamples, Spread, spreads
+from perilune_train.records.spread import Resamples, Spread, spreads
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.evaluate.matching import FOUND, IGNORED, Matches
-from perilune_train.evaluation.spread import Resamples
+from perilune_train.records.spread import Resamples
 
 Array = NDArray[np.float64]
 _GROUPS = 2000

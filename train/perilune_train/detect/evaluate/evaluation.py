@@ -33,8 +33,8 @@ from perilune_train.detect.evaluate.matching import (
     find_overlaps,
 )
 from perilune_train.detect.evaluate.metrics import figures, figures_of_account, figures_over_ious
-from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
 Array = NDArray[np.float64]
 

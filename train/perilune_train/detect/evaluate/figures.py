@@ -13,8 +13,8 @@ from perilune_train.detect.evaluate.bins import BinFigures
 from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.matching import FALSE, FOUND
 from perilune_train.detect.evaluate.metrics import Curve
-from perilune_train.evaluation.pictures import save_figure
-from perilune_train.evaluation.spread import MIN_UNITS
+from perilune_train.records.pictures import save_figure
+from perilune_train.records.spread import MIN_UNITS
 
 _LABEL, _IGNORED, _FOUND, _FALSE = "#ff4040", "#e0c030", "#19d3e0", "#ff40ff"
 _PANELS = {"radius": "radius, px", "altitude": "altitude, m", "sun": "Sun elevation, degrees"}

@@ -14,8 +14,8 @@ from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
-from perilune_train.evaluation.markdown import number, table, write_markdown
-from perilune_train.evaluation.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
+from perilune_train.records.markdown import number, table, write_markdown
+from perilune_train.records.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 
 CURVE_FILE = "precision_recall.parquet"
 _CURVE_POINTS = 1000

@@ -14,8 +14,8 @@ from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import Detections, Matches, match_split
-from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.provenance import protocol_of
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.provenance import protocol_of
 
 WRITTEN = (
     "report.md",

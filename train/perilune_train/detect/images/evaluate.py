@@ -16,10 +16,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_shared.console.terminal import progress_bar
 from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_shared.storage.files import written_aside
-from perilune_shared.terminal import progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import unknown_facts
 from perilune_train.detect.data.labels import FrameLabels
@@ -35,8 +35,8 @@ from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
-from perilune_train.evaluation.pictures import save_image
+from perilune_train.records.metrics_file import Metrics, write_metrics
+from perilune_train.records.pictures import save_image
 from perilune_train.training import runs
 
 _CROP_PX = 200

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import say
 from perilune_train.detect.images.labels import yolo
 from perilune_train.detect.images.labels.coco import is_coco, read_coco, read_content
 from perilune_train.detect.images.labels.image_set import (

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.evaluation.pictures import save_image
+from perilune_train.records.pictures import save_image
 
 MOST_DRAWN = 1000
 """Maximum number of craters in an overlay. Lines of more than that hide the ground."""

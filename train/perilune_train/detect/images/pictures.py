@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import say
 from perilune_train.detect.images.read import SUFFIXES
 
 _PICTURES = tuple(suffix for suffix in SUFFIXES if suffix != ".lbl")

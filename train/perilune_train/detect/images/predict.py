@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from perilune_shared.console.terminal import progress_bar, say
 from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.storage.files import new_folder
-from perilune_shared.terminal import progress_bar, say
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold

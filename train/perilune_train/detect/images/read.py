@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
 from perilune_shared.storage.rasters import PICTURE_DRIVERS, opened_raster, raster_files
-from perilune_shared.terminal import say
 from perilune_train.detect.images.orientation import (
     is_turned,
     orientation_of,

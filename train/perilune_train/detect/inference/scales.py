@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from perilune_shared.terminal import progress_bar
+from perilune_shared.console.terminal import progress_bar
 from perilune_train.detect.config import COARSEST_STRIDE, DetectConfig
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections

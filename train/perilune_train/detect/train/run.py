@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from perilune_shared.console.terminal import console, say, say_page
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console, say, say_page
 from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
@@ -36,9 +36,9 @@ from perilune_train.detect.train.network import (
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
-from perilune_train.evaluation.provenance import check_terrain, protocol_of, training_provenance
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import Metrics, write_metrics
+from perilune_train.records.provenance import check_terrain, protocol_of, training_provenance
 from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 from perilune_train.training.begin import hashes_of, held, start_run, state_of

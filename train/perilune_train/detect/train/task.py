@@ -22,8 +22,8 @@ from perilune_train.detect.train.distill import Teacher, distill_loss
 from perilune_train.detect.train.guide import guide_loss
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.preview_images import preview_images
-from perilune_train.evaluation.provenance import RECORD
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.records.provenance import RECORD
 
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100

@@ -7,7 +7,6 @@ import torch
 
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.evaluation.provenance import Provenance, read_provenance
 from perilune_train.models.darknet import AttentionDarknet53
 from perilune_train.models.darknet_weights import (
     COCO_FILTERS,
@@ -21,6 +20,7 @@ from perilune_train.models.darknet_weights import (
     read_darknet,
 )
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.records.provenance import Provenance, read_provenance
 from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.pictures import save_figure
 from perilune_train.explain.page.bars import BLUE, GREY, ORANGE
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.pictures import save_figure
 
 VERSIONS = {"rendered": ("crater removed, rendered again", BLUE), "inpainted": ("crater inpainted", ORANGE)} | {
     "placebo": ("empty ground inpainted", GREY)

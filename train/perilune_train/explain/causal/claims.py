@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from perilune_train.evaluation.spread import MIN_UNITS
 from perilune_train.explain.causal.figures import scene_interval
 from perilune_train.explain.evidence.significance import LEVEL, unit_sign_flip_p
+from perilune_train.records.spread import MIN_UNITS
 
 NO_PLACEBO = "undecided: no placebo"
 _BOTH_WAYS = MIN_UNITS + 1

@@ -8,11 +8,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from perilune_train.evaluation.pictures import save_figure, save_image
-from perilune_train.evaluation.spread import Resamples, draw_resamples, spreads
 from perilune_train.explain.causal.bins import VERSIONS
 from perilune_train.explain.causal.effects import region
 from perilune_train.explain.causal.pairs import CraterPairs
+from perilune_train.records.pictures import save_figure, save_image
+from perilune_train.records.spread import Resamples, draw_resamples, spreads
 
 _CELL_PX = 256
 

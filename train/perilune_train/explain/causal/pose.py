@@ -10,9 +10,9 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_train.data.frames import frame_table
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.navigate.data.trajectories import load_split
-from perilune_train.navigate.network import predict, target_of
-from perilune_train.navigate.pose import predict_pose
+from perilune_train.motion.data.trajectories import load_split
+from perilune_train.motion.network import predict, target_of
+from perilune_train.motion.pose import predict_pose
 
 _TRAJECTORY = ["scene_id", "trajectory_id"]
 

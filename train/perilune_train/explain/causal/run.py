@@ -7,19 +7,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_shared.console.terminal import say
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import say
 from perilune_train.data.frames import load_images
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.explain.causal import bins, figures
 from perilune_train.explain.causal.claims import Tested, detection_claim, pose_claim, reaction_claim
 from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects, with_found
@@ -30,7 +28,9 @@ from perilune_train.explain.evidence.stability import between
 from perilune_train.explain.inputs import frames_of
 from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.networks import folder_of, open_single_scale, terrain_marks
-from perilune_train.navigate.network import load_navigator
+from perilune_train.motion.network import load_navigator
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder, choose_device
 

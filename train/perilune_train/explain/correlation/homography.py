@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
-from perilune_train.navigate.geometry import (
+from perilune_train.motion.geometry import (
     apply_homography,
     pixel_index_homography,
     plane_homography,

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from torch import Tensor
 
-from perilune_shared.terminal import progress_bar
+from perilune_shared.console.terminal import progress_bar
 from perilune_train.explain.maps.masks import Masks
 from perilune_train.models.darknet import AttentionDarknet53
 

@@ -7,7 +7,6 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from perilune_shared.geometry.frames import Array
-from perilune_train.evaluation.spread import MIN_UNITS
 from perilune_train.explain.correlation.homography import moved_to_first, seen_in_second
 from perilune_train.explain.correlation.pearson import (
     Maps,
@@ -18,6 +17,7 @@ from perilune_train.explain.correlation.pearson import (
 )
 from perilune_train.explain.evidence.significance import Signs
 from perilune_train.explain.maps.masks import Masks
+from perilune_train.records.spread import MIN_UNITS
 
 NULL = "permutation"
 """Name of the null in the table of differences."""

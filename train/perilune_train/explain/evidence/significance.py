@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import false_discovery_control
 
-from perilune_train.evaluation.spread import MIN_UNITS, Array, Resamples, Rows, draw_resamples, spreads
+from perilune_train.records.spread import MIN_UNITS, Array, Resamples, Rows, draw_resamples, spreads
 
 Signs = Mapping[tuple[str, str, str], float]
 """Sign of the mean on validation frames, 1 or -1, by task, measure and map."""

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_train.evaluation.pictures import save_image
 from perilune_train.explain.correlation.pearson import is_constant
 from perilune_train.explain.maps.masks import Masks
+from perilune_train.records.pictures import save_image
 
 _CELL_PX = 160
 _MOST_COLUMNS = 8

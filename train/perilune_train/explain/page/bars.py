@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from perilune_train.evaluation.pictures import save_figure
+from perilune_train.records.pictures import save_figure
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
 """Colours that the colour-blind can tell apart (Okabe & Ito 2008)."""

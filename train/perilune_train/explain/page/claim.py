@@ -5,9 +5,9 @@ from dataclasses import asdict, dataclass
 
 import pandas as pd
 
-from perilune_train.evaluation.spread import MIN_UNITS
 from perilune_train.explain.evidence.significance import UNDECIDED
 from perilune_train.explain.evidence.tables import Evidence
+from perilune_train.records.spread import MIN_UNITS
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_train.evaluation.pictures import save_image
 from perilune_train.explain.evidence.removal import CONTROLS, chosen_pixels, random_like, removed, shifted_like
+from perilune_train.records.pictures import save_image
 
 _CELL_PX = 256
 _CAPTION_PX = 20

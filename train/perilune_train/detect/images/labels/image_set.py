@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import say
 from perilune_train.detect.images.labels.boxes import Box, StatedSize
 from perilune_train.detect.images.pictures import check_names
 from perilune_train.detect.images.read import picture_size, stored_size

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from perilune_shared.config.yaml_text import parse_yaml
 from perilune_shared.errors import UserError
-from perilune_shared.yaml_text import parse_yaml
 from perilune_train.detect.images.labels.boxes import around
 from perilune_train.detect.images.labels.image_set import LabelledObject
 from perilune_train.detect.images.labels.texts import below, read_text

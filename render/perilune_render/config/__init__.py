@@ -1,0 +1,1 @@
+"""The section `dataset`: settings of a dataset with their units, bounds and defaults."""

@@ -1,0 +1,76 @@
+"""Settings of outputs beside the frames: hazard maps of the scenes, images of a flash lidar."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from perilune_render.config.values import Deviation, Length, Share
+from perilune_shared.config.resolve import Section
+
+_LEAST_PX, _MOST_PX = 3, 100
+"""Smallest and largest footprint, pixels: a plane needs 3, and time grows with the square."""
+_MOST_SIDE_PX = 2048
+_ROUNDING = 1e-9
+
+
+class HazardConfig(Section):
+    """A map of each scene, for a lander of one size: slope, roughness, boulders, shadow, and where it is safe."""
+
+    footprint_m: Length = 10.0
+    """Diameter of the lander's footprint, metres."""
+    pixel_m: Length = 0.5
+    """Size of a pixel of the map, metres."""
+    extent_m: Length = 200.0
+    """Side of the square map, centred on the site, metres."""
+    max_slope_deg: Annotated[float, Field(gt=0, lt=90)] = 10.0
+    """Largest slope of a safe place, degrees."""
+    max_roughness_m: Deviation = 0.5
+    """Largest roughness of a safe place, metres."""
+    max_boulder_m: Deviation = 0.5
+    """Largest height of a boulder at a safe place, metres."""
+    max_shadow_share: Share = 1.0
+    """Largest share of shadow at a safe place; 1 for no limit."""
+    frame_channels: bool = False
+    """Whether the EXRs also have the channels slope, roughness, boulder and safe, sampled from the map."""
+
+    @model_validator(mode="after")
+    def _of_pixels(self) -> "HazardConfig":
+        if not _LEAST_PX <= self.footprint_m / self.pixel_m * (1 + _ROUNDING) <= _MOST_PX:
+            raise ValueError(f"footprint_m of {_LEAST_PX} to {_MOST_PX} pixel_m, which is {self.pixel_m:g}")
+        if not 1 <= self.side_px() <= _MOST_SIDE_PX:
+            raise ValueError(f"extent_m of 1 to {_MOST_SIDE_PX} pixel_m, which is {self.pixel_m:g}")
+        return self
+
+    def side_px(self) -> int:
+        """Side of the map, pixels."""
+        return int(self.extent_m / self.pixel_m * (1 + _ROUNDING))
+
+    def margin_px(self) -> int:
+        """Ground beyond the map that the footprints at its border cover, pixels."""
+        return int(self.footprint_m / self.pixel_m / 2 * (1 + _ROUNDING))
+
+
+class FlashLidarConfig(Section):
+    """A flash lidar that looks along the camera's axis and ranges all its pixels at the time of each frame."""
+
+    width_px: Annotated[int, Field(ge=1, le=1024)] = 128
+    """Image width, pixels."""
+    height_px: Annotated[int, Field(ge=1, le=1024)] = 128
+    """Image height, pixels."""
+    horizontal_fov_deg: Annotated[float, Field(ge=0.1, le=120)] = 20.0
+    """Field of view over the image width, degrees; the principal point is the image centre."""
+    range_sigma_m: Deviation = 0.05
+    """Standard deviation of a range at distance 0, metres."""
+    range_sigma_share: Share = 0.0
+    """Additional standard deviation of a range, share of the range."""
+    quantisation_m: Deviation = 0.01
+    """Step of the ranges, metres; 0 for none."""
+    max_range_m: Length = 2000.0
+    """Largest range that is measured, metres."""
+    threshold_range_m: Length = 1500.0
+    """Distance at which ground of mean albedo, seen along its normal, returns the least energy that is detected,
+    metres."""
+    energy_sigma_share: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """Standard deviation of the returned energy, share of the energy."""
+    false_return_share: Share = 0.0
+    """Share of pixels with a false return: its range is drawn evenly from 0 to max_range_m."""

@@ -1,0 +1,46 @@
+"""Settings of one scene whose poses are given: by a file (`perilune-render frames`)."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from perilune_shared.config.resolve import Section
+
+HIGHEST_M = 20_000.0
+"""Largest height of a camera in a scene with horizon, metres: the ground is the cap of a sphere, seen from above."""
+
+
+class ViewConfig(Section):
+    """How far from the site cameras see ground, from one height."""
+
+    height_m: Annotated[float, Field(gt=0, le=2e6)]
+    """Height of a camera above the ground, metres."""
+    reach_m: Annotated[float, Field(gt=0, le=2e6)]
+    """Largest |x| or |y| from the site of the ground that cameras at this height or below show, metres; with `horizon`,
+    of these cameras themselves."""
+
+
+class SceneConfig(Section):
+    """One scene with given poses, in place of drawn scenes and descents."""
+
+    sun_azimuth_deg: Annotated[float, Field(ge=-720, le=720)] = 90.0
+    """Azimuth of the Sun, clockwise from north, degrees; a column of the poses overrides it."""
+    sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
+    """Elevation of the Sun above the ground plane, degrees; a column of the poses overrides it."""
+    views: tuple[ViewConfig, ...] = ()
+    """Views that the ground is made for, from the lowest to the highest: they set its extent and the vertex spacing at
+    each distance from the site. Without views they are taken from the poses."""
+    horizon: bool = False
+    """Whether views may show the sky. The ground is then curved and extends to the horizon of a camera at the last
+    view's height; `reach_m` of a view limits where its cameras are."""
+    poses_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """SHA-256 of the poses; `perilune-render frames` sets it, so that a dataset is not resumed with other poses."""
+
+    @model_validator(mode="after")
+    def _views_ascend(self) -> "SceneConfig":
+        for low, high in zip(self.views, self.views[1:], strict=False):
+            if high.height_m <= low.height_m or high.reach_m < low.reach_m:
+                raise ValueError("views with ascending height_m, and reach_m that does not fall")
+        if self.horizon and self.views and self.views[-1].height_m > HIGHEST_M:
+            raise ValueError(f"views of at most {HIGHEST_M:g} m, since horizon is true")
+        return self

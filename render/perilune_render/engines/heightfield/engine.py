@@ -1,0 +1,153 @@
+"""The engine `heightfield`: renders a scene by rays over its height field, with the same light as the stage in Blender.
+
+Light, photometry, albedo, the Sun's disc and the pixel's box filter equal `perilune_render.engines.blender`.
+Deviations: NumPy draws the sample points in the pixel and on the disc; light scattered by other ground, and earthshine,
+are not rendered.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.engines.heightfield.beam import tops_of
+from perilune_render.engines.heightfield.horizon import NOWHERE, Horizon, horizon_of
+from perilune_render.engines.heightfield.light import disc_places, reflected
+from perilune_render.engines.heightfield.shade import see
+from perilune_render.engines.heightfield.surface import Surface, surface_of
+from perilune_render.flight.sub_poses import Pose, RowPoses
+from perilune_render.imaging.radiance import Radiance
+from perilune_render.streams import stream
+from perilune_render.terrain.scene import Scene
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.ellipse import plane_basis
+from perilune_shared.geometry.frames import Array
+
+_TILE_PX = 64
+"""Width of the tiles of an image that are rendered one after another."""
+_RAYS_AT_ONCE = 8192
+"""Rays of a tile, if a row of it has no more: their photometry fits the cache of a core."""
+_LIT = 1e-4
+"""Radiance factor above which a pixel counts as sunlit."""
+_RAYS_PER_VERTEX = 0.3
+"""Rays, in numbers of vertices, after which the horizon is made: without it they have taken as long as it takes."""
+
+
+class HeightfieldEngine:
+    """Renders frames of one scene. It is an `Engine` of `perilune_render.engines.frame_source`; several may be open.
+
+    Raises UserError if the configuration asks for light that this engine does not render.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        config: DatasetConfig,
+        camera: Camera,
+        sun: Array,
+        n_threads: int = 1,
+        surface: Surface | None = None,
+    ):
+        for name in ("bounce", "earthshine"):
+            if getattr(config.light, name):
+                raise UserError(
+                    "configuration", f"dataset.light.{name}", True, "false, or dataset.render.engine cycles"
+                )
+        self.camera, self.sun = camera, np.asarray(sun, np.float64)
+        self.surface = surface if surface is not None else surface_of(scene)
+        self.tops = tops_of(self.surface.ground)
+        self._law, self._samples = config.light.photometry, config.render.samples
+        self._disc_rad = np.float32(np.radians(config.light.sun_angular_diameter_deg) / 2)
+        self._far_m = scene.grid.farthest_m
+        self.horizon, self._n_rays = NOWHERE, 0
+        # One thread is the caller's: handing tiles over takes longer than that.
+        self._threads = ThreadPoolExecutor(n_threads, "rays") if n_threads > 1 else None
+
+    def close(self) -> None:
+        """End the threads, if there are any."""
+        if self._threads is not None:
+            self._threads.shutdown()
+
+    def __enter__(self) -> "HeightfieldEngine":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def render(
+        self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0
+    ) -> Radiance:
+        """Render one frame: radiance factor averaged over each pixel; depth and normal of the ray through its centre.
+
+        The first sample of a pixel is at its centre. `approach_deg` is not used: the ground is one mesh.
+        """
+        shape = self.camera.height_px, self.camera.width_px
+        found = Radiance.empty(shape)
+        pose = position_m, rotation_camera_from_site
+        self._cast(found, slice(0, shape[0]), pose, self._drawn(seed), self._horizon_now())
+        return found
+
+    def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
+        """Render one frame with a pose for each row of the sensor; a depth is along the axis at its row's pose."""
+        shape = self.camera.height_px, self.camera.width_px
+        whole, band = Radiance.empty(shape), Radiance.empty(shape)
+        drawn, horizon = self._drawn(seed), self._horizon_now()
+        for pixels, pose in poses.bands(len(poses.time_s)):
+            seen = np.flatnonzero(pixels.any(axis=1))
+            if not len(seen):
+                continue
+            # A row of a sensor with distortion crosses several rows of the rendering.
+            rows = slice(int(seen[0]), int(seen[-1]) + 1)
+            self._cast(band, rows, pose, drawn, horizon)
+            whole.take_from(band, rows, pixels[rows])
+        return whole
+
+    def _drawn(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the samples in their pixels and uniform numbers for the Sun's disc: (samples, h, w, 2) each."""
+        rng, shape = stream(seed, "rays"), (self._samples, self.camera.height_px, self.camera.width_px, 2)
+        moved = rng.random(shape, np.float32) - np.float32(0.5)
+        moved[0] = 0.0
+        return moved, rng.random(shape, np.float32)
+
+    def _cast(
+        self, found: Radiance, rows: slice, pose: Pose, drawn: tuple[np.ndarray, np.ndarray], horizon: Horizon
+    ) -> None:
+        """Render rows of an image from one pose into `found`, in tiles by all threads."""
+        position_m, rotation_camera_from_site = pose
+        moved, disc = drawn
+        origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
+        basis, plane = rays_of(self.camera) @ rotation_camera_from_site, np.stack(plane_basis(self.sun))
+        ground, rocks = self.surface.ground, self.surface.rocks
+
+        def cast(first: tuple[int, int]) -> None:
+            last_row = min(first[0] + tile_rows, rows.stop)
+            tile = slice(first[0], last_row), slice(first[1], first[1] + _TILE_PX)
+            places, suns = moved[:, *tile], disc_places(disc[:, *tile], self._disc_rad)
+            angles = np.empty((5, *places.shape[:3]), np.float32)
+            light = horizon, origin, basis, self.sun, plane
+            see(ground, rocks, self.tops, *light, self._far_m, first, places, suns, found.depth_m, found.normal, angles)
+            seen = reflected(self._law, angles).mean(axis=0)
+            found.radiance_factor[tile], found.sunlit[tile] = seen, seen > _LIT
+
+        tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
+        columns = range(0, self.camera.width_px, _TILE_PX)
+        firsts = [(row, column) for row in range(rows.start, rows.stop, tile_rows) for column in columns]
+        if self._threads is not None:
+            list(self._threads.map(cast, firsts))
+            return
+        for each in firsts:
+            cast(each)
+
+    def _horizon_now(self) -> Horizon:
+        """The horizon for a frame; `NOWHERE` as long as it costs less. Frames are the same with any horizon."""
+        self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
+        if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
+            self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))
+        return self.horizon
+
+
+def rays_of(camera: Camera) -> Array:
+    """Rows (3, 3): how a ray of a camera without distortion changes with u, with v, and the ray at u = v = 0."""
+    start, right, down = camera.rays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    return np.stack([right - start, down - start, start])

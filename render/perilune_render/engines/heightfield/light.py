@@ -1,0 +1,139 @@
+"""Light of the rays' hits: points of the Sun's disc, and photometry, compiled for speed.
+
+Compiled Hapke photometry has the operations of `perilune_render.imaging.photometry` in their order, in float32, and
+calls the functions of the C library that NumPy calls: the results are the same to the bit.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS
+from perilune_render.imaging.photometry import (
+    HAPKE,
+    LEAST_SINE_SQUARED,
+    HapkeParameters,
+    chi_of,
+    reflectance_factor,
+    slope_of,
+)
+from perilune_render.provenance.kernels import njit
+
+_ONE, _TWO, _LEAST = np.float32(1), np.float32(2), np.float32(LEAST_SINE_SQUARED)
+
+
+class _Factors(NamedTuple):
+    """Constants of Hapke's law, float32, in the order of the formulas."""
+
+    exponent_1: np.float32
+    exponent_2: np.float32
+    slope: np.float32
+    psi: np.float32
+    per_chi: np.float32
+    chi: np.float32
+    total_above: np.float32
+    product_above: np.float32
+    product_below: np.float32
+    total_below: np.float32
+    lobes: np.float32
+    lobe_sum: np.float32
+    backward: np.float32
+    forward: np.float32
+    surge: np.float32
+    h_s: np.float32
+    albedo: np.float32
+
+
+def _factors(p: HapkeParameters) -> _Factors:
+    """The constants of a parameter set. Each is computed in double precision and rounded once, as by NumPy."""
+    slope, chi, gamma = slope_of(p.theta_bar_deg), chi_of(p.theta_bar_deg), float(np.sqrt(1 - p.w))
+    scale = (1 - p.b**2) / 2
+    values = (
+        -2 / np.pi / slope,
+        -np.pi / 4,
+        slope,
+        -1 / np.pi,
+        1 / chi,
+        chi,
+        2 - 2 * gamma,
+        4 - 4 * gamma**2,
+        4 * gamma**2,
+        2 * gamma,
+        2 * p.b,
+        1 + p.b**2,
+        scale * (1 + p.c),
+        scale * (1 - p.c),
+        p.b_s0 * p.h_s,
+        p.h_s,
+        p.w / 4,
+    )
+    return _Factors(*map(np.float32, values))
+
+
+def disc_places(drawn: np.ndarray, radius_rad: np.float32) -> np.ndarray:
+    """Uniform places (..., 2) on the Sun's disc at unit distance, for uniform random numbers (..., 2), float32."""
+    places = np.empty(drawn.shape, np.float32)
+    _fill_disc(drawn, radius_rad, places)
+    return places
+
+
+def reflected(law: str, angles: np.ndarray) -> np.ndarray:
+    """Radiance factor (...) of a law for `angles` (5, ...) float32 as `see` writes them."""
+    mu0, mu, cos_phase, albedo, lit = angles
+    if law not in HAPKE:
+        return reflectance_factor(law, mu0, mu, cos_phase) * albedo * lit
+    found = np.empty(mu0.shape, np.float32)
+    _hapke(_factors(HAPKE[law]), angles.reshape(5, -1), found.reshape(-1))
+    return found
+
+
+@njit(**WITHOUT_COUNTS)
+def _fill_disc(drawn, radius_rad, places):
+    n_samples, height, width, _ = drawn.shape
+    turn = np.float32(2 * np.pi)
+    for s in range(n_samples):
+        for i in range(height):
+            for j in range(width):
+                length, angle = np.tan(radius_rad * np.sqrt(drawn[s, i, j, 0])), turn * drawn[s, i, j, 1]
+                places[s, i, j, 0], places[s, i, j, 1] = length * np.cos(angle), length * np.sin(angle)
+
+
+@njit(**INLINED)
+def _slopes(f, cosine):
+    """See `photometry`."""
+    sine = np.sqrt(max(cosine * cosine * -_ONE + _ONE, _LEAST))
+    exponent = cosine / sine * f.exponent_1
+    return sine, np.exp(exponent), np.exp(exponent * exponent * f.exponent_2)
+
+
+@njit(**WITHOUT_COUNTS)
+def _hapke(f, angles, found):
+    """`photometry.hapke` times albedo and cosine of incidence of each sample: angles (5, N), found (N,)."""
+    for k in range(len(found)):
+        mu0, mu, cos_phase = angles[0, k], angles[1, k], angles[2, k]
+        cos_l, cos_s = min(mu0, mu), max(mu0, mu)
+        sin_l, e1_l, e2_l = _slopes(f, cos_l)
+        sin_s, e1_s, e2_s = _slopes(f, cos_s)
+        open_l, open_s = _TWO - e1_l, _TWO - e1_s
+        cos_psi = min(max((cos_phase - mu0 * mu) / (sin_l * sin_s), -_ONE), _ONE)
+        psi = np.arccos(cos_psi)
+        seen_as_one = np.exp(np.tan(psi * np.float32(0.499999)) * -_TWO)
+        per_both = f.slope / max(psi * e1_s * f.psi + open_l, np.float32(1e-4))
+        common = (cos_psi * np.float32(-0.5) + np.float32(0.5)) * e2_s
+        larger = sin_l * (e2_l - common) * per_both + cos_l
+        smaller = sin_s * (cos_psi * e2_l + common) * per_both + cos_s
+        alone_l = sin_l * e2_l / open_l * f.slope + cos_l
+        alone_s = sin_s * e2_s / open_s * f.slope + cos_s
+        shadowing = f.per_chi / (alone_l * (seen_as_one * (cos_s - alone_s) + alone_s))
+        larger, smaller = larger * f.chi, smaller * f.chi
+        total, product = larger + smaller, larger * smaller
+        multiple = (total * f.total_above + product * f.product_above) / (
+            product * f.product_below + (total * f.total_below + _ONE)
+        )
+        phase = (cos_phase * -f.lobes + f.lobe_sum) ** np.float32(-1.5) * f.backward + (
+            cos_phase * f.lobes + f.lobe_sum
+        ) ** np.float32(-1.5) * f.forward
+        half_tangent = np.sqrt(_TWO / min(cos_phase + _ONE, _TWO) - _ONE)
+        surge = f.surge / (half_tangent + f.h_s) + _ONE
+        factor = product / total * (shadowing * f.albedo) * (phase * surge + multiple)
+        found[k] = factor * angles[3, k] * angles[4, k]

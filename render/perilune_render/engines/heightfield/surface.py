@@ -1,0 +1,229 @@
+"""The ground as arrays for casting rays: heights, vertex normals, albedo, and a pyramid of largest heights.
+
+The mesh is that of Blender (`Grid.quads`, each quad split from its first to its third vertex), in two parts:
+
+- the inner square, a regular grid;
+- four sectors between the rings, one for each side (south y = -d, then x = d, y = d, x = -d). In a sector a place has
+  two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines
+  d = half_widths[r], and the lines between neighbouring vertices of a ring are along / d = t / n_half - 1.
+
+A cell is a quad. Level L of the pyramid, from 1, has the largest height of blocks of 2^L x 2^L cells, with the boulders
+that touch them. The time of a ray is mostly that of reading memory, so a vertex is four numbers side by side.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from perilune_render.engines.heightfield.rocks import Rocks, rocks_of
+from perilune_render.provenance.kernels import njit
+from perilune_render.terrain.grid import vertex_of_ring
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.frames import Array
+
+WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
+"""Options of kernels that make no arrays: no counts of references to arrays, which all threads would write."""
+INLINED = WITHOUT_COUNTS | {"forceinline": True}
+"""Options of kernels that are compiled into their callers: a call passes `Ground` and `Rocks` as about 70 numbers."""
+_MOST_LEVELS = 16
+_MARGIN_M = 0.01
+"""Between the heights where rays begin and end, and the surface: a ray must cross the ground between them."""
+
+
+class Ground(NamedTuple):
+    """Arrays of the ground, as arguments of compiled functions: few, since each is passed in eight parts."""
+
+    half_widths_m: Array
+    """Half-widths of inner square and rings, ascending, metres (R + 1,)."""
+    vertex: np.ndarray
+    """Of each vertex, in the grid's order (V, 4) float32: x and y of its unit normal, O_L; height, metres; albedo,
+    negative if boulders touch the cell whose first vertex it is."""
+    top_m: np.ndarray
+    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and place, metres: levels from 1
+    one after another, float32."""
+    level: np.ndarray
+    """Index in `top_m` at which each level of the inner square and of the sectors begins (2, L + 1) int64; the last
+    column is the index of the coarsest level."""
+    n_half: int
+    """Vertex spacings from the centre of the inner square to its border."""
+    lowest_m: float
+    """Height below all ground, metres."""
+    highest_m: float
+    """Height above all ground and boulders, metres."""
+    ring: np.ndarray
+    """Ring at equal steps of the distance max(|x|, |y|), beginning at the first ring (N,) int64."""
+    rings_per_m: float
+    """Elements of `ring` per metre."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Ground and boulders of a scene."""
+
+    ground: Ground
+    """Ground."""
+    rocks: Rocks
+    """Boulders, with the cells that each touches."""
+    centre_m: tuple[float, float]
+    """x and y of the grid's centre, O_L, metres; the arrays are relative to it."""
+
+
+def surface_of(scene: Scene) -> Surface:
+    """The surface of a scene, built in a few seconds for ten million vertices."""
+    grid, n = scene.grid, scene.grid.n_half
+    half = np.ascontiguousarray(grid.half_widths_m, np.float64)
+    height = np.ascontiguousarray(scene.height_m, np.float32)
+    rocks, tops = rocks_of(scene)
+    _raise_to_ground(height, n, *tops)
+    pyramids = [_levels(tops[0][None]), _levels(tops[1])]
+    starts = np.zeros((2, _MOST_LEVELS + 1), np.int64)
+    for part, levels in enumerate(pyramids):
+        before = 0 if part == 0 else sum(map(len, pyramids[0]))
+        starts[part, 1 : len(levels) + 1] = before + np.cumsum([0, *map(len, levels)])[:-1]
+        starts[part, -1] = len(levels)
+    top = np.concatenate([level for levels in pyramids for level in levels])
+    highest = max(float(part.max()) for part in tops if part.size)
+    vertices = np.empty((len(height), 4), np.float32)
+    vertices[:, 2], vertices[:, 3] = height, scene.albedo
+    _write_normals(n, half, height, vertices)
+    _mark_rocks(vertices, n, rocks.cell_start, len(half) - 1)
+    bounds = float(height.min()) - _MARGIN_M, highest + _MARGIN_M
+    ground = Ground(half, vertices, top, starts, n, *bounds, *_ring_table(half))
+    return Surface(ground, rocks, (grid.centre_x_m, grid.centre_y_m))
+
+
+def _ring_table(half_widths: Array) -> tuple[np.ndarray, float]:
+    """`Ground.ring` and `Ground.rings_per_m`: four elements for each ring on average."""
+    n_rings = len(half_widths) - 1
+    width, count = half_widths[-1] - half_widths[0], 4 * max(n_rings, 1)
+    steps = half_widths[0] + width / count * np.arange(count)
+    ring = np.clip(np.searchsorted(half_widths, steps, side="right") - 1, 0, max(n_rings - 1, 0))
+    return ring, float(count / width) if n_rings else 0.0
+
+
+def _levels(tops: np.ndarray) -> list[np.ndarray]:
+    """Levels from 1 of the largest values of `tops` (sides, rows, columns), each flat."""
+    levels: list[np.ndarray] = []
+    level = tops
+    while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MOST_LEVELS - 1):
+        level = _coarser(level)
+        levels.append(level.ravel())
+    return levels
+
+
+@njit()
+def _coarser(tops):
+    """The largest values of blocks of 2 x 2 of `tops` (sides, rows, columns); fewer at the end of an odd length."""
+    n_sides, n_rows, n_columns = tops.shape
+    found = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
+    for side in range(n_sides):
+        for row in range(n_rows):
+            for column in range(n_columns):
+                top = found[side, row >> 1, column >> 1]
+                found[side, row >> 1, column >> 1] = max(top, tops[side, row, column])
+    return found
+
+
+@njit(inline="always")
+def ring_vertex(ring, place, n):
+    """As `vertex_of_ring` for places up to 8 n, without a division."""
+    if place >= 8 * n:
+        place -= 8 * n
+    return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place if ring > 0 else vertex_of_ring(ring, place, n)
+
+
+@njit(**INLINED)
+def vertex(part, row, column, k, n):
+    """Index of vertex k (0 to 3, as in `Grid.quads`) of a cell, in the grid's order."""
+    if part == 0:
+        return (row + (1 if k >= 2 else 0)) * (2 * n + 1) + column + (1 if k == 1 or k == 2 else 0)
+    place = (part - 1) * 2 * n + column + (1 if k >= 2 else 0)
+    return ring_vertex(row + (1 if k == 1 or k == 2 else 0), place, n)
+
+
+@njit(**INLINED)
+def place_of(part, row, column, k, n, half_widths):
+    """x and y of vertex k of a cell, relative to the grid's centre."""
+    if part == 0:
+        step = half_widths[0] / n
+        return (column + (1 if k == 1 or k == 2 else 0) - n) * step, (row + (1 if k >= 2 else 0) - n) * step
+    d = half_widths[row + (1 if k == 1 or k == 2 else 0)]
+    along = d * ((column + (1 if k >= 2 else 0)) / n - 1)
+    if part == 1:
+        return along, -d
+    if part == 2:
+        return d, along
+    if part == 3:
+        return -along, d
+    return -d, -along
+
+
+@njit()
+def _raise_to_ground(height, n, inner_top, sector_top):
+    """Raise the top of each cell to the largest height of its four vertices."""
+    for j in range(2 * n):
+        for i in range(2 * n):
+            for k in range(4):
+                inner_top[j, i] = max(inner_top[j, i], height[vertex(0, j, i, k, n)])
+    for side in range(4):
+        for ring in range(sector_top.shape[1]):
+            for t in range(2 * n):
+                for k in range(4):
+                    top = height[vertex(side + 1, ring, t, k, n)]
+                    sector_top[side, ring, t] = max(sector_top[side, ring, t], top)
+
+
+@njit()
+def _add_face(part, row, column, n, half_widths, height, points, total):
+    """Add to `total` (V, 3) at each vertex of a cell the normal of its face, weighted by the angle there."""
+    for k in range(4):
+        points[k, 0], points[k, 1] = place_of(part, row, column, k, n, half_widths)
+        points[k, 2] = height[vertex(part, row, column, k, n)]
+    ax, ay, az = points[2, 0] - points[0, 0], points[2, 1] - points[0, 1], points[2, 2] - points[0, 2]
+    bx, by, bz = points[3, 0] - points[1, 0], points[3, 1] - points[1, 1], points[3, 2] - points[1, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    for k in range(4):
+        after, before = (k + 1) % 4, (k + 3) % 4
+        ux, uy, uz = points[after, 0] - points[k, 0], points[after, 1] - points[k, 1], points[after, 2] - points[k, 2]
+        vx, vy, vz = (
+            points[before, 0] - points[k, 0],
+            points[before, 1] - points[k, 1],
+            points[before, 2] - points[k, 2],
+        )
+        sides = np.sqrt((ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz))
+        angle = np.arccos(min(max((ux * vx + uy * vy + uz * vz) / sides, -1.0), 1.0)) / length
+        at = vertex(part, row, column, k, n)
+        total[at, 0] += angle * nx
+        total[at, 1] += angle * ny
+        total[at, 2] += angle * nz
+
+
+@njit()
+def _write_normals(n, half_widths, height, vertices):
+    """Write x and y of the unit vertex normals as Blender's: means of the faces' normals, weighted by the angles."""
+    total, points = np.zeros((len(height), 3)), np.empty((4, 3))
+    for j in range(2 * n):
+        for i in range(2 * n):
+            _add_face(0, j, i, n, half_widths, height, points, total)
+    for side in range(4):
+        for ring in range(len(half_widths) - 1):
+            for t in range(2 * n):
+                _add_face(side + 1, ring, t, n, half_widths, height, points, total)
+    for k in range(len(height)):
+        length = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
+        vertices[k, 0], vertices[k, 1] = total[k, 0] / length, total[k, 1] / length
+
+
+@njit()
+def _mark_rocks(vertices, n, cell_start, n_rings):
+    """Make the albedo of the first vertex of each cell with boulders negative."""
+    for cell in range(len(cell_start) - 1):
+        if cell_start[cell] < cell_start[cell + 1]:
+            if cell < 4 * n * n:
+                at = vertex(0, cell // (2 * n), cell % (2 * n), 0, n)
+            else:
+                row, place = divmod(cell - 4 * n * n, 2 * n)
+                at = vertex(row // n_rings + 1, row % n_rings, place, 0, n)
+            vertices[at, 3] = -abs(vertices[at, 3])

@@ -1,0 +1,42 @@
+"""Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays over the height field)."""
+
+import contextlib
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+from perilune_render.config.dataset import DatasetConfig
+from perilune_render.engines.frame_source import Engine
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_shared.threads import usable_cores
+
+if TYPE_CHECKING:
+    from perilune_render.engines.heightfield.surface import Surface
+
+
+def open_engine(
+    scene: Scene, config: DatasetConfig, camera: Camera, sun: Array, surface: "Surface | None" = None
+) -> AbstractContextManager[Engine]:
+    """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L; use it as a context manager.
+
+    The engine `heightfield` builds the surface of the scene unless it is given.
+    Raises UserError if the engine does not render what the configuration asks for.
+    """
+    if config.render.engine == "heightfield":
+        from perilune_render.engines.heightfield.engine import HeightfieldEngine
+
+        return HeightfieldEngine(scene, config, camera, sun, config.render.threads or usable_cores(), surface)
+    # Importing Blender takes a second, and only this engine needs it.
+    from perilune_render.engines.blender.renderer import Renderer
+
+    return Renderer(scene, config, camera, sun)
+
+
+def load_engine(name: str) -> None:
+    """Import the libraries of an engine before there is a scene. `open_engine` reports one that is missing."""
+    with contextlib.suppress(ImportError):
+        if name == "heightfield":
+            import perilune_render.engines.heightfield.engine
+        else:
+            import perilune_render.engines.blender.renderer  # noqa: F401

@@ -1,0 +1,47 @@
+"""Render a job in this process."""
+
+from functools import partial
+from types import TracebackType
+
+from perilune_render.jobs.job import Job
+from perilune_render.jobs.report import Report
+from perilune_render.jobs.scene_renderer import SceneRenderer
+from perilune_render.jobs.work_list import WorkList
+from perilune_shared.console.progress import say
+from perilune_shared.errors import ends_run
+from perilune_shared.storage.store import Store
+
+
+class Here:
+    """The executor that renders in this process, one trajectory after another."""
+
+    def __init__(self, job: Job, out: Store):
+        self._renderer = SceneRenderer(job, out)
+
+    def __enter__(self) -> "Here":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._renderer.__exit__(kind, error, trace)
+
+    def check_scene(self, scene_id: str) -> None:
+        """Generate a scene and check that its poses fit it. Raises UserError."""
+        for line in self._renderer.check(scene_id):
+            say(line)
+
+    def render(self, work: WorkList, report: Report) -> None:
+        """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
+        while (place := work.take(self._renderer.scene_id)) is not None:
+            report.started(place)
+            try:
+                dark = self._renderer.render(place, partial(report.frame, place), report.note)
+            except Exception as error:
+                if ends_run(error):
+                    raise
+                text = f"{type(error).__name__}: {error}"
+                report.failed(place, text, work.failed(place, text))
+            else:
+                work.done(place)
+                report.done(place, dark)

@@ -1,0 +1,1 @@
+"""The server's interface with PANGU's wire protocol."""

@@ -1,0 +1,87 @@
+"""State of one client of PANGU's protocol: its camera and Sun, and the images that it gets."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perilune_render.server.pangu import messages as m
+from perilune_render.server.pangu.view import RollSense, SunZero, camera_from_angles, rotation_from_angles
+from perilune_render.server.pangu.wire import unsigned
+from perilune_render.server.world import View, World
+from perilune_shared.geometry.frames import Array
+
+CAMERAS = (0, 1)
+"""Numbers of the one camera of a session."""
+_START_M = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Conventions:
+    """What is not known of PANGU, with our defaults."""
+
+    sun_zero: SunZero = "clockwise-from-y"
+    """Direction of the Sun's azimuth 0."""
+    roll_sense: RollSense = "left"
+    """Side to which positive roll leans the top of the camera."""
+    may_quit: bool = False
+    """Whether a client may end the server."""
+
+
+@dataclass
+class Session:
+    """State of one client."""
+
+    world: World
+    """The scene."""
+    width_px: int
+    """Width of all images, pixels."""
+    height_px: int
+    """Height of all images, pixels."""
+    field_of_view_rad: float
+    """Horizontal field of view, radians."""
+    sun: Array
+    """Unit vector towards the Sun (3,)."""
+    seed: int
+    """Random seed of the noise of this client's images."""
+    conventions: Conventions = Conventions()
+    """Options."""
+    aspect: float = 1.0
+    """Height of a pixel over its width."""
+    position_m: Array = field(default_factory=lambda: np.array([0.0, 0.0, _START_M]))
+    """Position of the camera, O_L, metres (3,); at first above the site."""
+    rotation_camera_from_site: Array = field(default_factory=lambda: rotation_from_angles(0.0, -np.pi / 2, 0.0))
+    """Attitude of the camera (3, 3); at first straight down."""
+    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
+    """Velocity of the camera, O_L, metres per second (3,); blurs images."""
+    n_images: int = 0
+    """Number of images so far: the index of the next one's noise."""
+    asked_us: float = 0.0
+    """When the present message had arrived, microseconds since 1970."""
+    time_tag_us: float | None = None
+    """When the last image that was sent had been asked for, microseconds since 1970; None before the first."""
+
+    def view(self) -> View:
+        """The current view."""
+        camera = camera_from_angles(self.width_px, self.height_px, self.field_of_view_rad, self.aspect)
+        return View(self.position_m, self.rotation_camera_from_site, camera, self.sun)
+
+    def image(self) -> bytes:
+        """The image of the current view, as a message."""
+        frame = self.world.frame(self.view(), self.seed, self.n_images, self.velocity_mps)
+        self.n_images += 1
+        self.time_tag_us = self.asked_us
+        grey = frame.image if frame.image.dtype == np.uint8 else frame.image >> (self.world.config.sensor.bits - 8)
+        return picture(grey.astype(np.uint8))
+
+
+def check_camera(number: int) -> None:
+    """Raise ValueError if there is no camera of this number."""
+    if number not in CAMERAS:
+        raise ValueError(f"camera {number}, expected 0 or 1")
+
+
+def picture(grey: np.ndarray) -> bytes:
+    """Grey values (h, w) uint8 as a message with a PPM file of three equal channels, as PANGU sends."""
+    height, width = grey.shape
+    content = b"P6\n%d %d 255\n" % (width, height) + np.repeat(grey[..., None], 3, axis=2).tobytes()
+    return unsigned(m.IMAGE, len(content)) + content

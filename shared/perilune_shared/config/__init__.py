@@ -1,0 +1,1 @@
+"""Settings: presets, YAML files and single values resolved into checked sections, and pages about them."""

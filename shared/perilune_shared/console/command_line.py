@@ -1,0 +1,168 @@
+"""Make and run a command line: threads, errors in one line, exit codes, and the options that all programs have."""
+
+import atexit
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from perilune_shared.console.interrupts import ended_by_interrupt, ends_at_interrupt
+from perilune_shared.console.terminal import answer
+from perilune_shared.errors import DISK_FAULTS, EXIT_INTERRUPTED, EXIT_USER_ERROR, STOPPED, UserError, one_line
+from perilune_shared.threads import described_settings, set_up_program
+
+
+def _describe_threads(verbose: bool) -> None:
+    if verbose:
+        print(described_settings(), file=sys.stderr)
+
+
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the variables of threads."
+    ),
+]
+"""The option of a program, before the name of the command: `perilune-train -v detect train`."""
+
+
+def new_program(name: str, version: str, summary: str) -> typer.Typer:
+    """A program without commands: options -h, --verbose and --version, and completion for the user's shell."""
+    app = typer.Typer(
+        name=name,
+        help=summary,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+
+    def print_version(asked: bool) -> None:
+        if asked:
+            answer(f"{name} {version}")
+            raise typer.Exit
+
+    @app.callback()
+    def program(
+        verbose: Verbose = False,
+        version: Annotated[
+            bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version and end.")
+        ] = False,
+    ) -> None:
+        pass
+
+    return app
+
+
+_UNTRACKED = {
+    "DO_NOT_TRACK": "1",
+    "HF_HUB_DISABLE_TELEMETRY": "1",
+    "ORT_DISABLE_TELEMETRY": "1",
+    "RAY_USAGE_STATS_ENABLED": "0",
+}
+"""Variables by which libraries report no use to their makers; a value that the user has set stays."""
+
+
+def _check_arguments() -> None:
+    """Raise UserError on a path that is not UTF-8, which no table, page or library of ours can hold."""
+    for argument in sys.argv[1:]:
+        if any("\ud800" <= sign <= "\udfff" for sign in argument):
+            raise UserError("command line", "argument", argument, "text or a path in UTF-8")
+
+
+def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -> None:
+    """Run a command line; print user errors and disk errors in one line and exit with code 2.
+
+    First sets the threads of the numerical libraries (`threads.set_up_program`), which are not imported yet, and the
+    variables by which libraries report no use to their makers.
+
+    Ctrl-C ends the command with one line and exit code 130, after `ended_after_s` at the latest: then the processes
+    that it has started are ended too. Ctrl-C at the end of the process, when all work is done, is ignored.
+    """
+    with _interrupts() as interrupted, ended_by_interrupt(after_s=ended_after_s, at_end=_end_children):
+        message = _error_of(app, interrupted)
+    if message is None:
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+        return
+    print(message, file=sys.stderr)
+    sys.exit(EXIT_INTERRUPTED if message == STOPPED else EXIT_USER_ERROR)
+
+
+def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
+    """Run a command line; the line to print if a user has caused its end, else None."""
+    try:
+        _check_arguments()
+        set_up_program()
+        for name, value in (_UNTRACKED | _folders()).items():
+            os.environ.setdefault(name, value)
+        app()
+    except UserError as error:
+        return STOPPED if interrupted else f"error: {error}"
+    except SystemExit as stop:
+        # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
+        if interrupted or stop.code == EXIT_INTERRUPTED:
+            return STOPPED
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+        raise
+    except BaseException as error:
+        # An interrupt in the middle of an import, or in C code, comes out as another error.
+        if interrupted or isinstance(error, KeyboardInterrupt):
+            return STOPPED
+        if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+            return (
+                f"error: {one_line(error.filename or 'output')}: {os.strerror(error.errno)}; finished files stay valid"
+            )
+        raise
+    return None
+
+
+def _folders() -> dict[str, str]:
+    """The variable that puts Matplotlib's list of fonts into perilune's cache folder, if there is a home folder."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    home = Path(os.environ.get("HOME", ""))
+    if not given.is_absolute() and not (home.is_absolute() and home.is_dir()):
+        return {}
+    cache = given if given.is_absolute() else home / ".cache"
+    return {"MPLCONFIGDIR": str(cache / "perilune" / "matplotlib")}
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[list[bool]]:
+    """Raise KeyboardInterrupt at Ctrl-C, and note that it was pressed; without effect if it is ignored."""
+    pressed: list[bool] = []
+    before = signal.getsignal(signal.SIGINT)
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or (before is not signal.default_int_handler and not ends_at_interrupt()):
+        yield pressed
+        return
+
+    def press(*_: object) -> None:
+        pressed.append(True)
+        raise KeyboardInterrupt
+
+    def ignored(unraisable: Any) -> None:
+        # Python discards an interrupt in a destructor or a callback; `ended_by_interrupt` then ends the process.
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            hook(unraisable)
+
+    hook = sys.unraisablehook
+    signal.signal(signal.SIGINT, press)
+    sys.unraisablehook = ignored
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = hook
+
+
+def _end_children() -> None:
+    """Ask the processes that this one has started to end (Linux)."""
+    for path in Path("/proc/self/task").glob("*/children"):
+        for child in path.read_text(encoding="ascii").split():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGTERM)

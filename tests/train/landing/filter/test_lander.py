@@ -1,0 +1,249 @@
+"""A simulated descent over craters whose places are wrong, from inertial measurements, ranges and sightings."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.train.landing.craters.crater_world import CAMERA, ground_m, sighted, world
+
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
+from perilune_shared.geometry.gravity import gravity_mps2
+from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
+from perilune_train.landing.craters.catalogue import CatalogueErrors, with_errors
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
+from perilune_train.landing.filter.flight import Instruments, fly, fly_together, together
+from perilune_train.landing.filter.lander import Lander, Surroundings
+from perilune_train.landing.filter.propagate import Increments, InertialNoise
+from perilune_train.landing.filter.state import N_ERRORS, State
+
+GRADE = GRADES["tactical"]
+NOISE = InertialNoise.of(GRADE)
+WORLD = world()
+STEP_S = 0.05
+POSITION_M, VELOCITY_MPS = np.array([-300.0, 100, 1400]), np.array([9.0, -4, -35])
+NOTHING = Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+
+
+def lander(seed, off_m=20.0, claimed_m=20.0, moved_m=0.0):
+    """A lander whose start is off, its catalogue with errors, and the generator of its measurements."""
+    rng = np.random.default_rng(seed)
+    biases = np.radians(GRADE.gyro_bias_deg_per_h) / HOUR_S, GRADE.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
+    sigmas = np.repeat([claimed_m, 1.0, np.radians(0.3), *biases], 3)
+    position = POSITION_M + off_m * rng.normal(size=3) + [moved_m, 0, 0]
+    start = State.starting(position, VELOCITY_MPS + rng.normal(size=3), np.eye(3), sigmas, 5.0)
+    catalogue = with_errors(WORLD, CatalogueErrors(), rng)
+    return Lander(start, NOISE, Surroundings(CAMERA, MOUNTING, catalogue, 2.0, 5.0)), rng, biases
+
+
+def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda k: True):
+    """Fly a straight line; returns errors of position (n, 3), normalised errors squared (n,), and statuses by frame."""
+    # What repeats with a crater is drawn once.
+    shift = STATIC_SHARE * WORLD.radius_m[:, None] * rng.normal(size=(len(WORLD), 3)) * [1, 1, 0]
+    apparent = dataclasses.replace(WORLD, centre_m=WORLD.centre_m + shift)
+    gyro, force = (bias * rng.normal(size=3) for bias in biases)
+    noise = np.sqrt([NOISE.turn, NOISE.velocity]) / np.sqrt(STEP_S)
+    position, errors, squared, status = POSITION_M, [], [], []
+    for k in range(round(seconds / STEP_S)):
+        if k * STEP_S % 1 == 0:
+            seen = sighted(apparent, Pose(position, MOUNTING), rng, static=False)
+            craft.sightings(see(k * STEP_S, seen))
+            errors.append(craft.state.position_m - position)
+            own = [*range(3), *range(6, 9)]
+            error = craft.state.pose_error(position, np.eye(3))
+            squared.append(error @ np.linalg.solve(craft.state.covariance[np.ix_(own, own)], error))
+            status.append(craft.status)
+        position = position + VELOCITY_MPS * STEP_S
+        rate, lift = gyro + noise[0] * rng.normal(size=3), force + noise[1] * rng.normal(size=3)
+        if feel(k * STEP_S):
+            lift = lift - gravity_mps2(position[2])
+            craft.inertial(Increments.single((k + 1) * STEP_S, STEP_S, rate, lift))
+            craft.range(position[2] - ground_m(position) + 2 * rng.normal())
+    return np.array(errors), np.array(squared), status
+
+
+@pytest.mark.parametrize("n_descents", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_errors_are_small_and_of_the_stated_size(n_descents):
+    squared, last = [], []
+    for seed in range(n_descents):
+        errors, normalised, status = flown(*lander(seed))
+        assert set(status) == {"tracking"}
+        squared.append(normalised.mean())
+        last.append(np.linalg.norm(errors[-1]))
+    # Errors along a descent are correlated: 8 descents have about 16 independent ones of 6 parts, a deviation of 0.9.
+    assert 3.3 < np.mean(squared) < 8.7
+    assert np.mean(last) < 1.5
+
+
+def test_craters_missed_in_one_frame_keep_their_offsets():
+    """Else their catalogue errors would count as new information when they are seen again."""
+    craft, rng, _ = lander(6)
+    true = Pose(POSITION_M, MOUNTING)
+    seen = sighted(WORLD, true, rng)
+    craft.sightings(seen)
+    known, covariance = craft.state.craters, craft.state.covariance
+    assert len(known) > 40
+    some = Sightings(seen.centre_px[::2], seen.radius_px[::2], seen.score[::2])
+    craft.sightings(some)
+    lost = np.setdiff1d(known, craft.state.craters)
+    # Those at the very border of the image may leave it.
+    assert len(lost) < 0.05 * len(known)
+    before = dict(zip(known, np.diag(covariance)[N_ERRORS::2], strict=True))
+    after = dict(zip(craft.state.craters, np.diag(craft.state.covariance)[N_ERRORS::2], strict=True))
+    assert all(after[crater] <= before[crater] * (1 + 1e-9) for crater in set(before) & set(after))
+
+
+def test_craters_out_of_view_leave_the_state():
+    craft, rng, _ = lander(7)
+    around = Surroundings(CAMERA, MOUNTING, WORLD, 2.0, 5.0)
+    craft = Lander(craft.state, NOISE, around)
+    craft.sightings(sighted(WORLD, Pose(POSITION_M, MOUNTING), rng))
+    first = craft.state
+    # The view is as wide as 93 % of the altitude: half of it is new.
+    moved = np.array([0.0, 650.0, 0.0])
+    craft = Lander(dataclasses.replace(first, position_m=first.position_m + moved), NOISE, around)
+    assert craft.sightings(sighted(WORLD, Pose(POSITION_M + moved, MOUNTING), rng)) is not None
+    behind = first.craters[WORLD.centre_m[first.craters, 1] < POSITION_M[1] - 60]
+    assert len(behind) > 20
+    assert not np.isin(behind, craft.state.craters).any()
+    assert np.isin(first.craters, craft.state.craters).sum() > 20
+
+
+def test_an_outage_of_ten_seconds():
+    _, normalised, status = flown(*lander(1), see=lambda t, seen: NOTHING if 8 <= t < 18 else seen)
+    assert status[:8] == ["tracking"] * 8
+    assert "tracking" not in status[8:18]
+    assert status[18:] == ["tracking"] * 12
+    assert normalised.max() < 40
+
+
+def test_a_start_that_is_300_m_off_is_noticed():
+    errors, _, status = flown(*lander(2, off_m=0.0, claimed_m=15.0, moved_m=300.0))
+    wrong = np.linalg.norm(errors, axis=1) > 20
+    # Whenever it is wrong it does not claim to track.
+    assert not any(status[k] == "tracking" for k in np.flatnonzero(wrong))
+
+
+def seen_from(t, shift_m, turn_deg):
+    """Sightings of a camera that is shifted and turned against the true pose of a flight."""
+    true = Pose(POSITION_M + VELOCITY_MPS * t, MOUNTING)
+    wrong = true.changed(np.concatenate([shift_m, np.radians(turn_deg)]))
+    return sighted(WORLD, wrong, np.random.default_rng(int(t)))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (([16.0, 0, 0], [0, 3.0, 0]), ([16.0, 0, 0], [0, 3.0, 0])),
+        (([40.0, 0, 0], [0, 0, 0]), ([0.0, 50, 0], [0, 0, 0])),
+    ],
+    ids=["turned as no gyroscope can be", "two that differ"],
+)
+def test_wrong_fixes_do_not_replace_the_state(first, second):
+    """A state is replaced by fixes that agree with each other and with the gyroscope only."""
+
+    def see(t, seen):
+        return seen_from(t, *(first if t == 10 else second)) if t in (10, 11) else seen
+
+    errors, _, status = flown(*lander(8), see=see, seconds=16)
+    assert np.linalg.norm(errors[9:], axis=1).max() < 6
+    assert "tracking" not in status[10:12]
+    assert status[13:] == ["tracking"] * 3
+
+
+def test_half_of_the_sightings_false():
+    def see(t, seen):
+        rng = np.random.default_rng(int(t))
+        n = len(seen)
+        return Sightings(
+            np.concatenate([seen.centre_px, rng.uniform(0, 256, (n, 2))]),
+            np.concatenate([seen.radius_px, rng.permutation(seen.radius_px)]),
+            np.concatenate([seen.score, seen.score]),
+        )
+
+    errors, normalised, status = flown(*lander(3), see=see)
+    assert set(status[2:]) == {"tracking"}
+    assert np.linalg.norm(errors[2:], axis=1).max() < 12
+    assert normalised[2:].mean() < 14
+
+
+def test_a_gap_of_the_inertial_unit_makes_the_state_uncertain():
+    whole, gap = lander(4), lander(4)
+    flown(*whole, see=lambda t, seen: seen if t < 5 else NOTHING, seconds=9)
+    flown(*gap, see=lambda t, seen: seen if t < 5 else NOTHING, seconds=9, feel=lambda t: not 6 <= t < 8)
+    sigma = [np.sqrt(np.trace(one[0].state.covariance[:3, :3])) for one in (whole, gap)]
+    assert sigma[1] > 2 * sigma[0]
+    assert np.isfinite(gap[0].state.covariance).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_senseless_measurements_change_nothing(value):
+    craft, *_ = lander(5)
+    before = craft.state
+    assert not craft.range(value)
+    assert not craft.range(-3.0)
+    craft.inertial(Increments.single(0.05, 0.05, np.full(3, value), np.zeros(3)))
+    craft.inertial(Increments.single(-1.0, 0.05, np.zeros(3), np.zeros(3)))
+    assert craft.state is before
+
+
+def test_no_sightings_for_long_is_lost():
+    _, _, status = flown(*lander(6), see=lambda t, seen: NOTHING, seconds=20)
+    assert status[-1] == "lost"
+
+
+def test_the_smoother_keeps_all_frames_and_ends_where_the_filter_ends():
+    squared, filtered, smoothed = [], [], []
+    for seed in range(2):
+        plain = lander(seed)
+        errors, _, _ = flown(*plain)
+        craft, rng, biases = lander(seed)
+        keeping = Lander(craft.state, NOISE, craft.surroundings, keep_poses=True)
+        flown(keeping, rng, biases)
+        state, at_end = keeping.state, plain[0].state
+        assert len(state.past_position_m) == len(errors)
+        np.testing.assert_allclose(state.position_m, at_end.position_m, atol=1e-6)
+        np.testing.assert_allclose(state.covariance[:15, :15], at_end.covariance[:15, :15], rtol=1e-6, atol=1e-15)
+        for k in range(len(errors)):
+            error, covariance = state.past_pose_error(k, POSITION_M + VELOCITY_MPS * k, np.eye(3))
+            squared.append(error @ np.linalg.solve(covariance, error))
+            smoothed.append(error[:3])
+        filtered.append(errors)
+    assert np.sqrt(np.mean(np.square(smoothed))) < 0.7 * np.sqrt(np.mean(np.square(filtered)))
+    assert 2.5 < np.mean(squared) < 9
+
+
+def test_flights_together_are_those_one_by_one():
+    """Measurements of three flights at the same times, with a gap, a missed range and a missing measurement."""
+    time_s, rng = 0.05 * np.arange(1, 101), np.random.default_rng(0)
+    time_s = time_s[(time_s < 2.02) | (time_s > 2.53)]
+    rate, force = 0.01 * rng.normal(size=(3, len(time_s), 3)), 0.02 * rng.normal(size=(3, len(time_s), 3))
+    rate[:, 7] = np.nan
+    force[..., 2] += 1.62
+    frames, ranges = np.arange(5.0), np.arange(0.1, 5, 0.2)
+    range_m = 1400 - 35 * ranges + rng.normal(size=len(ranges))
+    range_m[3] = np.nan
+    inertial = Increments(time_s, np.full(len(time_s), 0.05), rate, force)
+    alone = [
+        Instruments(dataclasses.replace(inertial, angular_rate_radps=one, specific_force_mps2=other), ranges, range_m)
+        for one, other in zip(rate, force, strict=True)
+    ]
+    seen = [
+        [
+            sighted(WORLD, Pose(POSITION_M + t * VELOCITY_MPS, MOUNTING), np.random.default_rng(int(10 * t) + k))
+            for t in frames
+        ]
+        for k in range(3)
+    ]
+    flown = [list(fly(lander(k)[0], alone[k], frames, seen[k])) for k in range(3)]
+    crafts = [lander(k)[0] for k in range(3)]
+    found = list(fly_together(crafts, together(alone), frames, zip(*seen, strict=True)))
+    assert len(found) == len(frames)
+    for number, estimates in enumerate(found):
+        for k, estimate in enumerate(estimates):
+            expected = flown[k][number]
+            assert (estimate.status, estimate.frame) == (expected.status, number)
+            np.testing.assert_allclose(estimate.state.position_m, expected.state.position_m, atol=1e-7)
+            np.testing.assert_allclose(estimate.state.covariance, expected.state.covariance, rtol=1e-5, atol=1e-9)
+    assert "tracking" in {one.status for one in found[-1]}
+    assert all(craft.state.time_s == ranges[-1] for craft in crafts)

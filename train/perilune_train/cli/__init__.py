@@ -1,0 +1,8 @@
+"""The program `perilune-train`."""
+
+from perilune_shared.console.interrupts import start
+
+
+def main() -> None:
+    """Entry point: import the command line and run it."""
+    start("perilune_train.cli.main")

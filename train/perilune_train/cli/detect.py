@@ -1,0 +1,408 @@
+"""`perilune-train detect`: train, evaluate, find craters in images, export for flight."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.config.resolve import parse_setting, resolve, resolve_over
+from perilune_shared.console.terminal import say, say_page
+from perilune_shared.errors import UserError
+from perilune_shared.storage.replacement import replaceable
+from perilune_train.cli.options import (
+    AllowOverlap,
+    ConfigFile,
+    Overwrite,
+    OverwriteFolder,
+    Preset,
+    RunName,
+    RunsFolder,
+    Settings,
+)
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.finished_run import check_output, config_of_run
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.shipped.models import shipped_run
+
+app = typer.Typer(
+    help="Crater detection: train, evaluate, find craters in images, export for flight.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+Scales = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--scale",
+        help="Factor by which images are resized before detection. Repeatable; detections at all scales are merged."
+        " [default: those of the run]",
+    ),
+]
+TileSide = Annotated[
+    int, typer.Option("--tile", help="Side of the tiles, pixels; best is the side of the training frames.")
+]
+BoxMargin = Annotated[
+    float,
+    typer.Option(
+        help="Margin added to every side of the detected boxes, pixels. They end at the crest of the rim; use 0.5 to"
+        " compare them with labels that are boxes of whole pixels around a crater."
+    ),
+]
+NoData = Annotated[
+    float | None,
+    typer.Option(
+        help="Value of pixels without data, if the files do not declare it. [default: found where it stands apart]"
+    ),
+]
+Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels.")]
+
+
+def check_nodata(value: float | None) -> None:
+    """Raise UserError if it is not a finite number."""
+    if value is not None and not abs(value) < float("inf"):
+        raise UserError("--nodata", "value", value, "a finite number; others are always taken as no data")
+
+
+@app.command("train")
+def train(
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<preset>/detect]"
+        ),
+    ] = None,
+    runs: RunsFolder = Path("runs"),
+    name: RunName = None,
+    allow_overlap: AllowOverlap = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Train the crater detector (attention YOLOv3) and evaluate it on the test split.
+
+    Writes runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
+    detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. The same
+    command resumes an interrupted run and leaves a finished one unchanged; --overwrite replaces it.
+
+    The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
+    """
+    settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
+    # Importing torch and Lightning takes seconds; check the settings first.
+    from perilune_train.detect.train.run import run_detect
+
+    run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)
+
+
+_FOR_DATASETS = ("dataset", "allow_overlap")
+_FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin", "category", "image_folder", "nodata")
+
+
+@app.command("evaluate")
+def evaluate(
+    context: typer.Context,
+    run: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a finished detect run. [default: the detector that is installed]"),
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<name of the run>/detect]"
+        ),
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test; with --images of a source that has splits.")] = "test",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting of detect.evaluation or detect.labels in place of the run's. Repeatable."
+        ),
+    ] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="Score threshold. [default: the run's, chosen on its validation split]")
+    ] = None,
+    choose_threshold: Annotated[
+        bool,
+        typer.Option(
+            "--choose-threshold",
+            help="Choose a new threshold on the validation split, for settings other than those of the run.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder to write into. [default: <run>/evaluation, with --images <run>/images; needed without --run]"
+        ),
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Labelled images in place of a dataset: a folder or a label file of COCO, YOLO, CVAT, Pascal VOC,"
+            " LabelMe or tables of boxes."
+        ),
+    ] = None,
+    category: Annotated[
+        list[str] | None,
+        typer.Option(help="With --images: name of a category that is craters. Repeatable. [default: crater, craters]"),
+    ] = None,
+    image_folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --images: folder of the images that a label file names. [default: those near the file]"
+        ),
+    ] = None,
+    nodata: NoData = None,
+    min_size: Annotated[
+        float, typer.Option(help="With --images: minimum size sqrt(w h) of a crater to find, pixels.")
+    ] = 8.0,
+    scale: Scales = None,
+    tile: TileSide = Tiling.tile_px,
+    overlap: Overlap = Tiling.overlap_px,
+    box_margin: BoxMargin = Tiling.box_margin_px,
+) -> None:
+    """Evaluate a run's best weights: report.md, metrics.json, detections.parquet and pictures.
+
+    The threshold is the run's own, chosen on the validation split of its training dataset, unless --threshold sets one
+    or --choose-threshold chooses a new one.
+    """
+    from perilune_shared.dataset.names import SPLITS
+
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
+    if choose_threshold and (threshold is not None or images is not None or split == "val"):
+        other = "--threshold" if threshold is not None else "--images" if images is not None else "--split val"
+        raise UserError("--choose-threshold", "options", f"together with {other}", "only one of them")
+    for name in _FOR_IMAGES if images is None else _FOR_DATASETS:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + name.replace("_", "-")
+            if images is None:
+                raise UserError(option, "options", "no --images", f"--images, or no {option}")
+            raise UserError(option, "options", "together with --images", "only one of them")
+    if run is None:
+        run = shipped_run("detect")
+        if out is None:
+            raise UserError("--out", "folder", "none", "a folder to write into, since --run is not given")
+        if dataset is None and images is None:
+            raise UserError("--dataset", "address", "none", "a dataset or --images, since --run is not given")
+    config = config_of_run(run, tuple(set_ or ()))
+    if images is not None:
+        for text in set_ or ():
+            keys, _ = parse_setting(text)
+            if keys[1] == "labels":
+                raise UserError("--set", ".".join(keys), "together with --images", "--min-size instead")
+        from perilune_train.detect.images.evaluate import ImageSettings, evaluate_images
+        from perilune_train.detect.images.labelled import Request
+
+        folder = out or run / "images"
+        tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
+        source = context.get_parameter_source("split")
+        chosen = split if source is not None and source.name == "COMMANDLINE" else None
+        check_nodata(nodata)
+        request = Request(chosen, tuple(category or ()), image_folder)
+        settings = ImageSettings(tiling, min_size, threshold, nodata, request)
+        evaluate_images(run, config, images, folder, settings)
+        say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
+        return
+    if scale:
+        own = config.model_dump(mode="json")
+        own["evaluation"]["scales"] = scale
+        config = resolve_over(DetectConfig, "detect", "--scale", own)
+    # Importing torch takes seconds; check the settings first.
+    from perilune_train.detect.evaluate_run import evaluate_again
+
+    address = dataset or Path("data", run.resolve().name, "detect")
+    folder = evaluate_again(run, config, address, split, threshold, out, choose_threshold, allow_overlap)
+    say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
+
+
+@app.command("benchmark")
+def benchmark(
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished detect run. [default: the detector that is installed]")
+    ] = None,
+    detections: Annotated[
+        Path | None, typer.Option(help="Parquet or CSV table of another detector's detections, in place of --run.")
+    ] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="With --detections: score threshold of precision, recall and F1.")
+    ] = None,
+    data: Annotated[str, typer.Option(help="Folder or address of the rendered benchmark.")] = "data/benchmark",
+    manifests: Annotated[str, typer.Option(help="Folder or address of the shared manifests.")] = "data_manifests",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write into. [default: runs/benchmark/<name of the run or table>]")
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Score on the locked benchmark: benchmark.md, benchmark.json, and pictures by rule of labels."""
+    if run is not None and detections is not None:
+        raise UserError("benchmark", "options", "both --run and --detections", "one of them")
+    if (threshold is None) != (detections is None):
+        expected = "--threshold, chosen on other frames" if detections else "none: a run has its own threshold"
+        raise UserError("--threshold", "score", threshold, expected)
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
+    from perilune_train.detect.benchmark.run import FIGURES, PAGE, score_run, score_submission
+
+    if detections is not None and threshold is not None:
+        folder = out or Path("runs/benchmark", detections.stem)
+        made = score_submission(detections, detections.stem, threshold, data, manifests, folder)
+    else:
+        run = run or shipped_run("detect")
+        folder = out or Path("runs/benchmark", run.resolve().name)
+        check_output(folder, run)
+        made = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
+    rule, account, value = made.least("ap50_paper")
+    say(f"AP {value:.3f} by the least favourable account (labels by {rule}, {account}); {folder}: {PAGE}, {FIGURES}")
+
+
+@app.command("compare")
+def compare(
+    folders: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or of evaluations.")],
+    out: Annotated[Path, typer.Option(help="Folder to write into.")] = Path("runs/detect/compare"),
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Compare runs or evaluations: writes compare.md (a table) and precision_recall.png."""
+    # matplotlib and torch take seconds to load.
+    from perilune_train.detect.compare_runs import compare_folders
+
+    say_page(compare_folders(folders, out, allow_overlap))
+    say(f"{out}: compare.md, precision_recall.png")
+
+
+@app.command("predict")
+def predict(
+    images: Annotated[list[Path], typer.Argument(help="Images of any size, or folders of images.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("predictions"),
+    min_score: Annotated[
+        float | None,
+        typer.Option(
+            "--min-score", "--threshold", help="Minimum score. [default: the run's, chosen on its validation split]"
+        ),
+    ] = None,
+    min_radius_px: Annotated[
+        float, typer.Option(help="Minimum radius sqrt(w h) / 2 of a crater in the results, pixels.")
+    ] = 0.0,
+    min_size: Annotated[float, typer.Option(help="Twice --min-radius-px: minimum sqrt(w h), pixels.")] = 0.0,
+    top: Annotated[
+        int | None, typer.Option(min=1, help="Maximum number of craters in an image: those of the highest scores.")
+    ] = None,
+    nodata: NoData = None,
+    scale: Scales = None,
+    tile: TileSide = Tiling.tile_px,
+    overlap: Overlap = Tiling.overlap_px,
+    box_margin: BoxMargin = Tiling.box_margin_px,
+    overwrite: OverwriteFolder = False,
+) -> None:
+    """Find craters in images.
+
+    Writes detections.parquet and detections.csv (one row per crater, in pixels of the upright image, from the outer
+    corner of its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference.
+    """
+    if min_score is not None and not 0 < min_score <= 1:
+        raise UserError("--min-score", "score", min_score, "above 0, at most 1")
+    for option, pixels in (("--min-radius-px", min_radius_px), ("--min-size", min_size)):
+        if not 0 <= pixels < float("inf"):
+            raise UserError(option, "pixels", pixels, "at least 0")
+    if min_radius_px and min_size:
+        raise UserError("--min-size", "options", "together with --min-radius-px", "only one of them")
+    check_nodata(nodata)
+    run = run or shipped_run("detect")
+    config = config_of_run(run, ())
+    # Importing torch takes seconds; check the options first.
+    from perilune_train.detect.images.predict import PredictSettings, predict_images
+
+    tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
+    settings = PredictSettings(tiling, min_score, max(min_size, 2 * min_radius_px), nodata, top)
+    with replaceable(out, ("detections.parquet",), overwrite=overwrite) as folder:
+        count = predict_images(images, run, config, folder, settings)
+    n_images = len(list(out.glob("*.overlay.png")))
+    places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
+    written = f"detections.parquet, detections.csv{places}, *.overlay.png"
+    say(f"{out}: {count} craters in {n_images} images; {written}")
+
+
+@app.command("export")
+def export(
+    out: Annotated[Path, typer.Option(help="New folder for the files.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished run. [default: the detector that is installed]")
+    ] = None,
+    formats: Annotated[str, typer.Option(help="onnx, openvino, or both separated by a comma.")] = "onnx,openvino",
+    size_px: Annotated[int, typer.Option(help="Side of the square images, a multiple of 32.")] = 256,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Dataset (folder or address); the files are compared with torch on its validation frames."),
+    ] = None,
+    int8: Annotated[bool, typer.Option("--int8", help="Also try 8-bit integers; needs --dataset.")] = False,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Write a trained detector as ONNX and OpenVINO files, for flight.
+
+    Writes detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. Every
+    file is run and compared with torch first. --int8 adds detector-int8.onnx, quantised on training frames, only if it
+    is faster and loses at most 0.005 of AP on the validation frames.
+    """
+    asked = tuple(part.strip() for part in formats.split(","))
+    if not set(asked) <= {"onnx", "openvino"}:
+        raise UserError("options", "--formats", formats, "onnx, openvino or onnx,openvino")
+    if size_px <= 0 or size_px % 32:
+        raise UserError("options", "--size-px", size_px, "a multiple of 32")
+    if int8 and dataset is None:
+        raise UserError("options", "--int8", "no --dataset", "a dataset to calibrate and to evaluate on")
+    # Importing torch takes seconds; check the options first.
+    from perilune_train.detect.deploy.export import export_run
+
+    export_run(run or shipped_run("detect"), out, asked, size_px, dataset, int8, allow_overlap)
+    say(f"{out}: README.md explains how to use the files")
+
+
+@app.command("weights")
+def weights(
+    checkpoint: Annotated[
+        Path, typer.Argument(help="best.ckpt of a detect run; for a Darknet file of width 1 with 3 input channels.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File to write: NAME.safetensors to share, NAME.conv.74 for Darknet's backbone, NAME.weights for the"
+            " whole network."
+        ),
+    ],
+) -> None:
+    """Write the weights of a run as a file to share, or as a Darknet file; `detect.init_from` reads both.
+
+    NAME.safetensors has half precision and holds no code; a folder with it as weights.safetensors, config.yaml and
+    metrics.json is a run.
+
+    NAME.conv.74 has the 52 convolutions of the backbone. NAME.weights has all 75 and needs a network without attention
+    and with strides 8 16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors.
+    """
+    if not out.name.endswith((".safetensors", ".conv.74", ".weights")):
+        expected = "a name that ends in .safetensors, .conv.74 or .weights"
+        raise UserError(out, "--out", f"the name {out.name}", expected)
+    # Importing torch takes seconds; check the name first.
+    from perilune_train.detect.inference.detector import check_detector, load_detector
+    from perilune_train.detect.train.transfer import darknet_content
+    from perilune_train.models.darknet_weights import write_darknet
+    from perilune_train.training import runs
+    from perilune_train.training.half_weights import write_half
+
+    if out.suffix == ".safetensors":
+        stored = runs.load_weights(checkpoint)
+        check_detector(stored, checkpoint)
+        write_half(out, stored)
+        say(f"{out}: {len(stored['state_dict'])} tensors in half precision")
+        return
+    network = load_detector(checkpoint)
+    architecture = runs.load_weights(checkpoint)["architecture"]
+    content = darknet_content(network, architecture, checkpoint, whole=out.suffix == ".weights")
+    write_darknet(out, content)
+    gates = "" if architecture["attention"] == "none" else "; attention gates are not included"
+    say(f"{out}: {len(content.values)} floats{gates}")

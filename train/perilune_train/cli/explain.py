@@ -1,0 +1,163 @@
+"""`perilune-train explain` and `causal`: what attention gates show, and what single craters do."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import say
+from perilune_shared.errors import UserError
+from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunsFolder, Settings
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.records.metrics_file import METRICS_FILE, read_metrics
+from perilune_train.shipped.models import shipped_run
+
+
+def explain(
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="Folder, s3://bucket/prefix or gs://bucket/prefix that holds the datasets detect and nav."
+            " [default: data/<preset>]"
+        ),
+    ] = None,
+    runs: RunsFolder = Path("runs"),
+    name: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the run, and of the detect and navigate runs that it explains. [default: the preset]"
+        ),
+    ] = None,
+    task: Annotated[
+        Literal["both", "detect", "navigate"],
+        typer.Option(help="Networks to explain. With `detect` no navigator is needed, with `navigate` no detector."),
+    ] = "both",
+    detector: Annotated[
+        Path | None,
+        typer.Option(
+            help="A detector's best.ckpt in its run's folder. [default: runs/detect/<name>/checkpoints/best.ckpt;"
+            " with --task detect the installed detector if there is no such run]"
+        ),
+    ] = None,
+    navigator: Annotated[
+        Path | None,
+        typer.Option(help="A stack navigator's best.ckpt. [default: runs/navigate/<name>-stack/checkpoints/best.ckpt]"),
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Test what attention gates show: nulls, interventions, localisation, stability.
+
+    Computes the paper's correlations PCC1 to PCC4 of each gate and of null maps. A gate counts only if it beats every
+    null. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
+
+    Writes runs/explain/<name>/ with claims.json, metrics.json, the tables of all values and pictures. Leaves a finished
+    run of the same settings, datasets and checkpoints unchanged; --overwrite replaces it.
+    """
+    settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
+    # Importing torch and Lightning takes seconds; check the settings first.
+    from perilune_train.explain.run import explain_run
+    from perilune_train.training.runs import RunFolder
+
+    name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
+    for given, option, other in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
+        if given is not None and task == other:
+            raise UserError(option, "option", str(given), f"nothing beside --task {other}")
+    if task != "navigate" and detector is None:
+        own = runs / "detect" / name
+        detector = RunFolder(shipped_run("detect") if task == "detect" and not own.is_dir() else own).best
+    if task != "detect" and navigator is None:
+        navigator = RunFolder(runs / "navigate" / f"{name}-stack").best
+    run = explain_run(
+        settings, f"{above}/detect", f"{above}/nav", detector, navigator, runs, name, overwrite, allow_overlap
+    )
+    say(f"{run.root}: claims.json, metrics.json, *.parquet, *.png")
+
+
+def causal(
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
+    dataset: Annotated[
+        str | None, typer.Option(help="Detection dataset with all craters. [default: data/<preset>/detect]")
+    ] = None,
+    counterfactual: Annotated[
+        str | None,
+        typer.Option(
+            help="The same frames without some craters, from `perilune-render counterfactual`."
+            " [default: data/<preset>/causal]"
+        ),
+    ] = None,
+    turned: Annotated[str | None, typer.Option(help="The same frames under another Sun, with all craters.")] = None,
+    split: Annotated[str, typer.Option(help="Split of the frames.")] = "test",
+    runs: RunsFolder = Path("runs"),
+    name: Annotated[
+        str | None, typer.Option(help="Name of the run, and of the detect run that it explains. [default: the preset]")
+    ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a detect run. [default: runs/detect/<name>; the installed detector if absent]"),
+    ] = None,
+    gate: Annotated[
+        str | None,
+        typer.Option(help="Gate of the headline, such as B_22. [default: that of runs/explain/<name>, else B_11]"),
+    ] = None,
+    nav_dataset: Annotated[str | None, typer.Option(help="Navigation dataset with all craters, for poses.")] = None,
+    nav_counterfactual: Annotated[
+        str | None, typer.Option(help="The same descents without some craters, with all their frames.")
+    ] = None,
+    navigator: Annotated[
+        Path | None,
+        typer.Option(help="A stack navigator's best.ckpt. [default: runs/navigate/<name>-stack/checkpoints/best.ckpt]"),
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure what single craters do to attention masks, detections and poses.
+
+    Compares frames rendered with and without some craters, everything else equal. Writes runs/explain/<name>-causal/
+    with the tables of all effects, pictures, claims.json and metrics.json. Leaves a finished run of the same inputs
+    unchanged; --overwrite replaces it.
+    """
+    settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
+    if (nav_dataset is None) != (nav_counterfactual is None):
+        raise UserError("--nav-dataset", "datasets", "one of two", "--nav-dataset and --nav-counterfactual together")
+    # Importing torch and Lightning takes seconds; check the settings first.
+    from perilune_train.explain.causal.run import causal_folder, causal_run
+    from perilune_train.training.begin import held
+    from perilune_train.training.runs import RunFolder
+
+    name = name or preset
+    own = run or runs / "detect" / name
+    if run is None and not own.is_dir():
+        own = shipped_run("detect")
+    pose = None
+    if nav_dataset is not None and nav_counterfactual is not None:
+        best = navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt"
+        pose = nav_dataset, nav_counterfactual, best
+    with held(causal_folder(runs, name)):
+        made = causal_run(
+            settings,
+            dataset or f"data/{preset}/detect",
+            counterfactual or f"data/{preset}/causal",
+            RunFolder(own).best,
+            gate or _chosen_gate(runs / "explain" / name),
+            runs,
+            name,
+            split,
+            turned,
+            pose,
+            overwrite,
+            allow_overlap,
+        )
+    say(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
+
+
+def _chosen_gate(explained: Path) -> str:
+    """The gate that an explain run chose on validation frames; B_11, the paper's first, if there is no such run."""
+    found = read_metrics(explained).get("detect/strongest_gate") if (explained / METRICS_FILE).is_file() else None
+    return found if isinstance(found, str) else "B_11"

@@ -1,0 +1,379 @@
+"""`perilune-train navigate`: train navigators, evaluate and compare them, fly the filter over descents."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.config.resolve import resolve
+from perilune_shared.console.terminal import answer_page, say, say_page
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.inertial_grades import GRADES
+from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
+from perilune_train.landing.monte_carlo.scenario import SCENARIOS
+from perilune_train.motion.config import NavigateConfig
+from perilune_train.shipped.models import shipped_run
+
+app = typer.Typer(
+    help="Landing navigation: train the networks, evaluate, compare and export runs, fly the filter over a descent.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.command("train")
+def train(
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<preset>/nav]"),
+    ] = None,
+    runs: RunsFolder = Path("runs"),
+    name: RunName = None,
+    allow_overlap: AllowOverlap = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Train the navigation networks and evaluate them together with the nominal motion, mean motions and KLT tracks.
+
+    Writes runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's network), each
+    with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row per method),
+    errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. With navigate.stack.target=pose
+    the stack run has pose.md (the table) in place of descent.png. The stack network is initialised
+    with the backbone of runs/detect/<name>, if that has the same architecture. The same command resumes an interrupted
+    run and leaves finished ones unchanged; --overwrite replaces them.
+    """
+    settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
+    # Importing torch and Lightning takes seconds; check the settings first.
+    from perilune_train.motion.train.run import navigate_run
+
+    name = name or preset
+    detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
+    address = dataset or Path("data", preset, "nav")
+    for run in navigate_run(settings, address, runs, name, detector, overwrite, allow_overlap):
+        say(f"{run.root}: metrics.json, navigation.parquet, errors.png")
+
+
+@app.command("evaluate")
+def evaluate(
+    dataset: Annotated[str, typer.Option(help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write into. [default: <run>/evaluation; runs/evaluation/<name> without --run]"),
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Evaluate a run's best weights together with KLT tracks and the nominal motion.
+
+    Writes metrics.json, navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png and
+    errors.png. A run for poses (navigate.stack.target=pose) is evaluated over the landing area of its training, beside
+    the mean pose, with pose.md in place of descent.png.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    # torch takes seconds to load.
+    from perilune_train.motion.finished_run import evaluate_navigator
+
+    default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
+    folder = evaluate_navigator(run or shipped_run("navigate"), dataset, split, out or default, allow_overlap)
+    say(f"{folder}: metrics.json, navigation.parquet, errors.parquet, errors.png")
+
+
+@app.command("benchmark")
+def benchmark(
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+    ] = None,
+    data: Annotated[str, typer.Option(help="Folder or address of the rendered benchmark.")] = "data/benchmark",
+    manifests: Annotated[str, typer.Option(help="Folder or address of the shared manifests.")] = "data_manifests",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write into. [default: runs/benchmark/<name of the run>-navigate]")
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Score on the locked benchmark: benchmark.md, benchmark.json, tables of errors and pictures."""
+    # torch takes seconds to load.
+    from perilune_train.motion.benchmark import FIGURES, HEADLINE, PAGE, score_navigator
+
+    run = run or shipped_run("navigate")
+    folder = out or Path("runs/benchmark", f"{run.resolve().name}-navigate")
+    figures = score_navigator(run, data, manifests, folder, allow_overlap)
+    say(f"position RMSE {figures[f'headline/{HEADLINE}']:.3f} m; {folder}: {PAGE}, {FIGURES}")
+
+
+@app.command("benchmark-landing")
+def benchmark_landing(
+    detector: Annotated[
+        Path | None, typer.Option(help="Folder of a finished detect run. [default: the detector that is installed]")
+    ] = None,
+    data: Annotated[str, typer.Option(help="Folder or address of the rendered benchmark.")] = "data/benchmark",
+    manifests: Annotated[str, typer.Option(help="Folder or address of the shared manifests.")] = "data_manifests",
+    maps: Annotated[
+        Path | None, typer.Option("--maps", help="Folder with one map by `navigate map` for each part, by its name.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder. [default: runs/benchmark/<name of the run>-landing]")
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Score poses from craters and the filter on the locked benchmark: benchmark.md, benchmark.json, frames.parquet."""
+    # torch takes seconds to load.
+    from perilune_train.landing.methods.benchmark import FIGURES, PAGE, POSITION, score_landing
+
+    run = detector or shipped_run("detect")
+    folder = out or Path("runs/benchmark", f"{run.resolve().name}-landing")
+    figures = score_landing(run, data, manifests, folder, maps, allow_overlap)
+    if f"filter/{POSITION}" in figures:
+        say(f"filter: position RMSE {figures[f'filter/{POSITION}']:.3f} m")
+    say(f"{folder}: {PAGE}, {FIGURES}, frames.parquet")
+
+
+@app.command("calibrate")
+def calibrate(
+    run: Annotated[Path, typer.Option(help="Folder of a finished navigate run with a warp network.")],
+    dataset: Annotated[
+        str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
+    ],
+    split: Annotated[str, typer.Option(help="train, val or test: the descents to fit to.")] = "val",
+) -> None:
+    """Fit the covariance that a warp network states to its errors on validation descents; writes covariance.json.
+
+    Refuses test terrain. A training does this at its end. Use it for runs of earlier versions, or for another camera.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    # torch takes seconds to load.
+    from perilune_shared.dataset.manifest import open_single
+    from perilune_train.motion.covariance import FILE
+    from perilune_train.motion.covariance import calibrate as fit
+    from perilune_train.motion.data.trajectories import load_split
+    from perilune_train.motion.finished_run import fusion_of
+    from perilune_train.motion.network import load_navigator
+    from perilune_train.records.provenance import check_calibration, read_provenance, split_terrain
+    from perilune_train.training.runs import RunFolder, load_weights
+
+    best = RunFolder(run).best
+    fusion = fusion_of(best, load_weights(best)["architecture"])
+    if fusion != "warp":
+        raise UserError(best, "fusion", fusion, "warp; the paper's network states no covariance")
+    opened = open_single(dataset)
+    check_calibration(read_provenance(load_weights(best), best), split_terrain(opened, split, "calibrated"), opened)
+    network, architecture = load_navigator(best, fusion)
+    fit(run, network, architecture, load_split(opened, split))
+    say(f"{run / FILE}")
+
+
+@app.command("compare")
+def compare(
+    folders: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or of evaluations.")],
+    out: Annotated[Path, typer.Option(help="Folder to write into.")] = Path("runs/navigate/compare"),
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Compare runs or evaluations: writes compare.md (a table) and errors.png."""
+    # matplotlib takes seconds to load.
+    from perilune_train.motion.compare_runs import compare_folders
+
+    say_page(compare_folders(folders, out, allow_overlap))
+    say(f"{out}: compare.md, errors.png")
+
+
+@app.command("export")
+def export(
+    out: Annotated[Path, typer.Option(help="New folder for the files.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="Dataset (folder or address): export for its camera, and compare with torch on its validation frames."
+        ),
+    ] = None,
+) -> None:
+    """Write a trained navigator as an ONNX file, for flight: one pair of frames and the state in, motion and state out.
+
+    Writes navigator.onnx, navigator.json (sizes, camera, normalisation) and README.md with a program that uses them.
+    The file is run pair by pair and compared with torch over the whole sequence first; without a dataset on noise.
+    """
+    # torch takes seconds to load.
+    from perilune_train.motion.deploy.export import export_navigator
+
+    largest = export_navigator(run or shipped_run("navigate"), out, dataset)
+    say(f"{out}: README.md explains how to use the files; difference from torch {largest:.1e}")
+
+
+@app.command("methods")
+def methods(
+    dataset: Annotated[
+        str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
+    ],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+    ] = None,
+    detector: Annotated[
+        Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/methods"),
+    maps: Annotated[
+        Path | None, typer.Option("--map", help="Folder of a map by `navigate map`, a further catalogue.")
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Fly all methods over a split: learned and classical motion, poses from craters, lost in space, the filter.
+
+    Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
+    frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
+    metrics.json (hashes, command, commit, versions). Catalogues, priors and starts are drawn with a fixed seed.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    # torch takes seconds to load.
+    from perilune_train.landing.methods.run import PAGE, fly_methods
+
+    networks = run or shipped_run("navigate"), detector or shipped_run("detect")
+    fly_methods(dataset, split, *networks, out, allow_overlap, maps)
+    say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")
+
+
+@app.command("monte-carlo")
+def monte_carlo(
+    dataset: Annotated[
+        str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
+    ],
+    detector: Annotated[
+        Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    scenario: Annotated[str, typer.Option(help="What goes wrong: " + ", ".join(SCENARIOS) + ".")] = "nominal",
+    draws: Annotated[int, typer.Option(min=1, max=100_000, help="Draws of each descent.")] = 200,
+    attitude_deg: Annotated[
+        float, typer.Option(min=0.001, max=10, help="Standard deviation of the attitude at the start, on each axis.")
+    ] = 0.5,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all draws.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes. [default: one per core]")] = None,
+    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/monte-carlo"),
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Fly the filter over random starts, catalogues and inertial errors of each descent.
+
+    The detector runs once over every frame; all draws use its detections. Writes monte_carlo.md (table and pictures),
+    draws.parquet (one row per draw and frame), errors.png and consistency.png.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if scenario not in SCENARIOS:
+        raise UserError("--scenario", "scenario", scenario, "one of " + ", ".join(SCENARIOS))
+    # torch takes seconds to load.
+    from perilune_train.landing.monte_carlo.run import PAGE, fly_draws
+
+    own = detector or shipped_run("detect")
+    fly_draws(dataset, split, own, out, scenario, draws, attitude_deg, seed, workers, allow_overlap)
+    say(f"{out / PAGE}: table and pictures; draws.parquet")
+
+
+@app.command("map")
+def make_map(
+    dataset: Annotated[str, typer.Option(help="Dataset that `perilune-render survey` has made.")],
+    detector: Annotated[
+        Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="New folder for the catalogues.")] = Path("runs/navigate/map"),
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Make a crater catalogue of each scene from two images of an orbiter, with our own detector.
+
+    Writes <scene_id>.parquet (x_m, y_m, z_m, diameter_m, score) for `navigate fly` and `navigate methods --map`,
+    map.json (stated errors), map.md and errors.parquet (compared with the craters of the terrain), and map.png.
+    """
+    # torch takes seconds to load.
+    from perilune_train.landing.map.run import PAGE, map_scenes
+
+    map_scenes(dataset, detector or shipped_run("detect"), out, allow_overlap)
+    say(f"{out / PAGE}: errors and picture; one catalogue per scene beside it")
+
+
+@app.command("fly")
+def fly(
+    frames: Annotated[Path, typer.Option(help="Folder of images with frames.csv: file, time_s.")],
+    camera: Annotated[Path, typer.Option(help="Intrinsics and mounting: camera.yaml.")],
+    catalogue: Annotated[Path, typer.Option(help="Craters of the landing site, Parquet or CSV.")],
+    imu: Annotated[Path, typer.Option(help="Inertial measurements: imu.csv.")],
+    prior: Annotated[Path, typer.Option(help="Expected state at the first frame, and errors of all: prior.yaml.")],
+    ranges: Annotated[Path | None, typer.Option(help="Ranges of a laser altimeter: ranges.csv.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="True poses, for errors beside the estimates: truth.csv.")] = None,
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("flight"),
+    live: Annotated[Path | None, typer.Option(help="Picture that is drawn again after each frame, *.png.")] = None,
+) -> None:
+    """Estimate position, velocity and attitude at each frame of a descent by craters, inertial unit and ranges.
+
+    Prints one line per frame to standard output: time, status (tracking, coasting or lost), position and its deviations
+    in O_L, largest deviation of the attitude, craters matched. Writes estimates.parquet, estimates.csv and flight.png.
+    `navigate unpack` writes an example of all files.
+    """
+    if live is not None and live.suffix.lower() != ".png":
+        raise UserError("--live", "name", live, "a name that ends in .png")
+    run = run or shipped_run("detect")
+    # torch takes seconds to load.
+    from perilune_train.landing.fly.run import doubts_of, fly_descent, read_descent
+
+    descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
+    for doubt in doubts_of(descent):
+        say(f"warning: {imu}: {doubt}")
+    table = fly_descent(descent, run, out, answer_page, live)
+    counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
+    written = "estimates.parquet, estimates.csv, flight.png"
+    say(f"{out}: {len(table)} frames ({counts}); {written}")
+    if (table["status"] == "lost").any():
+        for doubt in doubts_of(descent, is_lost=True):
+            say(f"a possible cause of the status lost: {imu}: {doubt}")
+    if "error_x_m" in table:
+        length = (table[[f"error_{axis}_m" for axis in "xyz"]] ** 2).sum(axis=1)
+        rms, end = length.mean() ** 0.5, length.iloc[-1] ** 0.5
+        answer_page(f"position error: {rms:.2f} m r.m.s., {end:.2f} m at the last frame")
+
+
+@app.command("unpack")
+def unpack(
+    dataset: Annotated[
+        str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
+    ],
+    trajectory: Annotated[str, typer.Option(help="scene_id/trajectory_id, for example scene-0000/trajectory-0000.")],
+    out: Annotated[Path, typer.Option(help="New folder for the files.")] = Path("descent"),
+    grade: Annotated[str, typer.Option(help="Grade of the inertial unit.")] = "tactical",
+    exact: Annotated[bool, typer.Option("--exact", help="Write the catalogue without errors.")] = False,
+    position_m: Annotated[float, typer.Option(help="Deviation of the prior's position on each axis.")] = 60.0,
+    velocity_mps: Annotated[float, typer.Option(help="Deviation of the prior's velocity on each axis.")] = 1.0,
+    attitude_deg: Annotated[float, typer.Option(help="Deviation of the prior's attitude on each axis.")] = 0.5,
+    seed: Annotated[int, typer.Option(help="Seed of the prior and of the errors of the catalogue.")] = 0,
+) -> None:
+    """Write a descent as frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv.
+
+    The prior is off by random errors; the catalogue has those of one made from orbit (1 m in position, 3 % in diameter,
+    one in ten craters missing, one in twenty false).
+    """
+    ids = tuple(trajectory.split("/"))
+    if len(ids) != 2:
+        raise UserError("--trajectory", "trajectory", trajectory, "scene_id/trajectory_id")
+    if grade not in GRADES:
+        raise UserError("--grade", "grade", grade, "one of " + ", ".join(GRADES))
+    offset = (position_m, velocity_mps, attitude_deg)
+    for name, value in zip(("--position-m", "--velocity-mps", "--attitude-deg"), offset, strict=True):
+        if not 0 < value < 1e4:
+            raise UserError(name, "deviation", value, "above 0, below 10000")
+    # pyarrow and pandas take a second to load.
+    from perilune_shared.dataset.manifest import open_single
+    from perilune_train.landing.fly.unpack import unpack_descent
+
+    count = unpack_descent(open_single(dataset), (ids[0], ids[1]), out, grade, exact, offset, seed)
+    names = "frames, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml, truth.csv"
+    say(f"{out}: {count} frames; {names}")

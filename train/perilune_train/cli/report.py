@@ -1,0 +1,78 @@
+"""`perilune-train report` and `paper`: the HTML report, and the page of the paper's experiment."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from perilune_shared.console.terminal import say, say_page
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import is_plain
+
+USUAL_MB = 15
+"""Size below which the page of `small` is to be, MB (1e6 bytes); a larger page opens slowly."""
+
+
+def report(
+    kind: Annotated[
+        Literal["demo", "paper", "benchmark"],
+        typer.Option(help="What to show: a demo, the paper's experiment, a score."),
+    ] = "demo",
+    name: Annotated[
+        str | None, typer.Option(help="Name of the runs and of the report. [default: small, paper or benchmark]")
+    ] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="Folder that holds the datasets. [default: data/<name>; data/benchmark]")
+    ] = None,
+    runs: Annotated[
+        Path | None, typer.Option(help="Folder that holds all runs. [default: runs; runs/<name> for paper]")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the report. [default: runs/report/<name>]")] = None,
+) -> None:
+    """Write the report of a demo, a paper run or a benchmark: one HTML file, and a summary in Markdown.
+
+    report.html needs no server and no network. It shows datasets, detection, navigation, explanation and the source of
+    each figure, and a viewer of one descent. What does not exist is left out and named.
+    """
+    # matplotlib and pandas take seconds to load.
+    from perilune_train.report.page import SUMMARY, write_report
+
+    chosen = name or {"demo": "small", "paper": "paper", "benchmark": "benchmark"}[kind]
+    if not is_plain(chosen) or "/" in chosen:
+        raise UserError("command line", "--name", chosen, "a plain name, without folders")
+    data = dataset or Path("data") / ("benchmark" if kind == "benchmark" else chosen)
+    root = runs or (Path("runs") / chosen if kind == "paper" else Path("runs"))
+    page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen)
+    megabytes = page.stat().st_size / 1e6
+    if megabytes > USUAL_MB:
+        text = f"warning: {page}: size: got {megabytes:.1f} MB, expected below {USUAL_MB} MB; it opens slowly"
+        say_page(text)
+    say(f"{page}: {megabytes:.1f} MB, open it in a browser; {SUMMARY} has the tables")
+
+
+def paper(
+    runs: Annotated[Path, typer.Option(help="Folder of the experiment's runs, as `make paper` makes them.")] = Path(
+        "runs/paper"
+    ),
+    dataset: Annotated[
+        str, typer.Option(help="Detection dataset of the headline ground: a folder or an address.")
+    ] = "data/paper/detect",
+    about: Annotated[
+        list[str] | None, typer.Option(help="A line of the page on how the experiment was made. Repeatable.")
+    ] = None,
+    headline_share: Annotated[
+        str | None,
+        typer.Option(
+            help="equilibrium_share of the headline ground. Default: on the curve, the AP nearest to the paper's."
+        ),
+    ] = None,
+) -> None:
+    """Write the page of the paper's experiment: its tables and figures beside ours, and a verdict on each claim.
+
+    Sections of runs that are not finished say so.
+    """
+    # torch and matplotlib take seconds to load.
+    from perilune_train.report.paper.page import write_page
+
+    page = write_page(runs, dataset, tuple(about or ()), headline_share)
+    say(f"{page}: tables, figures and verdicts; paper.json has the figures")

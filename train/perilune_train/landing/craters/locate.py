@@ -1,0 +1,86 @@
+"""A pose from one frame: near an expected pose, in an area, or anywhere over the catalogue."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_shared.geometry.camera import Camera
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.craters.fix import Fix, PosePrior, refine
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.search import N_TESTED, Area, search
+from perilune_train.landing.craters.sightings import Sightings
+
+_NEAR_PX = 6.0
+"""Standard deviation of the expected pose, pixels on the ground, up to which no search is needed."""
+_LEAST_AGREED = 8
+_LEAST_SHARE = 0.25
+"""Least number of sightings that agree with a hypothesis, and their least share of those tested."""
+_AHEAD = 1.5
+"""By how much the best hypothesis must be ahead of the next different one."""
+_SIGMAS = 3.5
+_REACHES = (1.0, 3.0)
+"""How far a search goes, by what the prior says: it may be wrong."""
+_NEAREST = 30
+"""Craters whose median height is that of the ground."""
+_LEAST_MARGIN = 0.06
+"""Least margin of the altitude in a search, as a share: the ground is not level."""
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """A fix and how it was found."""
+
+    fix: Fix
+    """The fix."""
+    searched: bool
+    """Whether it was found by search, not near the expected pose."""
+
+
+def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior) -> Located | None:
+    """The pose of a frame by its craters, near the expected pose if that is certain enough, else by search.
+
+    None if too few sightings can be matched, or if two places explain them about equally well.
+    """
+    ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
+    altitude_m = float(prior.pose.position_m[2] - ground_m)
+    sigma = np.sqrt(np.diag(prior.covariance))
+    on_ground_m = float(np.hypot(sigma[:2].max(), altitude_m * sigma[3:5].max()))
+    if on_ground_m * camera.fx_px < _NEAR_PX * max(altitude_m, 1.0):
+        found = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose)
+        if found is not None:
+            return Located(found, searched=False)
+    margin = max(_SIGMAS * float(sigma[2]) / max(altitude_m, 1.0), _LEAST_MARGIN)
+    reach_m = max(_SIGMAS * on_ground_m, 20 * altitude_m / camera.fx_px)
+    altitudes = altitude_m * max(1 - margin, 0.2), altitude_m * (1 + margin)
+    heading = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
+    for factor in _REACHES:
+        area = Area(prior.pose.position_m[:2], factor * reach_m, altitudes, heading)
+        searched = lost_in_space(sightings, catalogue, camera, prior, area)
+        if searched is not None:
+            return searched
+    return None
+
+
+def lost_in_space(
+    sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
+) -> Located | None:
+    """The pose of a frame somewhere in an area, from a tilt known to about a degree; None if it is not certain."""
+    found = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
+    least = max(_LEAST_AGREED, _LEAST_SHARE * min(len(sightings), N_TESTED))
+    if not found or found[0].n_agreed < least:
+        return None
+    if len(found) > 1 and found[0].n_agreed < _AHEAD * found[1].n_agreed and not _same(found[0].pose, found[1].pose):
+        return None
+    fix = refine(sightings, catalogue, camera, _around(found[0].pose), found[0].pose)
+    return Located(fix, searched=True) if fix is not None else None
+
+
+def _same(one: Pose, other: Pose) -> bool:
+    """Whether two hypotheses differ by the error of a hypothesis only."""
+    return float(np.linalg.norm(one.position_m - other.position_m)) < 0.1 * float(one.position_m[2])
+
+
+def _around(pose: Pose) -> PosePrior:
+    """Weak knowledge around a pose, so that a fix tells what the sightings tell and nothing twice."""
+    return PosePrior(pose, np.diag(np.square([300.0] * 3 + [np.radians(3.0)] * 3)))

@@ -1,0 +1,203 @@
+"""Find where a camera is: pairs of craters, without or with a rough knowledge of the position.
+
+Two craters determine shift, heading and altitude of a level camera. Pairs of sightings are looked up among the
+catalogue's pairs by their ratios of size to separation (a 3-dimensional tree), each hit is a hypothesis, and the
+hypothesis is tested on all sightings. An accepted one must explain far more sightings than the best different one.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_train.landing.craters.catalogue import Catalogue, Chosen
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.sightings import Sightings
+
+_N_PAIRED = 18
+"""Largest sightings that form pairs: larger craters are rarer."""
+_N_FIRST, N_TESTED = 24, 60
+"""Largest sightings that test every hypothesis, and those that test the best."""
+_LEAST_SEPARATION = 0.1
+"""Smallest separation of a pair, divided by the width of the image."""
+_SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
+"""Standard deviation of the logarithm of a size; that of altitude and heading, in the limits of an area; the largest
+distance of two pairs that may be the same, in standard deviations."""
+_TEST_PX, _TEST_SIZE = 4.0, 0.35
+"""A sighting agrees with a crater within this distance and difference of the logarithms of the sizes."""
+_MOST_PAIRED, _MOST_HITS, _MOST_TESTED = 800, 150, 1000
+"""Limits on the time: craters that form pairs, the largest first; hypotheses for a pair of sightings; hypotheses that
+are tested on more sightings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """Where the camera may be."""
+
+    centre_m: Array
+    """Middle of the search (2,), metres, O_L."""
+    reach_m: float
+    """Largest distance of the camera from it, over ground."""
+    altitude_m: tuple[float, float]
+    """Least and largest altitude above the ground."""
+    heading_rad: float
+    """Largest difference of the heading from that of the assumed attitude; pi if it is unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A pose, and how many sightings agree."""
+
+    pose: Pose
+    """The pose."""
+    n_agreed: int
+    """Number of sightings that agree with a crater."""
+
+
+def search(
+    sightings: Sightings, catalogue: Catalogue, camera: Camera, rotation_camera_from_site: Array, area: Area
+) -> list[Hypothesis]:
+    """The best hypotheses, the best first, each at least 10 px of ground away from those before; may be empty.
+
+    `rotation_camera_from_site` is the assumed attitude: its tilt must be right to about a degree.
+    """
+    rays = camera.rays(sightings.centre_px) @ rotation_camera_from_site
+    offset, size = rays[:, :2] / -rays[:, 2:], sightings.radius_px / camera.fx_px
+    if len(sightings) < 3:
+        return []
+    paired = _in_reach(catalogue, camera, sightings.radius_px[:_N_PAIRED], area)
+    local = _in_reach(catalogue, camera, sightings.radius_px[:N_TESTED], area)
+    paired = paired.part(np.argsort(-paired.radius_m, kind="stable")[:_MOST_PAIRED])
+    if len(paired) < 3:
+        return []
+    scale, turn, shift = _hypotheses(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
+    if not len(scale):
+        return []
+    # All hypotheses are tested on some sightings, the best on more.
+    agreed = _agreed(scale, turn, shift, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
+    best = np.argsort(-agreed, kind="stable")[:_MOST_TESTED]
+    scale, turn, shift = scale[best], turn[best], shift[best]
+    agreed = _agreed(scale, turn, shift, offset[:N_TESTED], size[:N_TESTED], local, camera)
+    ground_m = float(np.median(local.centre_m[:, 2]))
+    found: list[Hypothesis] = []
+    for k in np.argsort(-agreed, kind="stable"):
+        position = np.array([*shift[k], ground_m + scale[k]])
+        apart = 10 * scale[k] / camera.fx_px
+        if any(np.linalg.norm(one.pose.position_m - position) < apart for one in found):
+            continue
+        heading = np.eye(3)
+        heading[:2, :2] = [[np.cos(turn[k]), np.sin(turn[k])], [-np.sin(turn[k]), np.cos(turn[k])]]
+        found.append(Hypothesis(Pose(position, rotation_camera_from_site @ heading), int(agreed[k])))
+        if len(found) == 5:
+            break
+    return found
+
+
+def _in_reach(catalogue: Catalogue, camera: Camera, radius_px: Array, area: Area) -> Catalogue:
+    """Craters that the camera may see, of the sizes of these sightings."""
+    low, high = area.altitude_m
+    view = np.hypot(camera.width_px, camera.height_px) / 2 / camera.fx_px * high
+    near = np.linalg.norm(catalogue.centre_m[:, :2] - area.centre_m, axis=1) < area.reach_m + view
+    least, most = radius_px.min() * low / camera.fx_px, radius_px.max() * high / camera.fx_px
+    factor = np.exp(_TEST_SIZE)
+    sized = (catalogue.radius_m > least / factor) & (catalogue.radius_m < most * factor)
+    return catalogue.part(np.flatnonzero(near & sized))
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """Ordered pairs of circles in a plane."""
+
+    index: Array
+    """First and second circle (n, 2)."""
+    separation: Array
+    """Logarithms of the separations (n,)."""
+    sizes: Array
+    """Logarithms of both radii, divided by the separation (n, 2)."""
+    direction: Array
+    """Directions from the first to the second (n,), radians."""
+
+    @classmethod
+    def of(cls, place: Array, size: Array, least: float, most: float) -> "_Pairs":
+        """Pairs with a separation in limits."""
+        index = KDTree(place).query_pairs(most, output_type="ndarray")
+        index = np.concatenate([index, index[:, ::-1]])
+        across = place[index[:, 1]] - place[index[:, 0]]
+        separation = np.linalg.norm(across, axis=1)
+        kept = separation > least
+        index, across, separation = index[kept], across[kept], separation[kept]
+        direction = np.arctan2(across[:, 1], across[:, 0])
+        return cls(index, np.log(separation), np.log(size[index] / separation[:, None]), direction)
+
+    def part(self, chosen: Chosen) -> "_Pairs":
+        """Some of the pairs."""
+        return _Pairs(self.index[chosen], self.separation[chosen], self.sizes[chosen], self.direction[chosen])
+
+    def places(self, log_range: float, heading_rad: float) -> Array:
+        """Places (n, 5) whose distance is that of two pairs in standard deviations; a range has `_SIGMAS` of them."""
+        on_circle = np.column_stack([np.cos(self.direction), np.sin(self.direction)])
+        across = 2 * np.sin(min(heading_rad, np.pi) / 2)
+        ranged = self.separation[:, None] * _SIGMAS / (log_range + 0.01)
+        return np.concatenate([self.sizes / _SIZE_SIGMA, ranged, on_circle * _SIGMAS / across], axis=1)
+
+
+def _hypotheses(offset: Array, size: Array, local: Catalogue, camera: Camera, area: Area) -> tuple[Array, Array, Array]:
+    """Altitudes (n,), turns of the heading (n,) and positions (n, 2) of all pairs that fit a pair of the catalogue."""
+    none = np.zeros(0), np.zeros(0), np.zeros((0, 2))
+    low, high = area.altitude_m
+    width = camera.width_px / camera.fx_px
+    seen = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
+    seen = seen.part(seen.index[:, 0] < seen.index[:, 1])
+    if not len(seen.index):
+        return none
+    most = np.exp(seen.separation.max()) * high
+    known = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
+    if not len(known.index):
+        return none
+    # In the middle of the range of altitudes, the separations differ by half of it at most.
+    middle = replace(seen, separation=seen.separation + np.log(low * high) / 2)
+    log_range = np.log(high / low) / 2
+    tree = KDTree(known.places(log_range, area.heading_rad))
+    distance, second = tree.query(
+        middle.places(log_range, area.heading_rad), _MOST_HITS, distance_upper_bound=_FARTHEST
+    )
+    first, hit = np.nonzero(np.isfinite(distance))
+    second = second[first, hit]
+    if not len(first):
+        return none
+    turn = (known.direction[second] - seen.direction[first] + np.pi) % (2 * np.pi) - np.pi
+    scale = np.exp(known.separation[second] - seen.separation[first])
+    middle_seen = offset[seen.index[first]].mean(axis=1)
+    middle_known = local.centre_m[known.index[second], :2].mean(axis=1)
+    shift = middle_known - scale[:, None] * _turned(middle_seen, turn)
+    near = np.linalg.norm(shift - area.centre_m, axis=1) <= area.reach_m
+    return scale[near], turn[near], shift[near]
+
+
+def _agreed(
+    scale: Array, turn: Array, shift: Array, offset: Array, size: Array, local: Catalogue, camera: Camera
+) -> Array:
+    """Number of sightings (n,) that agree with a crater, by hypothesis."""
+    altitude = float(np.exp(np.log(scale).mean()))
+    per_log = _TEST_PX / _TEST_SIZE * altitude / camera.fx_px
+    tree = KDTree(np.column_stack([local.centre_m[:, :2], per_log * np.log(local.radius_m)]))
+    count = np.zeros(len(scale), int)
+    for start in range(0, len(scale), 2000):
+        own = slice(start, start + 2000)
+        turned = _turned(offset[None], turn[own, None])
+        ground = shift[own, None] + scale[own, None, None] * turned
+        sizes = per_log * np.log(scale[own, None] * size[None])
+        points = np.concatenate([ground, sizes[..., None]], axis=2).reshape(-1, 3)
+        limit = _TEST_PX * altitude / camera.fx_px
+        distance, _ = tree.query(points, distance_upper_bound=limit)
+        count[own] = np.isfinite(distance).reshape(len(turned), -1).sum(axis=1)
+    return count
+
+
+def _turned(vector: Array, angle: Array) -> Array:
+    """Vectors (..., 2) turned by angles (...)."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

@@ -1,0 +1,205 @@
+"""The filter in flight: one call for each measurement, in the order of time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.craters.fix import Fix, PosePrior
+from perilune_train.landing.craters.locate import Located, locate
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.filter.measurements import craters_update, pose_fits
+from perilune_train.landing.filter.propagate import Increments, InertialNoise
+from perilune_train.landing.filter.state import ATTITUDE, POSITION, VELOCITY, State
+from perilune_train.landing.filter.stretch import Stretch
+from perilune_train.landing.filter.update import passes_gate
+
+Status = Literal["tracking", "coasting", "lost"]
+"""tracking: the last frame was matched to craters; coasting: it was not; lost: none was for 15 s, or a fix contradicts
+the state."""
+RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
+"""Standard deviations of a range and of the ground's height about the nearest craters, where none are given."""
+_LOST_S = 15.0
+_UNKNOWN_VELOCITY_MPS = 5.0
+"""Standard deviation of the velocity, on each axis, where a fix contradicts the state."""
+_NEAREST = 10
+"""Craters whose median height is that of the ground below, but for an error of the state."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the lander knows of its camera and of the ground."""
+
+    camera: Camera
+    """Intrinsics."""
+    rotation_camera_from_body: Array
+    """Mounting of the camera (3, 3)."""
+    catalogue: Catalogue
+    """Craters of the landing site."""
+    range_sigma_m: float
+    """Standard deviation of a range."""
+    relief_m: float
+    """Standard deviation of the ground's height about that of the nearest craters."""
+
+
+def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
+    """Update flights by the same range at the present time; whether it was accepted (F,). None if it is no length."""
+    if not (np.isfinite(range_m) and range_m > 0):
+        return np.zeros(len(surroundings), bool)
+    places = zip(stretch.position_m, surroundings, strict=True)
+    ground_m = np.array([around.catalogue.ground_m(position, _NEAREST) for position, around in places])
+    return stretch.range(range_m, ground_m, surroundings[0].range_sigma_m)
+
+
+@dataclass(frozen=True, slots=True)
+class _Contradiction:
+    """A fix that contradicts the state."""
+
+    time_s: float
+    """Time of its frame."""
+    offset_m: Array
+    """Position by the fix less that of the state (3,), O_L."""
+    covariance: Array
+    """Of the position by the fix (3, 3)."""
+
+    def agrees(self, later: "_Contradiction") -> bool:
+        """Whether a later fix has the same offset, but for errors of fixes and velocity."""
+        step_s = later.time_s - self.time_s
+        spread = self.covariance + later.covariance + np.eye(3) * (_UNKNOWN_VELOCITY_MPS * step_s) ** 2
+        return passes_gate(later.offset_m - self.offset_m, spread)
+
+
+class Lander:
+    """State and status of a lander; every method takes one measurement.
+
+    With `keep_poses` the state keeps the pose of every frame, and later frames correct it: a smoother.
+    """
+
+    def __init__(self, state: State, noise: InertialNoise, around: Surroundings, keep_poses: bool = False):
+        self.status = "coasting"
+        self._keep_poses = keep_poses
+        self.noise, self._around = noise, around
+        self._contradiction: _Contradiction | None = None
+        self._matched_s = state.time_s
+        self._state, self._since = state, None
+
+    status: Status
+    noise: InertialNoise
+    """Of the inertial unit."""
+    _since: Stretch | None
+    """What came after `_state`."""
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What the lander knows of its camera and of the ground."""
+        return self._around
+
+    @property
+    def state(self) -> State:
+        """The state at the present time."""
+        if self._since is not None:
+            (self.state,) = self._since.states()
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state, self._since = state, None
+
+    @property
+    def _stretch(self) -> Stretch:
+        if self._since is None:
+            self._since = Stretch([self._state], self.noise, self._around.relief_m)
+        return self._since
+
+    def inertial(self, measured: Increments) -> None:
+        """Propagate to the end of inertial measurements; those that are older, or not finite, are ignored."""
+        self._stretch.inertial(measured)
+
+    def coast(self, until_s: float) -> None:
+        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
+        self._stretch.coast(until_s)
+
+    def range(self, range_m: float) -> bool:
+        """Update by a range at the present time; whether it was accepted. One that is no length is not."""
+        return bool(range_update(self._stretch, range_m, [self._around])[0])
+
+    def sightings(self, seen: Sightings) -> Located | None:
+        """Update by the craters of a frame at the present time; the fix, if one was accepted."""
+        found = self._matched(seen)
+        if self._keep_poses:
+            self.state = self.state.keeping_pose()
+        return found
+
+    def _matched(self, seen: Sightings) -> Located | None:
+        found = locate(seen, self._around.catalogue, self._around.camera, self._expected())
+        if found is None:
+            self._unmatched()
+            return None
+        fix, mounting = found.fix, self._around.rotation_camera_from_body
+        if not pose_fits(self.state, fix.pose, fix.covariance, mounting):
+            if not self._replaces(fix):
+                self._unmatched()
+                return None
+            self._restart(found)
+        else:
+            around = self._around
+            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
+        self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
+        return found
+
+    def _replaces(self, fix: Fix) -> bool:
+        """Whether a fix that contradicts the state shall replace it: if the fix before has the same offset.
+
+        A fix whose attitude contradicts the state is itself wrong, since a gyroscope does not jump; but not if the
+        state is lost.
+        """
+        expected, state = self._expected(), self.state
+        turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)
+        if not self._late and not passes_gate(turn, fix.covariance[3:, 3:] + expected.covariance[3:, 3:]):
+            return False
+        before = self._contradiction
+        offset_m = fix.pose.position_m - state.position_m
+        self._contradiction = _Contradiction(state.time_s, offset_m, fix.covariance[:3, :3])
+        return before is not None and before.agrees(self._contradiction)
+
+    @property
+    def _late(self) -> bool:
+        return self.state.time_s - self._matched_s > _LOST_S
+
+    def _unmatched(self) -> None:
+        self.status = "lost" if self._late or self._contradiction is not None else "coasting"
+
+    def _restart(self, found: Located) -> None:
+        """Take position and attitude from a fix; the velocity becomes uncertain by what the position was wrong."""
+        fix, mounting = found.fix, self._around.rotation_camera_from_body
+        state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
+        covariance = state.covariance.copy()
+        for part in (POSITION, ATTITUDE):
+            covariance[part], covariance[:, part] = 0, 0
+        covariance[VELOCITY, VELOCITY] += np.eye(3) * _UNKNOWN_VELOCITY_MPS**2
+        body = np.zeros((6, 6))
+        body[:3, :3], body[3:, 3:] = np.eye(3), -mounting.T
+        own = body @ fix.covariance @ body.T
+        covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = own[:3, :3], own[3:, 3:]
+        covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = own[:3, 3:], own[3:, :3]
+        self.state = replace(
+            state,
+            position_m=fix.pose.position_m,
+            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ mounting,
+            covariance=covariance,
+        )
+
+    def _expected(self) -> PosePrior:
+        """The camera's expected pose, with its covariance as of a step of `Pose`."""
+        mounting, state = self._around.rotation_camera_from_body, self.state
+        own = [*range(3), *range(6, 9)]
+        to_camera = np.zeros((6, 6))
+        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -mounting
+        covariance = to_camera @ state.covariance[np.ix_(own, own)] @ to_camera.T
+        return PosePrior(Pose(state.position_m, mounting @ state.rotation_site_from_body.T), covariance)

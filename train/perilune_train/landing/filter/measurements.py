@@ -1,0 +1,168 @@
+"""Poses from craters, craters, and relative motions as measurements of the state."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.compiled import compiled
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.craters.fix import Fix
+from perilune_train.landing.craters.projection import Pose, in_view, projected
+from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
+from perilune_train.landing.filter.state import (
+    ATTITUDE,
+    COMMON,
+    LAST_ATTITUDE,
+    LAST_POSITION,
+    N_ERRORS,
+    POSITION,
+    State,
+    common_pattern,
+)
+from perilune_train.landing.filter.update import Update, passes_gate, updated, updated_by
+
+_LEAST_WEIGHT = 0.1
+"""Matches with a smaller weight in a fix are not used."""
+_ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
+"""Parts of the error state that displace every sighting."""
+
+
+def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
+    """Whether a pose of the camera passes the gate.
+
+    `covariance` (6, 6): shift in O_L, metres, then turn from the left in O_C, radians.
+    """
+    innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
+    spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
+    return passes_gate(innovation, spread)
+
+
+def pose_update(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> Update:
+    """Update by a pose of the camera, with a covariance as of `pose_fits`."""
+    return updated(state, *_pose_innovation(state, pose, rotation_camera_from_body), covariance)
+
+
+def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
+    """Shift and turn (6,) from the expected pose, and their derivative (6, 27)."""
+    expected = rotation_camera_from_body @ state.rotation_site_from_body.T
+    turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
+    by_error = np.zeros((6, N_ERRORS))
+    by_error[:3, POSITION] = np.eye(3)
+    # R_camera_from_site = C R^T, and R exp(e) in the place of R turns it by -C e from the left.
+    by_error[3:, ATTITUDE] = -rotation_camera_from_body
+    return np.concatenate([pose.position_m - state.position_m, turn]), by_error
+
+
+def motion_update(
+    state: State,
+    translation_m: Array,
+    rotation_c2_from_c1: Array,
+    covariance: Array,
+    rotation_camera_from_body: Array,
+) -> Update:
+    """Update by the motion of the camera since the last frame.
+
+    `covariance` (6, 6) is that of an alignment: of the turn from the left, radians, and the shift, metres, O_C of the
+    later frame.
+    """
+    mounting = rotation_camera_from_body
+    first, second = (
+        mounting @ rotation.T for rotation in (state.last_rotation_site_from_body, state.rotation_site_from_body)
+    )
+    turned = second @ first.T
+    moved = first @ (state.position_m - state.last_position_m)
+    turn = rotation_vectors(rotation_c2_from_c1 @ turned.T)
+    innovation = np.concatenate([turn, turned @ (moved - translation_m)])
+    by_error = np.zeros((6, N_ERRORS))
+    by_error[:3, ATTITUDE], by_error[:3, LAST_ATTITUDE] = -mounting, turned @ mounting
+    by_error[3:, POSITION], by_error[3:, LAST_POSITION] = -second, second
+    x, y, z = moved
+    by_error[3:, LAST_ATTITUDE] = -turned @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ mounting
+    return updated(state, innovation, by_error, covariance)
+
+
+def craters_update(
+    state: State,
+    fix: Fix,
+    sightings: Sightings,
+    catalogue: Catalogue,
+    camera: Camera,
+    rotation_camera_from_body: Array,
+) -> Update:
+    """Update by the craters that a fix has matched, with their offsets as part of the state.
+
+    Craters that are in view but not matched stay in the state: a crater that is missed in one frame must not bring its
+    error of the catalogue as new information in the next.
+    The measurement is linear about the pose of the fix, which is nearer to the truth than the state (iterated filter,
+    Bell & Cathey 1993, doi 10.1109/9.250476).
+    """
+    used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
+    own, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
+    unmatched = np.setdiff1d(state.craters, crater)
+    unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]
+    known = np.concatenate([crater, unmatched])
+    state = state.with_craters(known, np.hypot(catalogue.position_sigma_m, STATIC_SHARE * catalogue.radius_m[known]))
+    seen = projected(catalogue.part(crater), camera, fix.pose, margin_px=np.inf, least_radius_px=0.0)
+    by_pose = seen.jacobian()[:, :2]
+    expected = rotation_camera_from_body @ state.rotation_site_from_body.T
+    turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
+    from_fix = np.concatenate([state.position_m - fix.pose.position_m, turn])
+    # A crater that is shifted one way looks like a camera that is shifted the other way.
+    by_offset = -by_pose[:, :, :2]
+    pattern = common_pattern(camera.rays(seen.centre_px)[:, :2])
+    predicted = (
+        seen.centre_px
+        + by_pose @ from_fix
+        + np.einsum("nij,nj->ni", by_offset, state.offsets_m[seen.index])
+        + pattern @ state.common_px
+    )
+    by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
+    innovation = (sightings.centre_px[own[seen.index]] - predicted).ravel()
+    variance = sightings.noise_px[own[seen.index]] ** 2 / weight[seen.index]
+    # Errors of heights in the catalogue shift craters in the image, away from its middle. As parts of the state they
+    # gave the same errors and normalised errors, for a state that is half as large again.
+    by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
+    noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
+    crossed, spread = _crossed(state, seen.index, by_error, by_offset)
+    number = np.arange(len(noise))
+    spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
+    return updated_by(state, innovation, crossed, spread, gated=False)
+
+
+def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
+    """Covariance of N sightings with the error state (2 N, M) and with one another (2 N, 2 N), without their noise.
+
+    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are their derivatives by the errors `_ALL_SEE` and by the offsets of
+    their craters, whose places in the state are `crater` (N,). The other derivatives are zero.
+    """
+    by_error = by_error.reshape(-1, len(_ALL_SEE))
+    crossed = by_error @ state.covariance[_ALL_SEE]
+    first = N_ERRORS + 2 * crater
+    _add_offsets(crossed, by_offset, state.covariance, first)
+    spread = crossed[:, _ALL_SEE] @ by_error.T
+    _add_own(spread, by_offset, crossed, first)
+    return crossed, spread
+
+
+@compiled
+def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDArray[np.int64]) -> None:
+    """Add what the offsets of the craters, from rows `first` on, give to the covariance `crossed` of `_crossed`."""
+    for k in range(len(first)):
+        east = first[k]
+        for axis in range(2):
+            own, by_east, by_north = crossed[2 * k + axis], by_offset[k, axis, 0], by_offset[k, axis, 1]
+            for column in range(len(own)):
+                own[column] += by_east * covariance[east, column] + by_north * covariance[east + 1, column]
+
+
+@compiled
+def _add_own(spread: Array, by_offset: Array, crossed: Array, first: NDArray[np.int64]) -> None:
+    """Add what the offsets of the craters, from rows `first` on, give to the covariance `spread` of `_crossed`."""
+    for row in range(len(crossed)):
+        for k in range(len(first)):
+            east = first[k]
+            for axis in range(2):
+                spread[row, 2 * k + axis] += (
+                    by_offset[k, axis, 0] * crossed[row, east] + by_offset[k, axis, 1] * crossed[row, east + 1]
+                )

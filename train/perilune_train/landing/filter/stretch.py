@@ -1,0 +1,179 @@
+"""Flights between two frames: inertial measurements and ranges.
+
+They change and measure 16 parts of the error state alone: the first 15 and the height of the ground (the core). What
+they tell about the others - craters, earlier poses - is a linear function of the errors of the core at the start of the
+stretch. It is gathered and applied once, at the end (compressed filter, Guivant & Nebot 2001, doi 10.1109/70.938382):
+the result is that of the whole filter, and a range costs as much as if there were no craters. Only corrections of
+earlier attitudes differ, by products of two of them: they are added up, and not applied one after the other.
+
+All flights of a stretch have measurements at the same times. Every operation is done on all of them at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.frames import Array
+from perilune_train.landing.filter.propagate import Increments, InertialNoise, Moving, integrated
+from perilune_train.landing.filter.state import (
+    ATTITUDE,
+    FORCE_BIAS,
+    GROUND,
+    GYRO_BIAS,
+    POSITION,
+    VELOCITY,
+    State,
+    rotation_matrices,
+)
+from perilune_train.landing.filter.update import gate
+
+_INERTIAL = FORCE_BIAS.stop
+_HEIGHT = _INERTIAL
+"""Place of the ground's height in the core."""
+CORE = np.r_[0:_INERTIAL, GROUND]
+"""Places of the core in the error state."""
+_GROUND_S = 10.0
+"""Time in which the ground below a lander becomes another, at 10 to 30 m/s over ground."""
+_GAP_S = 0.05
+_UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
+"""Standard deviations of the motion while inertial measurements are missing."""
+
+
+class Stretch:
+    """F flights since the same frame."""
+
+    def __init__(self, states: Sequence[State], noise: InertialNoise, relief_m: float):
+        """From the states at the frame; `relief_m` is the deviation of the ground's height, a Gauss-Markov process."""
+        self._begin, self._noise, self._relief_m = list(states), noise, relief_m
+        self.time_s = states[0].time_s
+        self._moving = Moving(
+            np.stack([one.position_m for one in states]),
+            np.stack([one.velocity_mps for one in states]),
+            np.stack([one.rotation_site_from_body for one in states]),
+            np.stack([one.gyro_bias_radps for one in states]),
+            np.stack([one.force_bias_mps2 for one in states]),
+        )
+        self._ground_m = np.array([one.ground_m for one in states])
+        self._covariance = np.stack([one.covariance[np.ix_(CORE, CORE)] for one in states])
+        self._change = np.tile(np.eye(len(CORE)), (len(states), 1, 1))
+        self._told: list[tuple[Array, Array]] = []
+
+    time_s: float
+    """Present time, seconds since the first frame."""
+
+    @property
+    def position_m(self) -> Array:
+        """Present positions (F, 3), O_L."""
+        return self._moving.position_m
+
+    def inertial(self, measured: Increments) -> None:
+        """Propagate to the end of inertial measurements; those that are older, or not finite, are ignored."""
+        measured = measured.measured()
+        measured = measured.part(slice(int(np.searchsorted(measured.time_s, self.time_s, side="right")), None))
+        if not len(measured):
+            return
+        start_s = measured.time_s - measured.interval_s
+        after_s = np.concatenate([[self.time_s], measured.time_s[:-1]])
+        done = 0
+        for gap in np.flatnonzero(start_s > after_s + _GAP_S):
+            self._propagate(measured.part(slice(done, gap)))
+            self.coast(float(start_s[gap]))
+            done = int(gap)
+        self._propagate(measured.part(slice(done, None)))
+
+    def _propagate(self, measured: Increments) -> None:
+        """Propagate by measurements that follow one another; each begins where the one before ends."""
+        if not len(measured):
+            return
+        measured = replace(measured, interval_s=np.diff(measured.time_s, prepend=self.time_s))
+        done = integrated(self._moving, measured, self._noise)
+        self._moving = done.end
+        kept = np.exp(-(measured.time_s[-1] - self.time_s) / _GROUND_S)
+        self._ground_m = kept * self._ground_m
+        self._moved(float(measured.time_s[-1]), done.change, done.added, kept)
+
+    def coast(self, until_s: float) -> None:
+        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
+        gap_s = until_s - self.time_s
+        self._moving = replace(self._moving, position_m=self.position_m + self._moving.velocity_mps * gap_s)
+        change = np.eye(_INERTIAL)
+        change[POSITION, VELOCITY] = gap_s * np.eye(3)
+        sigmas = np.repeat([_UNKNOWN_MPS2 * gap_s**2 / 2, _UNKNOWN_MPS2 * gap_s, _UNKNOWN_RADPS * gap_s, 0.0, 0.0], 3)
+        self._moved(until_s, change, np.diag(sigmas**2), 1.0)
+
+    def _moved(self, time_s: float, change: Array, added: Array, kept: float) -> None:
+        """Apply a change of the first 15 errors, the covariance that is added, and the share kept of the ground's."""
+        whole, noise = np.zeros_like(self._covariance), np.zeros_like(self._covariance)
+        whole[:, :_INERTIAL, :_INERTIAL], whole[:, _HEIGHT, _HEIGHT] = change, kept
+        noise[:, :_INERTIAL, :_INERTIAL], noise[:, _HEIGHT, _HEIGHT] = added, self._relief_m**2 * (1 - kept**2)
+        self._covariance = whole @ self._covariance @ np.swapaxes(whole, 1, 2) + noise
+        self._change = whole @ self._change
+        self.time_s = time_s
+
+    def range(self, range_m: float, ground_m: Array, sigma_m: float) -> NDArray[np.bool_]:
+        """Update by a distance to the ground along -Z_B; whether it was accepted (F,).
+
+        `ground_m` (F,) are the heights of the ground as the nearest craters have it, `sigma_m` the deviation of the
+        instrument.
+        """
+        rotation, height_m = self._moving.rotation_site_from_body, self.position_m[:, 2] - ground_m - self._ground_m
+        cosine = rotation[:, 2, 2]
+        by_error = np.zeros((len(cosine), len(CORE)))
+        by_error[:, 2], by_error[:, _HEIGHT] = 1 / cosine, -1 / cosine
+        by_error[:, ATTITUDE] = (-height_m / cosine**2)[:, None] * rotation[:, 2, [1, 0, 2]] * [-1, 1, 0]
+        crossed = (self._covariance @ by_error[:, :, None])[:, :, 0]
+        innovation = range_m - height_m / cosine
+        spread = (by_error * crossed).sum(axis=1) + sigma_m**2
+        accepted = innovation**2 / spread <= gate(1)
+        # In units of the innovation's deviation; nothing where the range is refused.
+        scale = accepted / np.sqrt(spread)
+        innovation, crossed, by_error = innovation * scale, crossed * scale[:, None], by_error * scale[:, None]
+        told = (by_error[:, None] @ self._change)[:, 0]
+        self._told.append((told, innovation))
+        self._change = self._change - crossed[:, :, None] * told[:, None, :]
+        self._covariance = self._covariance - crossed[:, :, None] * crossed[:, None, :]
+        self._correct(crossed * innovation[:, None])
+        return accepted
+
+    def _correct(self, error: Array) -> None:
+        """Remove estimated errors of the core (F, 16)."""
+        moving = self._moving
+        self._moving = Moving(
+            moving.position_m + error[:, POSITION],
+            moving.velocity_mps + error[:, VELOCITY],
+            moving.rotation_site_from_body @ rotation_matrices(error[:, ATTITUDE]),
+            moving.gyro_bias_radps + error[:, GYRO_BIAS],
+            moving.force_bias_mps2 + error[:, FORCE_BIAS],
+        )
+        self._ground_m = self._ground_m + error[:, _HEIGHT]
+
+    def states(self) -> list[State]:
+        """The states at the present time."""
+        if not self._told and self.time_s == self._begin[0].time_s:
+            return self._begin
+        return [self._state(number) for number in range(len(self._begin))]
+
+    def _state(self, number: int) -> State:
+        before, moving, change = self._begin[number], self._moving, self._change[number]
+        from_core = before.covariance[:, CORE]
+        covariance, error = before.covariance.copy(), np.zeros(len(before.covariance))
+        if self._told:
+            told = from_core @ np.stack([derivative[number] for derivative, _ in self._told], axis=1)
+            covariance -= told @ told.T
+            error = told @ np.array([innovation[number] for _, innovation in self._told])
+        from_core = from_core @ change.T
+        covariance[:, CORE], covariance[CORE] = from_core, from_core.T
+        core = self._covariance[number]
+        covariance[np.ix_(CORE, CORE)] = (core + core.T) / 2
+        return replace(
+            before.corrected(error, covariance),
+            time_s=self.time_s,
+            position_m=moving.position_m[number],
+            velocity_mps=moving.velocity_mps[number],
+            rotation_site_from_body=moving.rotation_site_from_body[number],
+            gyro_bias_radps=moving.gyro_bias_radps[number],
+            force_bias_mps2=moving.force_bias_mps2[number],
+            ground_m=float(self._ground_m[number]),
+        )

@@ -1,0 +1,184 @@
+"""Fly the filter over the files of one descent and write what it estimates."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.dataset.metadata import CameraRecord
+from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import write_csv
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, quaternion_from_matrix
+from perilune_shared.storage.files import new_folder
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.images.predict import above
+from perilune_train.detect.images.read import read_grey
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.tiles import detect_image
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.filter.flight import Estimate, Instruments, fly
+from perilune_train.landing.filter.lander import Lander, Surroundings
+from perilune_train.landing.filter.propagate import InertialNoise
+from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
+from perilune_train.landing.fly.catalogue import read_catalogue
+from perilune_train.landing.fly.clocks import check_clocks
+from perilune_train.landing.fly.picture import draw_flight
+from perilune_train.landing.fly.settings import FlightPrior, read_camera, read_prior
+from perilune_train.landing.fly.tables import FrameFiles, read_frame_files, read_instruments
+from perilune_train.landing.fly.truth import Truth, read_truth, with_errors_of
+from perilune_train.landing.fly.units import Prior, doubts
+from perilune_train.training.runs import RunFolder
+
+ESTIMATES, PICTURE = "estimates", "flight.png"
+_NOTHING = Detections(np.zeros((0, 4)), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Descent:
+    """The files of one descent, read and checked."""
+
+    camera: CameraRecord
+    """Camera and its mounting."""
+    prior: FlightPrior
+    """Expected state at the first frame, and errors of what is measured."""
+    frames: FrameFiles
+    """Frames and their times."""
+    instruments: Instruments
+    """Inertial measurements and ranges."""
+    catalogue: Catalogue
+    """Craters of the landing site."""
+    truth: Truth | None
+    """True poses of the frames, where they are known."""
+
+
+def read_descent(
+    frames: Path, camera: Path, catalogue: Path, imu: Path, prior: Path, ranges: Path | None, truth: Path | None
+) -> Descent:
+    """Read all files of a descent. Raises UserError on the first that is missing or wrong."""
+    record, expected = read_camera(camera), read_prior(prior)
+    craters = read_catalogue(catalogue, expected.catalogue_use)
+    files = read_frame_files(frames, record.intrinsics())
+    true = read_truth(truth, files.time_s, np.array(record.rotation_camera_from_body)) if truth else None
+    instruments = read_instruments(imu, ranges)
+    check_clocks(frames, files.time_s, imu, ranges, instruments)
+    return Descent(record, expected, files, instruments, craters, true)
+
+
+def fly_descent(
+    descent: Descent, run: Path, out: Path, tell: Callable[[str], None], live: Path | None = None
+) -> pd.DataFrame:
+    """Fly the filter over a descent with the detector of a run; returns one row per frame.
+
+    Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`, or nothing. `tell` receives a line
+    for each frame; `live` is a picture that is drawn again after each.
+    """
+    rows: list[dict[str, object]] = []
+    faults: dict[int, str] = {}
+    with new_folder(out) as folder:
+        lander = _lander(descent)
+        seen = _sightings(descent, run, faults)
+        mounting = np.array(descent.camera.rotation_camera_from_body)
+        for estimate in fly(lander, descent.instruments, descent.frames.time_s, seen):
+            row = _row(estimate, descent.frames, mounting, faults.get(estimate.frame, ""))
+            rows.append(row)
+            tell(_line(row))
+            if live is not None:
+                draw_flight(live, with_errors_of(pd.DataFrame(rows), descent.truth))
+        table = with_errors_of(pd.DataFrame(rows), descent.truth)
+        table.to_parquet(folder / f"{ESTIMATES}.parquet", index=False)
+        write_csv(table, folder / f"{ESTIMATES}.csv")
+        draw_flight(folder / PICTURE, table)
+    return table
+
+
+def doubts_of(descent: Descent, *, is_lost: bool = False) -> list[str]:
+    """Reasons to doubt the units of the inertial measurements; more of them after a flight that lost its position."""
+    mounting, expected = np.array(descent.camera.rotation_camera_from_body), descent.prior
+    sigmas = expected.position_sigma_m, expected.velocity_sigma_mps
+    prior = Prior(_start(descent), *sigmas, mounting[2], float(descent.frames.time_s[-1]))
+    return doubts(descent.instruments.inertial, prior, is_lost=is_lost)
+
+
+def _start(descent: Descent) -> State:
+    """The expected state at the first frame."""
+    mounting = np.array(descent.camera.rotation_camera_from_body)
+    return replace(descent.prior.state(mounting), time_s=float(descent.frames.time_s[0]))
+
+
+def _lander(descent: Descent) -> Lander:
+    mounting, prior = np.array(descent.camera.rotation_camera_from_body), descent.prior
+    state = _start(descent)
+    camera = descent.camera.intrinsics().covering_pinhole()
+    around = Surroundings(camera, mounting, descent.catalogue, prior.range_sigma_m, prior.relief_m)
+    return Lander(state, InertialNoise.of(prior.unit), around)
+
+
+def _sightings(descent: Descent, run: Path, faults: dict[int, str]) -> Iterator[Sightings]:
+    """Craters of one frame after the other; a frame that cannot be read has none, and its fault is noted."""
+    config, threshold = config_of_run(run), chosen_threshold(run)
+    detector = open_detector(RunFolder(run).best, config)
+    tiling = replace(Tiling(), scales=tuple(config.evaluation.scales))
+    for number, path in enumerate(descent.frames.paths):
+        try:
+            found = above(detect_image(detector, read_grey(path), tiling, lambda n: None), threshold)
+        except UserError as error:
+            faults[number], found = str(error), _NOTHING
+        yield sightings_of(found, descent.camera.intrinsics())
+
+
+def sightings_of(found: Detections, camera: Camera) -> Sightings:
+    """Detections as the pinhole camera that covers the view would have them; those that no ray reaches are left out."""
+    boxes = np.asarray(found.boxes, np.float64)
+    if not any(camera.distortion):
+        return Sightings.of_boxes(boxes, found.scores)
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    pinhole = camera.covering_pinhole()
+    left, right = (np.column_stack([boxes[:, side], middle[:, 1]]) for side in (0, 2))
+    top, bottom = (np.column_stack([middle[:, 0], boxes[:, side]]) for side in (1, 3))
+    left, right, top, bottom, middle = (
+        pinhole.project(camera.rays(points)) for points in (left, right, top, bottom, middle)
+    )
+    half = np.column_stack([np.linalg.norm(right - left, axis=1), np.linalg.norm(bottom - top, axis=1)]) / 2
+    straight = np.column_stack([middle - half, middle + half])
+    reached = np.isfinite(straight).all(axis=1)
+    return Sightings.of_boxes(straight[reached], found.scores[reached])
+
+
+def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Array, fault: str) -> dict[str, object]:
+    state = estimate.state
+    rotation = quaternion_from_matrix(rotation_camera_from_body @ state.rotation_site_from_body.T)
+    sigma = np.sqrt(np.diag(state.covariance))
+    located = estimate.located
+    pixels = located.fix.rms_px if located else np.nan
+    own = {"file": frames.paths[estimate.frame].name, "time_s": float(frames.time_s[estimate.frame])}
+    return {
+        **own,
+        "status": estimate.status,
+        **_named("{}_m", "xyz", state.position_m),
+        **_named("velocity_{}_mps", "xyz", state.velocity_mps),
+        **_named("rotation_{}", "wxyz", rotation),
+        **_named("sigma_{}_m", "xyz", sigma[POSITION]),
+        **_named("sigma_attitude_{}_deg", "xyz", np.degrees(sigma[ATTITUDE])),
+        "n_matched": len(located.fix.crater) if located else 0,
+        "rms_px": pixels,
+        "fault": fault,
+    }
+
+
+def _named(form: str, axes: str, values: Array) -> dict[str, float]:
+    return {form.format(axis): float(value) for axis, value in zip(axes, values, strict=True)}
+
+
+def _line(row: dict[str, object]) -> str:
+    place = " ".join(f"{row[f'{axis}_m']:9.2f}" for axis in "xyz")
+    sigma = " ".join(f"{row[f'sigma_{axis}_m']:.2f}" for axis in "xyz")
+    turn = max(float(str(row[f"sigma_attitude_{axis}_deg"])) for axis in "xyz")
+    line = f"{row['time_s']:9.2f} s  {row['status']:8}  {place} m  sigma {sigma} m  {turn:.3f} deg"
+    line += f"  {row['n_matched']:3} craters"
+    return f"{line}  {row['fault']}" if row["fault"] else line

@@ -1,0 +1,192 @@
+"""Tables of a descent: frames.csv, imu.csv and ranges.csv, or files of EuRoC and TUM-VI. All are untrusted input."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_shared.storage.tables.columns import Columns, Kind
+from perilune_shared.storage.tables.limits import FRAMES, INERTIAL, RANGES, TableLimits
+from perilune_shared.storage.tables.read import open_table, read_table
+from perilune_train.detect.images.read import picture_size
+from perilune_train.landing.filter.flight import Instruments
+from perilune_train.landing.filter.propagate import Increments
+
+FRAMES_FILE = "frames.csv"
+FRAME_COLUMNS = ("file", "time_s")
+RATES = tuple(f"angular_rate_{axis}_radps" for axis in "xyz")
+FORCES = tuple(f"specific_force_{axis}_mps2" for axis in "xyz")
+INERTIAL_COLUMNS = ("time_s", "interval_s", *RATES, *FORCES)
+RANGE_COLUMNS = ("time_s", "range_m")
+CRATER_COLUMNS = ("x_m", "y_m", "z_m", "diameter_m")
+NORMAL_COLUMNS = ("normal_x", "normal_y", "normal_z")
+_EUROC_FRAMES_FILE, _EUROC_FOLDER = "data.csv", "data"
+_TIME_NS, _FILE = "timestamp", "filename"
+_EUROC_SAMPLES = (
+    tuple(f"{kind}_RS_S_{axis}" for kind in "wa" for axis in "xyz"),
+    tuple(f"{kind}_{axis}" for kind in ("omega", "alpha") for axis in "xyz"),
+)
+"""Rates and specific forces in files of EuRoC and TUM-VI, and of Kalibr."""
+_GAP = 5
+"""A distance of samples of more than this many times the median is a gap."""
+_LARGEST_S = 1e11
+"""Above every clock in seconds; milliseconds since 1970 are 1e12."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFiles:
+    """Frames in the order of time."""
+
+    paths: list[Path]
+    """Image files (n)."""
+    time_s: Array
+    """Seconds since the start of the descent (n,)."""
+
+
+def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
+    """Read frames.csv of a folder: file, time_s; or data.csv of EuRoC, with its images in the folder data.
+
+    Raises UserError if times do not increase, a file is missing or outside the folder, or an image is not of the
+    camera's size.
+    """
+    path = folder / FRAMES_FILE
+    if not path.exists() and (folder / _EUROC_FRAMES_FILE).is_file():
+        path, folder = folder / _EUROC_FRAMES_FILE, folder / _EUROC_FOLDER
+        table = read_euroc(path, FRAMES, {_TIME_NS: "integer", _FILE: "text"})
+        column, time_s = _FILE, nanoseconds_as_seconds(table)
+    else:
+        table = read_table(path, FRAMES, {"file": "text", "time_s": "number"})
+        column, time_s = "file", _increasing(table)
+    if not table.n_rows:
+        raise UserError(path, "rows", 0, "one row for each frame")
+    paths = []
+    for row, name in enumerate(table.texts(column).to_list()):
+        if not name or Path(name).is_absolute() or ".." in Path(name).parts:
+            raise table.fault(row, column, "a file of this folder")
+        paths.append(folder / name)
+        width, height = picture_size(paths[-1])
+        if (width, height) != (camera.width_px, camera.height_px):
+            expected = f"{camera.width_px} x {camera.height_px}, the camera's size"
+            raise UserError(paths[-1], "size", f"{width} x {height}", expected)
+    return FrameFiles(paths, time_s)
+
+
+def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
+    """Read imu.csv, or samples as of EuRoC, and ranges.csv. Empty values and NaN are missing measurements.
+
+    Raises UserError on a missing column, a value that is no number, or times that do not increase.
+    """
+    inertial = _read_inertial(imu)
+    if ranges is None:
+        return Instruments(inertial, np.zeros(0), np.zeros(0))
+    lengths = read_table(ranges, RANGES, dict.fromkeys(RANGE_COLUMNS, "number"))
+    return Instruments(inertial, _increasing(lengths), lengths.numbers("range_m"))
+
+
+def read_euroc(path: Path, limits: TableLimits, columns: dict[str, Kind]) -> Columns:
+    """Read columns by their names without units; the header may be a comment."""
+    names, is_comment = _header(path, limits)
+    plain = {name: plain_name(name) for name in names}
+    missing = [name for name in columns if name not in plain.values()]
+    if missing:
+        raise UserError(path, "columns", f"no {missing[0]}", ", ".join(columns))
+    with open_table(path, limits, names if is_comment else None) as table:
+        read = table.read({name: columns[short] for name, short in plain.items() if short in columns})
+    arrays = {plain[name]: array for name, array in read.arrays.items()}
+    return Columns(path, arrays, read.n_rows, read.lines)
+
+
+def plain_name(name: str) -> str:
+    """The name of a column without its unit, as `timestamp [ns]`."""
+    return re.sub(r"\s*\[.*$", "", name.lstrip("# "))
+
+
+def column_names(path: Path, limits: TableLimits) -> list[str]:
+    """Names of the columns without their units; the header may be a comment."""
+    return [plain_name(name) for name in _header(path, limits)[0]]
+
+
+def _header(path: Path, limits: TableLimits) -> tuple[list[str], bool]:
+    """Names of the columns, and whether they are in a comment: one before the first row that begins with a time."""
+    with open_table(path, limits, header=()) as table:
+        first = table.peek()
+        for comment in reversed(table.comments):
+            names = [name.strip() for name in comment.split(",")]
+            if plain_name(names[0]) == _TIME_NS and (first is None or len(names) == len(first[1])):
+                return names, True
+        return list(table.names) if first is None else first[1], False
+
+
+def _read_inertial(path: Path) -> Increments:
+    known = column_names(path, INERTIAL)
+    samples = next((names for names in _EUROC_SAMPLES if names[0] in known), None)
+    if samples is not None and _TIME_NS in known:
+        return _of_samples(path, samples)
+    table = read_table(path, INERTIAL, dict.fromkeys(INERTIAL_COLUMNS, "number"))
+    if not table.n_rows:
+        raise UserError(path, "rows", 0, "one row for each measurement")
+    end_s, interval_s = _increasing(table), table.finite("interval_s")
+    table.check("interval_s", (interval_s > 0) & (interval_s <= 1), "above 0, at most 1 s")
+    _check_steps(table, end_s, interval_s)
+    rates, forces = (np.column_stack([table.numbers(name) for name in names]) for names in (RATES, FORCES))
+    return Increments(end_s, interval_s, rates, forces)
+
+
+def _of_samples(path: Path, names: tuple[str, ...]) -> Increments:
+    """Means over the intervals between samples at single times, in nanoseconds. Gaps are left out."""
+    table = read_euroc(path, INERTIAL, {_TIME_NS: "integer", **dict.fromkeys(names, "number")})
+    if table.n_rows < 2:
+        raise UserError(path, "rows", table.n_rows, "at least two measurements")
+    time_s = nanoseconds_as_seconds(table)
+    interval_s = np.diff(table.integers(_TIME_NS)) / 1e9
+    values = np.column_stack([table.numbers(name) for name in names])
+    means = (values[1:] + values[:-1]) / 2
+    kept = (interval_s <= 1) & (interval_s <= _GAP * np.median(interval_s))
+    if not kept.any():
+        expected = "samples at most 1 s apart, in nanoseconds"
+        raise UserError(path, _TIME_NS, f"steps of {np.median(interval_s):g} s", expected)
+    return Increments(time_s[1:][kept], interval_s[kept], means[kept, :3], means[kept, 3:])
+
+
+def nanoseconds_as_seconds(table: Columns) -> Array:
+    """Times in nanoseconds as seconds. Raises UserError if they do not increase."""
+    time_ns = table.integers(_TIME_NS)
+    late = np.diff(time_ns) <= 0
+    if late.any():
+        row = int(late.argmax()) + 1
+        raise table.fault(row, _TIME_NS, f"above {time_ns[row - 1]}, the time of the row before")
+    return time_ns / 1e9
+
+
+def _increasing(table: Columns) -> Array:
+    """Times in seconds. Raises UserError if they do not increase or cannot be seconds."""
+    time_s = table.finite("time_s")
+    table.check("time_s", np.abs(time_s) <= _LARGEST_S, "seconds; these may be nanoseconds: divide by 1e9")
+    late = np.diff(time_s) <= 0
+    if late.any():
+        row = int(late.argmax()) + 1
+        raise table.fault(row, "time_s", f"above {time_s[row - 1]}, the time of the row before")
+    return time_s
+
+
+def _check_steps(table: Columns, end_s: Array, interval_s: Array) -> None:
+    """Raises UserError if times of measurements have another unit than their intervals."""
+    if len(end_s) < 2:
+        return
+    step, interval = float(np.median(np.diff(end_s))), float(np.median(interval_s))
+    unit = unit_of(step / interval)
+    if unit is not None:
+        found = f"steps of {step:g} between measurements of {interval:g} s"
+        raise UserError(table.path, "time_s", found, f"seconds; these may be {unit[0]}: divide by {unit[1]:g}")
+
+
+def unit_of(ratio: float) -> tuple[str, float] | None:
+    """The unit of time that a ratio to seconds suggests, with the number of it in a second."""
+    for name, per_s in (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)):
+        if per_s / 5 < ratio < 5 * per_s:
+            return name, per_s
+    return None

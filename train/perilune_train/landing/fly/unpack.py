@@ -1,0 +1,129 @@
+"""Write one descent of a dataset as the files that `navigate fly` reads, with a prior and a catalogue that are off."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from perilune_shared.config.yaml_text import to_yaml_text
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import write_csv
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion, quaternion_from_matrix
+from perilune_shared.geometry.inertial_grades import InertialGrade
+from perilune_shared.storage.files import new_folder
+from perilune_train.landing.craters.catalogue import (
+    LEAST_DIAMETER_M,
+    Catalogue,
+    CatalogueErrors,
+    exact_catalogue,
+    with_errors,
+)
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.fly.tables import (
+    CRATER_COLUMNS,
+    FORCES,
+    FRAME_COLUMNS,
+    FRAMES_FILE,
+    INERTIAL_COLUMNS,
+    NORMAL_COLUMNS,
+    RANGE_COLUMNS,
+    RATES,
+)
+from perilune_train.landing.fly.truth import TRUTH_COLUMNS
+
+
+def unpack_descent(
+    dataset: Dataset,
+    ids: tuple[str, str],
+    out: Path,
+    grade: InertialGrade,
+    exact: bool,
+    offset: tuple[float, float, float],
+    seed: int,
+) -> int:
+    """Write the files of a trajectory (scene_id, trajectory_id) to the new folder `out`; returns the number of frames.
+
+    `offset` holds the standard deviations, per axis, of position (m), velocity (m/s) and attitude (degrees) with
+    which the prior is off; catalogue and prior are drawn with the seed. Raises UserError if the dataset has no such
+    trajectory, or no inertial measurements of it.
+    """
+    columns = ["frame_id", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "png_path"]
+    frames = dataset.table("frames", columns, *ids).sort_by("time_s")
+    if not frames.num_rows:
+        known = dataset.table("trajectories", ["scene_id", "trajectory_id"]).to_pylist()
+        first = ", ".join("/".join(row.values()) for row in known[:3])
+        raise UserError(dataset.store, "trajectory", "/".join(ids), f"one of its {len(known)}: {first} ...")
+    inertial = dataset.table("inertial", None, *ids).to_pandas()
+    inertial = inertial[inertial["grade"] == grade].sort_values("time_s")
+    if inertial.empty:
+        expected = f"inertial measurements of grade {grade}; render the dataset with dataset.nav.inertial"
+        raise UserError(dataset.store, "inertial", f"none of {'/'.join(ids)}", expected)
+    rng = np.random.default_rng(seed)
+    catalogue = exact_catalogue(dataset, ids[0], LEAST_DIAMETER_M)
+    if not exact:
+        catalogue = with_errors(catalogue, CatalogueErrors(), rng)
+    with new_folder(out) as folder:
+        _write_frames(dataset, frames, folder)
+        camera = dataset.info.camera.model_dump(mode="json")
+        (folder / "camera.yaml").write_text(to_yaml_text(camera), encoding="utf-8")
+        _write_catalogue(folder / "catalogue.parquet", catalogue)
+        measured = {
+            **{name: inertial[name] for name in INERTIAL_COLUMNS[:2]},
+            **_columns(RATES, inertial["angular_rate_radps"]),
+            **_columns(FORCES, inertial["specific_force_mps2"]),
+        }
+        write_csv(pd.DataFrame(measured), folder / "imu.csv")
+        ranges = dataset.table("ranges", list(RANGE_COLUMNS), *ids).to_pandas().sort_values("time_s")
+        write_csv(ranges, folder / "ranges.csv")
+        prior = _prior(frames, np.array(dataset.info.camera.rotation_camera_from_body), grade, catalogue, offset, rng)
+        (folder / "prior.yaml").write_text(to_yaml_text(prior), encoding="utf-8")
+        poses = np.column_stack([frames[name].to_pylist() for name in ("time_s", "position_m", "rotation_wxyz")])
+        write_csv(pd.DataFrame(poses, columns=list(TRUTH_COLUMNS)), folder / "truth.csv")
+    return int(frames.num_rows)
+
+
+def _columns(names: tuple[str, ...], vectors: pd.Series) -> dict[str, Array]:
+    values = np.stack(vectors.to_list())
+    return {name: values[:, place] for place, name in enumerate(names)}
+
+
+def _write_frames(dataset: Dataset, frames: pa.Table, out: Path) -> None:
+    folder = out / "frames"
+    folder.mkdir()
+    names = {frame_id: f"{place:04d}.png" for place, frame_id in enumerate(frames["frame_id"].to_pylist())}
+    for frame_id, png in dataset.pngs(frames):
+        (folder / names[frame_id]).write_bytes(png)
+    rows = {FRAME_COLUMNS[0]: list(names.values()), FRAME_COLUMNS[1]: frames["time_s"].to_pylist()}
+    write_csv(pd.DataFrame(rows), folder / FRAMES_FILE)
+
+
+def _write_catalogue(path: Path, catalogue: Catalogue) -> None:
+    values = np.column_stack([catalogue.centre_m, 2 * catalogue.radius_m, catalogue.normal])
+    pd.DataFrame(values, columns=[*CRATER_COLUMNS, *NORMAL_COLUMNS]).to_parquet(path, index=False)
+
+
+def _prior(
+    frames: pa.Table,
+    rotation_camera_from_body: Array,
+    grade: InertialGrade,
+    catalogue: Catalogue,
+    offset: tuple[float, float, float],
+    rng: np.random.Generator,
+) -> dict[str, object]:
+    """Content of prior.yaml: the first frame's true state, changed at random."""
+    off = np.repeat(np.array(offset) * [1, 1, np.radians(1)], 3) * rng.normal(size=9)
+    true = Pose(np.array(frames["position_m"][0].as_py()), matrix_from_quaternion(frames["rotation_wxyz"][0].as_py()))
+    pose = true.changed(np.concatenate([off[:3], rotation_camera_from_body @ off[6:]]))
+    return {
+        "position_m": pose.position_m.tolist(),
+        "velocity_mps": (np.array(frames["velocity_mps"][0].as_py()) + off[3:6]).tolist(),
+        "rotation_wxyz": quaternion_from_matrix(pose.rotation_camera_from_site).tolist(),
+        "position_sigma_m": offset[0],
+        "velocity_sigma_mps": offset[1],
+        "attitude_sigma_deg": offset[2],
+        "inertial": grade,
+        "catalogue_position_sigma_m": catalogue.position_sigma_m,
+        "catalogue_diameter_sigma_share": catalogue.radius_sigma_share,
+    }

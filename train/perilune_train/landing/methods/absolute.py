@@ -1,0 +1,73 @@
+"""All methods that give a position over ground: fixes of single frames, and the filter."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_train.landing.craters.catalogue import (
+    LEAST_DIAMETER_M,
+    Catalogue,
+    CatalogueErrors,
+    exact_catalogue,
+    with_errors,
+)
+from perilune_train.landing.methods.fixes import fix_summary, fixes_lost_in_space, fixes_near_a_prior
+from perilune_train.landing.methods.flights import flight_summary, flights
+from perilune_train.landing.methods.seen import SeenDescent
+
+SEED = 0
+_START_DEG, _STAR_TRACKER_DEG = 0.5, 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogues:
+    """The catalogues of the scenes of a split, each by scene_id."""
+
+    exact: Mapping[str, Catalogue]
+    """Without errors."""
+    rough: Mapping[str, Catalogue]
+    """With the stated errors of one made from orbit."""
+    mapped: Mapping[str, Catalogue]
+    """Made by our own detector from images of an orbiter; may be empty."""
+
+
+def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, Catalogue]) -> Catalogues:
+    """The catalogues of some scenes. Raises UserError if the map lacks one of them."""
+    exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in scene_ids}
+    rough = {
+        scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(place))
+        for place, scene in enumerate(scene_ids)
+    }
+    missing = sorted(set(scene_ids) - set(mapped))
+    if mapped and missing:
+        raise UserError("--map", "scenes", f"none for {missing[0]}", "a map of every scene of the split")
+    return Catalogues(exact, rough, {scene: mapped[scene] for scene in scene_ids} if mapped else {})
+
+
+def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: Catalogues) -> dict[str, pd.DataFrame]:
+    """Errors of each method, one row per frame; methods without any frame are left out.
+
+    The filter needs inertial measurements of grade `tactical`; without them there are fixes only.
+    """
+    sources = {"": catalogues.rough, ", exact catalogue": catalogues.exact, ", map": catalogues.mapped}
+    sources = {name: source for name, source in sources.items() if source}
+    tables = {}
+    for name, source in sources.items():
+        tables[f"fix{name}"] = fixes_near_a_prior(descents, source, SEED)
+        tables[f"lost in space{name}"] = fixes_lost_in_space(descents, source, SEED)
+    inertial = dataset.table("inertial", ["grade"], *descents[0].ids)
+    if "tactical" in inertial["grade"].unique().to_pylist():
+        for name, source in sources.items():
+            tables[f"filter{name}"] = flights(dataset, descents, source, "tactical", _START_DEG)
+        tables["filter, star tracker"] = flights(dataset, descents, catalogues.rough, "tactical", _STAR_TRACKER_DEG)
+        tables["smoother"] = flights(dataset, descents, catalogues.rough, "tactical", _START_DEG, smooth=True)
+    return {name: table for name, table in tables.items() if len(table)}
+
+
+def absolute_summary(method: str, errors: pd.DataFrame) -> dict[str, float]:
+    """The figures of a method, from its rows of `absolute_errors`."""
+    return fix_summary(errors) if method.startswith(("fix", "lost")) else flight_summary(errors)

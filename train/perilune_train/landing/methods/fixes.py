@@ -1,0 +1,112 @@
+"""Poses of single frames from craters: near a prior that is off, and lost in space."""
+
+import time
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.console.terminal import progress_bar
+from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.craters.fix import PosePrior
+from perilune_train.landing.craters.locate import Located, locate, lost_in_space
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.search import Area
+from perilune_train.landing.methods.seen import SeenDescent
+
+PRIOR_M, PRIOR_DEG = 100.0, 1.0
+"""Standard deviations of the prior on each axis."""
+WRONG_PX = 5.0
+"""A fix that is off by more pixels on the ground is wrong."""
+LOST_ABOVE_M, LOST_ALTITUDE_SHARE = 800.0, 0.1
+"""Lost in space: least altitude, and by how much the altitude may be off."""
+
+
+def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
+    """Errors of the fixes of all frames; their priors are off by 100 m and 1 degree (standard deviations) per axis."""
+    rng, sigma = np.random.default_rng(seed), np.repeat([PRIOR_M, np.radians(PRIOR_DEG)], 3)
+    rows = []
+    for descent in _followed("fixes", descents):
+        for true, sightings in zip(descent.true, descent.sightings, strict=True):
+            prior = PosePrior(true.changed(sigma * rng.normal(size=6)), np.diag(sigma**2))
+            begun = time.process_time()
+            found = locate(sightings, catalogues[descent.ids[0]], descent.camera, prior)
+            rows.append(_row(descent, true, found, time.process_time() - begun))
+    return pd.DataFrame(rows)
+
+
+def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
+    """Errors of the fixes of all frames above 800 m, from no more than the altitude within 10 % and a level camera.
+
+    Position over the whole catalogue and heading are unknown.
+    """
+    rng, rows = np.random.default_rng(seed), []
+    for descent in _followed("lost in space", descents):
+        catalogue = catalogues[descent.ids[0]]
+        low, high = catalogue.centre_m[:, :2].min(axis=0), catalogue.centre_m[:, :2].max(axis=0)
+        for true, sightings in zip(descent.true, descent.sightings, strict=True):
+            if true.position_m[2] < LOST_ABOVE_M:
+                continue
+            altitude_m = true.position_m[2] * rng.uniform(1 - LOST_ALTITUDE_SHARE, 1 + LOST_ALTITUDE_SHARE)
+            limits = altitude_m / (1 + LOST_ALTITUDE_SHARE), altitude_m / (1 - LOST_ALTITUDE_SHARE)
+            area = Area((low + high) / 2, float(np.linalg.norm(high - low) / 2), limits, np.pi)
+            heading = rng.uniform(-np.pi, np.pi)
+            turned = np.array(
+                [[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]]
+            )
+            assumed = Pose(np.array([*area.centre_m, altitude_m]), descent.level_rotation_camera_from_site @ turned)
+            begun = time.process_time()
+            found = lost_in_space(sightings, catalogue, descent.camera, PosePrior(assumed, np.eye(6)), area)
+            rows.append(_row(descent, true, found, time.process_time() - begun))
+    return pd.DataFrame(rows)
+
+
+def _followed(name: str, descents: list[SeenDescent]) -> Iterator[SeenDescent]:
+    """The descents, with a progress bar."""
+    with progress_bar() as progress:
+        task = progress.add_task(name, total=len(descents), unit="descents", note="")
+        for descent in descents:
+            yield descent
+            progress.advance(task)
+
+
+def _row(descent: SeenDescent, true: Pose, found: Located | None, seconds: float) -> dict[str, object]:
+    own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1], "altitude_m": true.position_m[2]}
+    if found is None:
+        return {**own, "error_m": np.nan, "error_px": np.nan, "turn_deg": np.nan, "squared": np.nan, "seconds": seconds}
+    error = step_to(found.fix.pose, true)
+    length_m = float(np.linalg.norm(error[:3]))
+    return {
+        **own,
+        "error_m": length_m,
+        "error_px": length_m * descent.camera.fx_px / true.position_m[2],
+        "turn_deg": float(np.degrees(np.linalg.norm(error[3:]))),
+        "squared": float(error @ np.linalg.solve(found.fix.covariance, error)),
+        "seconds": seconds,
+    }
+
+
+def step_to(pose: Pose, true: Pose) -> Array:
+    """The step (6,) from a pose to the true one: shift in O_L, metres, turn from the left, radians, O_C."""
+    turn = rotation_vectors(true.rotation_camera_from_site @ pose.rotation_camera_from_site.T)
+    return np.concatenate([true.position_m - pose.position_m, turn])
+
+
+def fix_summary(fixes: pd.DataFrame) -> dict[str, float]:
+    """Figures of a method: errors over the right fixes, shares of frames without fix and with a wrong one."""
+    right = fixes[fixes["error_px"] < WRONG_PX]
+    return {
+        "n_frames": float(len(fixes)),
+        "position_rmse_m": _rms(right["error_m"]),
+        "position_rmse_ground_px": _rms(right["error_px"]),
+        "attitude_rmse_deg": _rms(right["turn_deg"]),
+        "normalised_error_squared_mean": float(right["squared"].mean()),
+        "right_share": len(right) / max(len(fixes), 1),
+        "wrong_share": float((fixes["error_px"] >= WRONG_PX).mean()),
+        "seconds_per_frame": float(fixes["seconds"].mean()),
+    }
+
+
+def _rms(values: pd.Series) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,165 @@
+"""The filter over descents: errors at every frame with their stated sizes."""
+
+import time
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.console.terminal import progress_bar
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.filter.flight import Estimate, Instruments, fly
+from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
+from perilune_train.landing.filter.propagate import InertialNoise, start_sigmas
+from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
+from perilune_train.landing.methods.seen import SeenDescent
+
+START_M, START_MPS = 60.0, 1.0
+"""Standard deviations of position and velocity at the start, on each axis."""
+BAND = (1.24, 14.45)
+"""Where a sum of six squares lies in 95 % of cases."""
+
+
+def flights(
+    dataset: Dataset,
+    descents: list[SeenDescent],
+    catalogues: Mapping[str, Catalogue],
+    grade: InertialGrade,
+    attitude_deg: float,
+    smooth: bool = False,
+) -> pd.DataFrame:
+    """Errors of the filter, or of the smoother, at every frame of all descents.
+
+    The starts are off, drawn by the place of the descent.
+    """
+    tables = []
+    mounting, sigmas = mounting_of(dataset), default_sigmas(grade, attitude_deg)
+    with progress_bar() as progress:
+        task = progress.add_task(
+            f"{'smoother' if smooth else 'filter'}, {attitude_deg:g} deg", total=len(descents), unit="descents", note=""
+        )
+        for place, descent in enumerate(descents):
+            instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
+            off = sigmas[:9] * np.random.default_rng(place).normal(size=9)
+            begun = time.process_time()
+            flown = flight(descent, instruments, mounting, catalogues[descent.ids[0]], grade, sigmas, off, smooth)
+            tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
+            progress.advance(task)
+    return pd.concat(tables, ignore_index=True)
+
+
+def mounting_of(dataset: Dataset) -> Array:
+    """rotation_camera_from_body (3, 3). Raises UserError unless the camera is at the body's origin."""
+    camera = dataset.info.camera
+    if any(camera.position_in_body_m):
+        where = dataset.store.at("dataset.json")
+        raise UserError(where, "camera.position_in_body_m", list(camera.position_in_body_m), "[0, 0, 0]")
+    return np.array(camera.rotation_camera_from_body)
+
+
+def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
+    """Standard deviations of the start: `START_M`, `START_MPS`, an attitude, and the biases of a grade."""
+    return start_sigmas(START_M, START_MPS, attitude_deg, GRADES[grade])
+
+
+def flight(
+    descent: SeenDescent,
+    instruments: Instruments,
+    mounting: Array,
+    catalogue: Catalogue,
+    grade: InertialGrade,
+    sigmas: Array,
+    off: Array,
+    smooth: bool = False,
+) -> pd.DataFrame:
+    """Errors of the filter at every frame of a descent, or with `smooth` of the smoother, which knows all frames.
+
+    `mounting` is rotation_camera_from_body (3, 3), `sigmas` states the errors of the start, `off` (9,) has its true
+    errors: position, velocity, attitude.
+    """
+    lander = lander_of(descent, mounting, catalogue, grade, sigmas, off, smooth)
+    estimates = list(fly(lander, instruments, descent.time_s, descent.sightings))
+    rows = [row_of(descent, one, mounting) for one in estimates]
+    if smooth:
+        for number, row in enumerate(rows):
+            position, rotation = _true(descent, number, mounting)
+            error, covariance = lander.state.past_pose_error(number, position, rotation)
+            rows[number] = _row(position[2], row["status"], error, covariance)
+    return table_of(descent, rows)
+
+
+def lander_of(
+    descent: SeenDescent,
+    mounting: Array,
+    catalogue: Catalogue,
+    grade: InertialGrade,
+    sigmas: Array,
+    off: Array,
+    smooth: bool = False,
+) -> Lander:
+    """The lander at the first frame; arguments as of `flight`."""
+    turned = descent.true[0].changed(np.concatenate([off[:3], mounting @ off[6:]]))
+    attitude = turned.rotation_camera_from_site.T @ mounting
+    start = State.starting(turned.position_m, descent.velocity_mps + off[3:6], attitude, sigmas, RELIEF_M)
+    around = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
+    return Lander(start, InertialNoise.of(GRADES[grade]), around, keep_poses=smooth)
+
+
+def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFrame:
+    """The table of a flight from the rows of its frames."""
+    own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
+    return pd.DataFrame(rows).assign(**own, time_s=descent.time_s)
+
+
+def row_of(descent: SeenDescent, estimate: Estimate, mounting: Array) -> dict[str, object]:
+    """Errors of the filter at a frame."""
+    position, rotation = _true(descent, estimate.frame, mounting)
+    covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
+    return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation), covariance)
+
+
+_POSE = np.r_[POSITION, ATTITUDE]
+
+
+def _true(descent: SeenDescent, frame: int, mounting: Array) -> tuple[Array, Array]:
+    """True position and rotation_site_from_body at a frame."""
+    true = descent.true[frame]
+    return true.position_m, true.rotation_camera_from_site.T @ mounting
+
+
+def _row(altitude_m: float, status: object, error: Array, covariance: Array) -> dict[str, object]:
+    """One frame, from the step (6,) to the true pose and its covariance (6, 6)."""
+    return {
+        "altitude_m": altitude_m,
+        "status": status,
+        **_axes("error", -error[:3]),
+        **_axes("sigma", np.sqrt(np.diag(covariance))[:3]),
+        "error_m": float(np.linalg.norm(error[:3])),
+        "turn_deg": float(np.degrees(np.linalg.norm(error[3:]))),
+        "squared": float(error @ np.linalg.solve(covariance, error)),
+    }
+
+
+def _axes(name: str, values: Array) -> dict[str, float]:
+    return {f"{name}_{axis}_m": float(value) for axis, value in zip("xyz", values, strict=True)}
+
+
+def flight_summary(flown: pd.DataFrame) -> dict[str, float]:
+    """Figures of the filter over all frames of all descents, none left out."""
+    ends = flown.groupby(["scene_id", "trajectory_id"])["error_m"].last()
+    inside = flown["squared"].between(*BAND)
+    return {
+        "n_frames": float(len(flown)),
+        "position_rmse_m": float(np.sqrt(np.mean(np.square(flown["error_m"])))),
+        "position_end_rmse_m": float(np.sqrt(np.mean(np.square(ends)))),
+        "position_end_worst_m": float(ends.max()),
+        "attitude_rmse_deg": float(np.sqrt(np.mean(np.square(flown["turn_deg"])))),
+        "normalised_error_squared_mean": float(flown["squared"].mean()),
+        "in_band_share": float(inside.mean()),
+        "right_share": float((flown["status"] == "tracking").mean()),
+        "seconds_per_frame": float(flown["seconds"].mean()),
+    }

@@ -1,0 +1,111 @@
+"""The page of all methods: what each knows, its errors, and pictures."""
+
+import math
+from collections.abc import Sequence
+
+import pandas as pd
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.export.foreign_text import code_span, for_markdown
+from perilune_train.landing.methods.seen import SeenDescent
+from perilune_train.records.markdown import number, table
+
+_KNOWS = {
+    "warp": "two frames, the nominal motion",
+    "stack": "two frames",
+    "klt": "two frames, the altitude at the start",
+    "klt_gyroscope": "the same and a tactical gyroscope",
+    "alignment": "two frames, the altitude at the start",
+    "alignment_gyroscope": "the same and a tactical gyroscope",
+    "nominal": "the planned curve; no frame",
+    "fix, exact catalogue": "one frame, catalogue without errors, prior of 100 m and 1 degree",
+    "fix": "one frame, catalogue with errors, prior of 100 m and 1 degree",
+    "lost in space, exact catalogue": "one frame at 800 m or above, exact catalogue, altitude to 10 %, level camera",
+    "lost in space": "one frame at 800 m or above, catalogue with errors, altitude to 10 %, level camera",
+    "filter": "all frames so far, catalogue with errors, tactical unit, ranges, start of 60 m, 1 m/s, 0.5 degrees",
+    "smoother": "as `filter`, and all later frames; for reference, not on board",
+    "fix, map": "as `fix`, catalogue by our own detector from images of an orbiter",
+    "lost in space, map": "as `lost in space`, that catalogue",
+    "filter, map": "as `filter`, that catalogue",
+    "filter, star tracker": "as `filter`, with a start of 0.02 degrees",
+    "filter, exact catalogue": "as `filter`, with a catalogue without errors",
+}
+_RELATIVE = {
+    "position_rmse_m": "position RMSE of a step, vector (m)",
+    "attitude_rmse_deg": "orientation RMSE, angle (deg)",
+    "stated_rmse_m": "as the covariance states (m)",
+    "normalised_error_squared_mean": "normalised error squared (6)",
+    "position_end_rmse_m": "drift at the end (m)",
+}
+COLUMNS_ABSOLUTE = {
+    "n_frames": "frames",
+    "right_share": "right or tracking",
+    "wrong_share": "wrong",
+    "position_rmse_m": "position RMSE (m)",
+    "position_rmse_ground_px": "in ground pixels",
+    "position_end_rmse_m": "at the end (m)",
+    "attitude_rmse_deg": "attitude RMSE (deg)",
+    "normalised_error_squared_mean": "normalised error squared (6)",
+    "in_band_share": "in the 95 % band",
+    "seconds_per_frame": "seconds per frame",
+}
+_CAPTIONS = {
+    "altitude.png": "Errors by altitude, and normalised errors squared",
+    "flights.png": "Errors of the filter within three standard deviations",
+    "matches_high.png": "First frame: detections matched (cyan) and not (red), catalogue at the pose (yellow)",
+    "matches_low.png": "Last frame, likewise",
+}
+
+
+def page_of(
+    dataset: Dataset,
+    split: str,
+    rows: pd.DataFrame,
+    descents: list[SeenDescent],
+    detection_s: float,
+    pictures: Sequence[str],
+) -> str:
+    """The page as Markdown."""
+    scenes = {one.ids[0] for one in descents}
+    lines = [
+        "# Navigation methods",
+        "",
+        f"Dataset {code_span(dataset.info.name)}, split {for_markdown(split)}: "
+        f"{len(descents)} descents over {len(scenes)} scenes.",
+        f"Detection takes {detection_s:.3f} s per frame, which every absolute method needs besides its own time.",
+        "",
+        "## Motion between consecutive frames",
+        "",
+        *_table(rows[rows["kind"] == "relative"], _RELATIVE),
+        "",
+        "What the covariance of KLT states is the Cramer-Rao bound of its tracks over a plane, if their errors are",
+        "independent.",
+        "",
+        "## Position over ground",
+        "",
+        "A fix is right if it is off by less than 5 pixels on the ground; its errors are those of the right ones.",
+        "Errors of the filter are those of all frames.",
+        "",
+        *_table(rows[rows["kind"] == "absolute"], COLUMNS_ABSOLUTE),
+    ]
+    for name in pictures:
+        lines += ["", f"![{_CAPTIONS[name]}]({name})", "", f"*{_CAPTIONS[name]}.*"]
+    return "\n".join(lines) + "\n"
+
+
+def _table(rows: pd.DataFrame, columns: dict[str, str]) -> list[str]:
+    used = {key: title for key, title in columns.items() if key in rows and rows[key].notna().any()}
+    cells = [
+        [f"`{row['method']}`", _KNOWS[row["method"]], *(cell(key, row[key]) for key in used)]
+        for row in rows.to_dict("records")
+    ]
+    return table(["Method", "What it knows", *used.values()], cells)
+
+
+def cell(key: str, value: float) -> str:
+    """A figure as text, by the name of its column."""
+    if not math.isfinite(value):
+        return "-"
+    if key == "n_frames":
+        return f"{value:.0f}"
+    return f"{100 * value:.1f} %" if key.endswith("_share") else number(value)

@@ -1,0 +1,66 @@
+"""Descents with the craters that a detector finds in every frame."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perilune_shared.console.terminal import progress_bar
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.images.predict import above
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.scales import detect_at_scales
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.motion.data.trajectories import Trajectory
+from perilune_train.training.runs import RunFolder
+
+_BATCH = 4
+
+
+@dataclass(frozen=True, slots=True)
+class SeenDescent:
+    """One descent of n frames."""
+
+    ids: tuple[str, str]
+    """scene_id and trajectory_id."""
+    camera: Camera
+    """Intrinsics, without distortion."""
+    time_s: Array
+    """Times of the frames (n,), seconds since the first."""
+    true: list[Pose]
+    """True poses of the camera (n)."""
+    velocity_mps: Array
+    """True velocity at the first frame (3,), O_L."""
+    level_rotation_camera_from_site: Array
+    """Attitude (3, 3) of the camera on a level lander of heading 0."""
+    sightings: list[Sightings]
+    """Detected craters of each frame (n)."""
+
+
+def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
+    """Descents with the craters that the detector of a run finds, and its seconds per frame."""
+    detector, threshold = open_detector(RunFolder(run).best, config_of_run(run)), chosen_threshold(run)
+    descents, seconds = [], 0.0
+    n_frames = sum(len(one.images) for one in trajectories)
+    with progress_bar() as progress:
+        bar = progress.add_task("detect", total=n_frames, unit="frames", note="")
+        for one in trajectories:
+            seen = []
+            for start in range(0, len(one.images), _BATCH):
+                begun = time.perf_counter()
+                for found in detect_at_scales(detector, one.images[start : start + _BATCH]):
+                    kept = above(found, threshold)
+                    seen.append(Sightings.of_boxes(kept.boxes, kept.scores))
+                seconds += time.perf_counter() - begun
+                progress.advance(bar, len(one.images[start : start + _BATCH]))
+            rows = dataset.table("frames", ["time_s", "velocity_mps"], *one.ids).sort_by("time_s")
+            true = [Pose(*pose) for pose in zip(one.position_m, one.rotation_camera_from_site, strict=True)]
+            first = np.array(rows["velocity_mps"][0].as_py())
+            level = one.nominal_rotation_camera_from_site
+            descents.append(SeenDescent(one.ids, one.camera, rows["time_s"].to_numpy(), true, first, level, seen))
+    return descents, seconds / n_frames

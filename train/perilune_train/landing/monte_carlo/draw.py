@@ -1,0 +1,76 @@
+"""What one draw changes: the start, the catalogue, the inertial errors, and what goes wrong."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.inertial_errors import drawn_errors
+from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
+from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.filter.flight import Instruments
+from perilune_train.landing.methods.seen import SeenDescent
+from perilune_train.landing.monte_carlo.scenario import OUTAGE_S, WRONG_PRIOR_M, Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """One draw of a descent."""
+
+    descent: SeenDescent
+    """The descent, with the detections of the scenario."""
+    instruments: Instruments
+    """Measurements with the drawn inertial errors."""
+    off: Array
+    """True errors of the start (9,): position, m, velocity, m/s, attitude, rad."""
+
+
+def drawn(
+    descent: SeenDescent,
+    reference: Instruments,
+    grade: InertialGrade,
+    sigmas: Array,
+    scenario: Scenario,
+    rng: np.random.Generator,
+) -> Draw:
+    """A draw of a descent.
+
+    `reference` has inertial measurements whose own errors are small beside those of `grade`; they are taken as the true
+    motion. Ranges are as recorded. `sigmas` are the stated errors of the start, position, velocity and attitude first.
+    """
+    off = sigmas[:9] * rng.normal(size=9)
+    instruments = _measured(reference, grade, rng)
+    if scenario == "wrong-prior":
+        heading = rng.uniform(0, 2 * np.pi)
+        off[:2] = WRONG_PRIOR_M * np.array([np.cos(heading), np.sin(heading)])
+    elif scenario == "outage":
+        duration_s = descent.time_s[-1]
+        start_s = rng.uniform(0.0, max(duration_s - OUTAGE_S, 0.0))
+        blind = (descent.time_s >= start_s) & (descent.time_s < start_s + OUTAGE_S)
+        seen = [_none() if dark else own for own, dark in zip(descent.sightings, blind, strict=True)]
+        descent = replace(descent, sightings=seen)
+    elif scenario == "false-detections":
+        size_px = np.array([descent.camera.width_px, descent.camera.height_px])
+        descent = replace(descent, sightings=[_with_false(own, size_px, rng) for own in descent.sightings])
+    return Draw(descent, instruments, off)
+
+
+def _measured(reference: Instruments, grade: InertialGrade, rng: np.random.Generator) -> Instruments:
+    exact = reference.inertial
+    gyro, accelerometer = drawn_errors(GRADES[grade], exact.interval_s, rng)
+    rate, force = exact.angular_rate_radps + gyro, exact.specific_force_mps2 + accelerometer
+    return replace(reference, inertial=replace(exact, angular_rate_radps=rate, specific_force_mps2=force))
+
+
+def _none() -> Sightings:
+    return Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+
+
+def _with_false(seen: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
+    """As many false sightings as there are, of the same sizes and scores, anywhere in the image."""
+    places = rng.permutation(len(seen))
+    centre = np.concatenate([seen.centre_px, rng.uniform(0, size_px, (len(seen), 2))])
+    radius = np.concatenate([seen.radius_px, seen.radius_px[places]])
+    score = np.concatenate([seen.score, seen.score[places]])
+    order = np.argsort(-radius, kind="stable")
+    return Sightings(centre[order], radius[order], score[order])

@@ -1,0 +1,222 @@
+"""Fly the filter over draws of every descent of a split, in parallel, and write table, page and pictures."""
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.console.terminal import progress_bar
+from perilune_shared.dataset.manifest import Dataset, open_single
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.inertial_grades import InertialGrade
+from perilune_shared.storage.files import new_folder
+from perilune_shared.storage.store import Address
+from perilune_shared.threads import usable_cores
+from perilune_train.landing.craters.catalogue import (
+    LEAST_DIAMETER_M,
+    Catalogue,
+    CatalogueErrors,
+    exact_catalogue,
+    with_errors,
+)
+from perilune_train.landing.filter.flight import Instruments, fly_together, together
+from perilune_train.landing.methods.flights import default_sigmas, lander_of, mounting_of, row_of, table_of
+from perilune_train.landing.methods.seen import SeenDescent, seen_descents
+from perilune_train.landing.monte_carlo.draw import drawn
+from perilune_train.landing.monte_carlo.figures import draw_bands, draw_consistency
+from perilune_train.landing.monte_carlo.page import page_of
+from perilune_train.landing.monte_carlo.scenario import Scenario
+from perilune_train.motion.data.trajectories import load_split
+from perilune_train.records.markdown import write_markdown
+from perilune_train.records.marks import mark_files
+from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.training.runs import RunFolder, load_weights
+
+PAGE, TABLE = "monte_carlo.md", "draws.parquet"
+PICTURES = ("errors.png", "consistency.png")
+REFERENCE: InertialGrade = "navigation"
+"""Inertial measurements that are taken as the true motion: the errors of this grade are smaller than those of
+`GRADE` by factors of 6 (noise of the specific force) to 1000."""
+GRADE: InertialGrade = "tactical"
+_TOGETHER = 20
+"""Number of draws of a descent that are flown together."""
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One descent and what its draws start from."""
+
+    descent: SeenDescent
+    """The descent with recorded detections."""
+    reference: Instruments
+    """Inertial measurements of the grade `REFERENCE`, and ranges."""
+    catalogue: Catalogue
+    """Craters without errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What all draws share."""
+
+    sites: list[Site]
+    """All descents."""
+    mounting: Array
+    """rotation_camera_from_body (3, 3)."""
+    sigmas: Array
+    """Stated errors of the start."""
+    scenario: Scenario
+    """What goes wrong."""
+    seed: int
+    """Of all draws."""
+
+
+def fly_draws(
+    address: Address,
+    split: str,
+    detector: Path,
+    out: Path,
+    scenario: Scenario = "nominal",
+    draws: int = 200,
+    attitude_deg: float = 0.5,
+    seed: int = 0,
+    workers: int | None = None,
+    allow_overlap: bool = False,
+) -> pd.DataFrame:
+    """Fly the filter over `draws` random draws of every descent; returns a row per draw and frame.
+
+    The detector runs once over every frame. Writes monte_carlo.md, draws.parquet and pictures to the new folder `out`,
+    or nothing. The result does not depend on the number of workers. Raises UserError if the detector was fitted to the
+    terrain of the split, unless `allow_overlap`, or if the dataset lacks frames or inertial measurements.
+    """
+    dataset = open_single(address)
+    best = RunFolder(detector).best
+    check = check_terrain(read_provenance(load_weights(best), best), dataset, split, allow_overlap)
+    with new_folder(out) as folder:
+        job = Job(
+            sites_of(dataset, split, detector, address),
+            mounting_of(dataset),
+            default_sigmas(GRADE, attitude_deg),
+            scenario,
+            seed,
+        )
+        begun = time.perf_counter()
+        rows = pd.concat(all_draws(job, draws, workers or usable_cores()), ignore_index=True)
+        rows = rows.sort_values(["scene_id", "trajectory_id", "draw", "time_s"], ignore_index=True)
+        rows.to_parquet(folder / TABLE, index=False)
+        draw_bands(folder / PICTURES[0], rows)
+        draw_consistency(folder / PICTURES[1], rows)
+        about = {"scenario": scenario, "draws": draws, "seed": seed, "attitude_deg": attitude_deg}
+        seconds = time.perf_counter() - begun
+        write_markdown(folder / PAGE, page_of(dataset.info.name, split, about, rows, seconds, PICTURES))
+        mark_files(folder, (PAGE, TABLE, *PICTURES), str(check.metrics()["terrain/mark"]))
+    return rows
+
+
+def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> list[Site]:
+    """The descents of a split, after the detector of a run has seen their frames."""
+    trajectories = load_split(dataset, split)
+    references = {one.ids: _reference(dataset, one.ids, address) for one in trajectories}
+    descents, _ = seen_descents(dataset, trajectories, detector)
+    exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {one.ids[0] for one in descents}}
+    return [Site(one, references[one.ids], exact[one.ids[0]]) for one in descents]
+
+
+def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Instruments:
+    """Measurements that are taken as the true motion."""
+    found = Instruments.of_trajectory(dataset, ids, REFERENCE)
+    if not len(found.inertial):
+        expected = f"measurements of the grade {REFERENCE} (see the setting dataset.nav.instruments.inertial_grades)"
+        raise UserError(str(address), f"inertial of {'/'.join(ids)}", "nothing", expected)
+    return found
+
+
+def flown_draws(job: Job, place: int, draws: Sequence[int]) -> list[pd.DataFrame]:
+    """Draws of one descent, flown together.
+
+    Each depends on the seed, the place of the descent and the number of the draw, and on the others by rounding alone.
+    """
+    site, sigmas = job.sites[place], job.sigmas
+    landers, drawn_ones = [], []
+    for draw in draws:
+        rng = np.random.default_rng([job.seed, place, draw])
+        catalogue = with_errors(site.catalogue, CatalogueErrors(), rng)
+        one = drawn(site.descent, site.reference, GRADE, sigmas, job.scenario, rng)
+        landers.append(lander_of(one.descent, job.mounting, catalogue, GRADE, sigmas, one.off))
+        drawn_ones.append(one)
+    instruments = together([one.instruments for one in drawn_ones])
+    seen = zip(*(one.descent.sightings for one in drawn_ones), strict=True)
+    rows: list[list[dict[str, object]]] = [[] for _ in draws]
+    for estimates in fly_together(landers, instruments, site.descent.time_s, seen):
+        for own, estimate in zip(rows, estimates, strict=True):
+            own.append(row_of(site.descent, estimate, job.mounting))
+    return [table_of(site.descent, own).assign(draw=draw) for own, draw in zip(rows, draws, strict=True)]
+
+
+def all_draws(job: Job, draws: int, workers: int) -> list[pd.DataFrame]:
+    """Tables of all flights, in any order; in this process if there is one worker."""
+    asked = [
+        (place, range(first, min(first + _TOGETHER, draws)))
+        for first in range(0, draws, _TOGETHER)
+        for place in range(len(job.sites))
+    ]
+    tables = []
+    with progress_bar() as progress:
+        task = progress.add_task("filter", total=draws * len(job.sites), unit="flights", note=job.scenario)
+        for flown in _flown(job, asked, min(workers, len(asked))):
+            tables += flown
+            progress.advance(task, len(flown))
+    return tables
+
+
+def _flown(job: Job, asked: list[tuple[int, range]], workers: int) -> Iterator[list[pd.DataFrame]]:
+    """Tables in any order."""
+    if workers == 1:
+        yield from (flown_draws(job, *one) for one in asked)
+        return
+    # spawn: torch's threads do not survive a fork.
+    with _one_thread(), ProcessPoolExecutor(workers, get_context("spawn"), _begin, (job,)) as pool:
+        remaining = iter(asked)
+        running = {pool.submit(_of_job, *one) for one in islice(remaining, 2 * workers)}
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                following = next(remaining, None)
+                if following is not None:
+                    running.add(pool.submit(_of_job, *following))
+                yield future.result()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that start inside have one thread for linear algebra: those of several workers slow each other down."""
+    before = dict(os.environ)
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name in _THREADS:
+            os.environ.pop(name)
+            if name in before:
+                os.environ[name] = before[name]
+
+
+_JOB: list[Job] = []
+"""The job of a worker process."""
+
+
+def _begin(job: Job) -> None:
+    _JOB.append(job)
+
+
+def _of_job(place: int, draws: range) -> list[pd.DataFrame]:
+    return flown_draws(_JOB[0], place, draws)

@@ -1,0 +1,1 @@
+"""Motion of a lander from its frames: navigators (networks) and classical methods."""

@@ -1,0 +1,165 @@
+"""Score a navigator on the locked benchmark: all methods by region, altitude and Sun, with intervals over scenes."""
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.console.terminal import progress_bar
+from perilune_shared.export.foreign_text import code_span
+from perilune_shared.storage.store import Address
+from perilune_train.motion.covariance import stated_covariances
+from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
+from perilune_train.motion.finished_run import fusion_of
+from perilune_train.motion.metrics.baselines import baselines
+from perilune_train.motion.metrics.metrics import motion_errors, summary, summary_spreads
+from perilune_train.motion.metrics.report import write_evaluation
+from perilune_train.motion.network import check_motion, load_navigator, predict, predict_by_pairs
+from perilune_train.records.benchmark_parts import Part, open_parts, part_names
+from perilune_train.records.markdown import number, table, write_markdown
+from perilune_train.records.marks import mark_files
+from perilune_train.records.metrics_file import Metrics, write_metrics
+from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.training.runs import RunFolder, load_weights
+
+PAGE, FIGURES = "benchmark.md", "benchmark.json"
+HEADLINE = "position_rmse_vector_m"
+"""The least favourable of the RMSEs of position: of the vector's length, not of a component."""
+_COLUMNS = {
+    HEADLINE: "position RMSE, vector (m)",
+    "position_rmse_per_component_m": "per component (m)",
+    "orientation_rmse_angle_deg": "orientation RMSE, angle (deg)",
+    "drift_final_m": "drift at the end (m)",
+    "stated_position_rmse_vector_m": "stated position RMSE, vector (m)",
+    "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is right)",
+}
+_OF_BINS = tuple(_COLUMNS)[:3]
+"""The figures that are also given by region, altitude and Sun."""
+_ALTITUDES_M = (200, 500, 1000, 1600)
+_SUNS_DEG = (0, 15, 30, 45, 60, 90)
+
+
+def score_navigator(run: Path, data: Address, manifests: Address, out: Path, allow_overlap: bool = False) -> Metrics:
+    """Score a run's best weights, the classical methods and the nominal motion, and return the figures.
+
+    Writes page, figures, tables and pictures. Raises UserError if the benchmark is missing or changed, or if the
+    network was fitted to its terrain, unless `allow_overlap`.
+    """
+    parts = open_parts("nav", data, manifests)
+    best = RunFolder(run).best
+    content = load_weights(best)
+    fusion = fusion_of(best, content["architecture"])
+    check_motion(best, content["architecture"])
+    provenance = read_provenance(content, best)
+    checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
+    network, architecture = load_navigator(best, fusion)
+    trajectories, regions, suns = _load(parts)
+    motions: dict[str, list[Motion]] = {fusion: []}
+    with progress_bar() as progress:
+        bar = progress.add_task("navigate", total=len(trajectories), unit="trajectories", note="")
+        for trajectory in trajectories:
+            motions[fusion].append(predict(network, architecture, trajectory))
+            progress.advance(bar)
+    classical = baselines([], trajectories)
+    motions |= classical.motions
+    covariances = classical.covariances
+    stated = stated_covariances(run, network, architecture, trajectories)
+    if stated is not None:
+        covariances = {fusion: stated, **covariances}
+    errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
+    mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
+    counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}
+    ms = round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2)
+    details: Metrics = {"test/ms_per_single_pair": ms, "terrain/mark": mark, "dataset/name": "locked benchmark"}
+    write_evaluation(out, fusion, "test", trajectories, motions, covariances, details)
+    figures = _figures(errors, regions, suns) | {"headline/method": fusion, f"headline/{HEADLINE}": None}
+    figures[f"headline/{HEADLINE}"] = figures[f"{fusion}/{HEADLINE}"]
+    for name, (n_frames, n_locked) in counts.items():
+        figures |= {f"frames/{name}": n_frames, f"locked_frames/{name}": n_locked}
+    write_markdown(out / PAGE, _page(run, fusion, errors, figures, ms, counts))
+    mark_files(out, [PAGE], mark)
+    write_metrics(out, figures | details | {"scored": f"run {run.resolve().name}"}, FIGURES)
+    return figures
+
+
+def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str, float]]:
+    """All trajectories, with the part in the scene's name; region and Sun (degrees) of each scene."""
+    trajectories, regions, suns = [], {}, {}
+    for part in parts:
+        for row in part.dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist():
+            scene = f"{part.name}/{row['scene_id']}"
+            regions[scene], suns[scene] = part.region, float(row["sun_elevation_deg"])
+        for one in load_split(part.dataset, "test"):
+            trajectories.append(replace(one, ids=(f"{part.name}/{one.ids[0]}", one.ids[1])))
+    return trajectories, regions, suns
+
+
+def _figures(errors: dict[str, pd.DataFrame], regions: dict[str, str], suns: dict[str, float]) -> Metrics:
+    """Flat keys: <method>/<figure>, <method>/region/<name>/..., <method>/altitude/<bin>/..., <method>/sun/<bin>/..."""
+    figures: Metrics = {}
+    for method, own in errors.items():
+        figures |= {f"{method}/{key}": value for key, value in summary(own).items()}
+        for key, spread in summary_spreads(own).items():
+            figures |= spread.keys(f"{method}/{key}")
+        for kind, names in (
+            ("region", own["scene_id"].map(regions)),
+            ("altitude_m", _bins(own["altitude_m"], _ALTITUDES_M)),
+            ("sun_deg", _bins(own["scene_id"].map(suns), _SUNS_DEG)),
+        ):
+            for name, rows in own.groupby(names):
+                found = summary(rows)
+                figures |= {f"{method}/{kind}/{name}/{key}": found[key] for key in _OF_BINS}
+                figures[f"{method}/{kind}/{name}/scenes"] = int(rows["scene_id"].nunique())
+    return figures
+
+
+def _bins(values: pd.Series, edges: tuple[int, ...]) -> pd.Series:
+    names = [f"{low}-{high}" for low, high in itertools.pairwise(edges)]
+    return pd.Series(np.array(names)[np.clip(np.digitize(values, edges) - 1, 0, len(names) - 1)], index=values.index)
+
+
+def _page(
+    run: Path,
+    fusion: str,
+    errors: dict[str, pd.DataFrame],
+    figures: Metrics,
+    ms: float,
+    counts: dict[str, tuple[int, int]],
+) -> str:
+    """The page as Markdown."""
+    spreads = {method: summary_spreads(own) for method, own in errors.items()}
+    headline = spreads[fusion][HEADLINE].text(float(figures[f"{fusion}/{HEADLINE}"] or np.nan))
+    lines = ["# Locked benchmark of navigation", ""]
+    lines += [
+        f"**Position RMSE of a step {headline} m** (length of the error vector), run {code_span(run.resolve().name)}.",
+        "",
+    ]
+    for name in part_names("nav"):
+        n_frames, n_locked = counts.get(name, (0, 0))
+        whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
+        lines.append(f"- `{name}`: {whole} of the shared manifest" if n_frames else f"- `{name}`: **not scored**")
+    lines += [f"- one pair at a time with the state carried: {ms:g} ms", "", "## Methods", ""]
+    rows = []
+    for method in errors:
+        cells = [
+            spreads[method][key].text(float(figures[f"{method}/{key}"] or np.nan))
+            if key in spreads[method]
+            else number(figures.get(f"{method}/{key}"))
+            for key in _COLUMNS
+        ]
+        rows.append([method, *cells])
+    lines += [*table(["method", *_COLUMNS.values()], rows), ""]
+    lines += ["In brackets: 95 % intervals over scenes, or the value of each scene if there are fewer than five.", ""]
+    for kind, title in (("region", "region"), ("altitude_m", "altitude (m)"), ("sun_deg", "Sun (deg)")):
+        start = f"{fusion}/{kind}/"
+        names = [
+            key[len(start) : -len("/scenes")] for key in figures if key.startswith(start) and key.endswith("/scenes")
+        ]
+        lines += [f"## Position RMSE (m) by {title}", ""]
+        by_name = [
+            [name, *[number(figures.get(f"{method}/{kind}/{name}/{HEADLINE}")) for method in errors]] for name in names
+        ]
+        lines += [*table([title, *errors], by_name), ""]
+    return "\n".join(lines)

@@ -1,0 +1,165 @@
+"""Direct alignment of two frames: the motion, tilt and heights with which the second looks like the first.
+
+Gauss-Newton over all pixels (Lucas & Kanade 1981; with free heights of the ground as in direct odometry, Engel et al.
+2018, doi 10.1109/TPAMI.2017.2658577), on local contrast, with Tukey's weights (Beaton & Tukey 1974, doi
+10.1080/00401706.1974.10489171). The unknowns, in this order: turn (3) and shift (3) of the points of frame 2, tilt of
+frame 1 (2), heights at the nodes (25).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
+from perilune_train.motion.classical.contrast import Level, sampled
+from perilune_train.motion.classical.ground import N_NODES, Heights, node_weights
+from perilune_train.motion.classical.klt import SHIFT_SHARE
+
+_TUKEY = 4.685
+_DEPENDENT_PIXELS = 6.0
+"""Errors of neighbouring pixels are alike: so many pixels count as one. Chosen on training and validation scenes."""
+_TILT_SIGMA_RAD = float(np.radians(0.5))
+"""Standard deviation of the tilt around a level attitude, on each axis."""
+_ITERATIONS = 8
+_SMALL_STEP = 1e-5
+"""Step of turn, and of shift divided by altitude, below which the iteration ends."""
+_MARGIN_PX = 2
+_N_POSE = 8
+_N_UNKNOWN = _N_POSE + N_NODES
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is known of a pair of frames before they are aligned."""
+
+    translation_m: Array
+    """Expected motion (3,), O_C of frame 1."""
+    rotation_c2_from_c1: Array
+    """Expected rotation (3, 3)."""
+    turn_sigma_rad: float
+    """Standard deviation of the rotation on each axis."""
+    down_c: Array
+    """Unit vector (3,) towards the ground in O_C of a level camera."""
+    altitude_m: float
+    """Altitude of frame 1 above the ground plane."""
+    heights: Heights
+    """Heights of the ground in view of frame 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The unknowns of a pair."""
+
+    translation_m: Array
+    """Motion (3,), O_C of frame 1."""
+    rotation_c2_from_c1: Array
+    """Rotation (3, 3)."""
+    tilt_rad: Array
+    """Tilt of frame 1 (2,) about the axes of `_across`."""
+    height_m: Array
+    """Heights at the nodes (N_NODES,)."""
+
+    def changed(self, step: Array) -> "State":
+        """The state after a step of all unknowns (n_unknown,)."""
+        # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
+        rotation = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
+        translation = self.translation_m - rotation.T @ step[3:6]
+        return State(translation, rotation, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
+
+    def offset(self, prior: Prior) -> Array:
+        """Difference of all unknowns (n_unknown,) to the prior."""
+        turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.rotation_c2_from_c1.T)
+        shift = self.rotation_c2_from_c1 @ (prior.translation_m - self.translation_m)
+        return np.concatenate([turn, shift, self.tilt_rad, self.height_m - prior.heights.mean_m])
+
+    def down_c(self, prior: Prior) -> Array:
+        """Unit vector (3,) towards the ground in O_C of frame 1."""
+        down = prior.down_c + self.tilt_rad @ _across(prior.down_c)
+        return down / np.linalg.norm(down)
+
+
+def align(first: list[Level], second: list[Level], prior: Prior, start: State) -> tuple[State, Array]:
+    """Align two pyramids, the coarsest level first; returns the state and its covariance (n_unknown, n_unknown).
+
+    Turns are from the left, radians; shifts are metres, O_C of frame 2.
+    """
+    precision = np.zeros((_N_UNKNOWN, _N_UNKNOWN))
+    shift_sigma_m = SHIFT_SHARE * prior.altitude_m
+    sigmas = [prior.turn_sigma_rad] * 3 + [shift_sigma_m] * 3 + [_TILT_SIGMA_RAD] * 2
+    precision[range(_N_POSE), range(_N_POSE)] = 1 / np.square(sigmas)
+    precision[_N_POSE:, _N_POSE:] = np.linalg.inv(prior.heights.covariance_m2)
+    state = start
+    for one, other in zip(first, second, strict=True):
+        residuals = _Residuals(one, other, prior)
+        for _ in range(_ITERATIONS):
+            normal, gradient = residuals.normal_equations(state)
+            normal, gradient = normal + precision, gradient + precision @ state.offset(prior)
+            # Metres and radians have very different scales; a unit diagonal keeps the system well conditioned.
+            unit: Array = 1 / np.sqrt(np.diag(normal))
+            scale: Array = unit[:, None] * unit
+            covariance = scale * np.linalg.inv(scale * normal)
+            step = -covariance @ gradient
+            state = state.changed(step)
+            if np.abs(step[:6] / np.repeat([1, prior.altitude_m], 3)).max() < _SMALL_STEP:
+                break
+    return state, covariance
+
+
+class _Residuals:
+    """Differences between two images of one level, as a function of the state."""
+
+    def __init__(self, first: Level, second: Level, prior: Prior):
+        inner = np.s_[_MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX]
+        pixels = first.camera.pixel_centres()[inner].reshape(-1, 2)
+        self._prior, self._camera = prior, second.camera
+        self._values = first.contrast[inner].ravel()
+        self._rays = first.camera.rays(pixels).astype(np.float32)
+        self._nodes = node_weights(first.camera, pixels)
+        by_row, by_column = np.gradient(second.contrast)
+        self._maps = np.stack([second.contrast, by_column, by_row])
+
+    def normal_equations(self, state: State) -> tuple[Array, Array]:
+        """Weighted normal matrix (n_unknown, n_unknown) and gradient (n_unknown,) of the squared differences."""
+        down = state.down_c(self._prior).astype(np.float32)
+        along = self._rays @ down
+        drop_m = self._prior.altitude_m - self._nodes @ state.height_m.astype(np.float32)
+        points = self._rays * (drop_m / along)[:, None]
+        rotation = state.rotation_c2_from_c1.astype(np.float32)
+        moved = (points - state.translation_m.astype(np.float32)) @ rotation.T
+        value, by_u, by_v = sampled(self._maps, self._camera.project(moved))
+        used = np.isfinite(value)
+        error = np.where(used, value - self._values, 0)
+        by_moved = _by_point(np.nan_to_num(by_u), np.nan_to_num(by_v), moved, self._camera)
+        spread = 1.4826 * float(np.median(np.abs(error[used]))) + 1e-6 if used.any() else 1.0
+        weight = np.where(used, np.clip(1 - (error / (_TUKEY * spread)) ** 2, 0, None) ** 2, 0)
+        weight /= spread**2 * _DEPENDENT_PIXELS
+        jacobian = self._jacobian(points, moved, along, by_moved, by_moved @ rotation)
+        scaled = jacobian * weight[:, None].astype(np.float32)
+        return (scaled.T @ jacobian).astype(np.float64), (scaled.T @ error).astype(np.float64)
+
+    def _jacobian(self, points: Array, moved: Array, along: Array, by_moved: Array, by_first: Array) -> Array:
+        """Derivatives (n, n_unknown) of the differences, from those by the points of frame 2 and of frame 1 (n, 3)."""
+        found: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
+        # By a turn w from the left a point X moves by w x X, and the value by w . (X x derivative).
+        found[:, :3], found[:, 3:6] = np.cross(moved, by_moved), by_moved
+        tilted = self._rays @ _across(self._prior.down_c).T.astype(np.float32)
+        found[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
+        found[:, _N_POSE:] = self._nodes * (-np.einsum("ni,ni->n", by_first, self._rays) / along)[:, None]
+        return found
+
+
+def _by_point(by_u: Array, by_v: Array, points: Array, camera: Camera) -> Array:
+    """Derivatives (n, 3) by points (n, 3), O_C, from those by image coordinates."""
+    x, y, z = points.T
+    by_x, by_y = by_u * np.float32(camera.fx_px) / z, by_v * np.float32(camera.fy_px) / z
+    return np.stack([by_x, by_y, -(by_x * x + by_y * y) / z], axis=1)
+
+
+def _across(down_c: Array) -> Array:
+    """Two unit vectors (2, 3) at right angles to a direction and to each other."""
+    one = np.cross(down_c, np.eye(3)[np.argmin(np.abs(down_c))])
+    one /= np.linalg.norm(one)
+    return np.stack([one, np.cross(down_c, one)])

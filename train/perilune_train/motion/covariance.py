@@ -1,0 +1,121 @@
+"""The covariance that a warp network states for its motions.
+
+The network fits a motion to flows with weights of its own and a prior, so the fit has a covariance. It is not right by
+itself: weights of neighbouring cells are not independent, the ground is no plane, and the recurrent part corrects the
+fit. Five numbers are therefore fitted to the errors of validation descents, by maximum likelihood.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import Array
+from perilune_shared.storage.files import write_text
+from perilune_train.models.navigator import WarpNavigator
+from perilune_train.motion.data.sequences import pair_sequence
+from perilune_train.motion.data.trajectories import Motion, Trajectory
+from perilune_train.motion.metrics.metrics import signed_errors
+from perilune_train.motion.network import Collate, Scales, predict
+
+FILE = "covariance.json"
+NAMES = ("flow", "flow_by_altitude", "prior", "turn", "along")
+"""Logarithms of: the factor on the information of the flows; its growth with the logarithm of the altitude over 1000 m;
+the factor on the prior; the factors on the deviations of the rotation about z and of the translation along z."""
+_ALTITUDE_M, _LARGEST = 1000.0, 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class MotionInformation:
+    """Information on the motions of one trajectory of n frames, from a network's flows and its prior."""
+
+    information: Array
+    """Of the flows (n - 1, 6, 6), without factors: turn, radians, and shift, metres, as in `EstimatedMotion`."""
+    prior: Array
+    """Inverse variances of the network's own prior (6,)."""
+    altitude_m: Array
+    """Nominal altitudes (n - 1,)."""
+
+    def covariance(self, numbers: Sequence[float] | Array) -> Array:
+        """Covariances (n - 1, 6, 6), with the five numbers of `NAMES`."""
+        flow, by_altitude, prior, turn, along = numbers
+        factor = np.exp(flow + by_altitude * np.log(self.altitude_m / _ALTITUDE_M))
+        inverse = factor[:, None, None] * self.information + np.exp(prior) * np.diag(self.prior)
+        spread = np.exp([0.0, 0.0, turn, 0.0, 0.0, along])
+        return np.asarray(np.linalg.inv(inverse) * spread[:, None] * spread)
+
+
+def information_of(network: WarpNavigator, architecture: dict[str, Any], trajectory: Trajectory) -> MotionInformation:
+    """Information on the motions of a trajectory, from the flows and the prior of a warp network."""
+    shrunk, scales = trajectory.shrunk(architecture["size_px"]), Scales(**architecture["scales"])
+    network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
+    sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=True)
+    batch = Collate(scales, "warp")([sequence]).to(next(network.parameters()).device)
+    with torch.no_grad():
+        information = network.information(batch.first, batch.second, batch.altitude_m)[0].cpu().double().numpy()
+        prior = network.log_prior.exp().cpu().double().numpy()
+    # The turn leads from the estimate to the truth, the shift from the truth to the estimate (`EstimatedMotion`).
+    unit = np.array([*scales.spread_m, *[-scales.rotation_rad] * 3])
+    order = np.r_[3:6, 0:3]
+    found = (information / unit[:, None] / unit)[:, order][:, :, order]
+    return MotionInformation(found, (prior / unit**2)[order], shrunk.altitude_m)
+
+
+def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
+    """The five numbers under which the errors of these motions are most likely, as those of a Gaussian."""
+    errors = np.concatenate([signed_errors(one, motion) for one, motion in zip(trajectories, motions, strict=True)])
+
+    def cost(numbers: Array) -> float:
+        stated = np.concatenate([one.covariance(numbers) for one in known])
+        squared = np.einsum("ni,ni->n", errors, np.linalg.solve(stated, errors[:, :, None])[:, :, 0])
+        return float(np.mean(np.linalg.slogdet(stated)[1] + squared))
+
+    # Bounds, since the flows of a network that was hardly trained have no information.
+    start, bounds = np.array([-4.0, 0.0, 0.0, 0.0, 0.0]), [(-_LARGEST, _LARGEST)] * len(NAMES)
+    options = {"maxfev": 4000, "maxiter": 4000}
+    return minimize(cost, start, method="Nelder-Mead", bounds=bounds, options=options).x.tolist()
+
+
+def calibrate(
+    folder: Path, network: WarpNavigator, architecture: dict[str, Any], trajectories: list[Trajectory]
+) -> None:
+    """Fit the five numbers to validation trajectories, and write covariance.json to a run's folder."""
+    motions = [predict(network, architecture, one) for one in trajectories]
+    numbers = fit_numbers([information_of(network, architecture, one) for one in trajectories], trajectories, motions)
+    write_numbers(folder, numbers, sum(one.n_pairs for one in trajectories))
+
+
+def write_numbers(folder: Path, numbers: list[float], n_pairs: int) -> None:
+    """Write covariance.json of a run."""
+    content = {"numbers": dict(zip(NAMES, numbers, strict=True)), "pairs": n_pairs}
+    write_text(folder / FILE, json.dumps(content, indent=2) + "\n")
+
+
+def read_numbers(folder: Path) -> list[float] | None:
+    """The five numbers of a run; None if it has none. Raises UserError if the file is damaged."""
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    try:
+        numbers = [float(json.loads(path.read_text(encoding="utf-8"))["numbers"][name]) for name in NAMES]
+        if not all(abs(number) <= _LARGEST for number in numbers):
+            raise ValueError(f"numbers {numbers}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(path, "numbers", repr(error), f"-{_LARGEST:g} to {_LARGEST:g}: {', '.join(NAMES)}") from None
+    return numbers
+
+
+def stated_covariances(
+    folder: Path, network: Any, architecture: dict[str, Any], trajectories: list[Trajectory]
+) -> list[Array] | None:
+    """Covariances of a run's motions over some trajectories, as in `EstimatedMotion`; None if the run states none."""
+    numbers = read_numbers(folder)
+    if numbers is None or not isinstance(network, WarpNavigator):
+        return None
+    return [information_of(network, architecture, one).covariance(numbers) for one in trajectories]

@@ -1,0 +1,98 @@
+"""What a pose network must beat: mean poses of the training set, and ridge regression on the frozen features."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
+from perilune_train.motion.data.trajectories import Pose, Trajectory
+from perilune_train.motion.geometry import mean_rotation
+
+FLOORS = {
+    "mean_pose": "mean pose of the training, without images",
+    "mean_pose_at_frame": "mean pose of the training at that frame, without images",
+    "ridge": "ridge regression on the frozen features",
+}
+"""Methods beside a pose network, with their names in tables."""
+_PENALTIES = np.logspace(-6, 2, 17)
+"""Penalties of the ridge regression, in units of the mean squared length of a standardised feature vector."""
+
+
+def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Pose]]:
+    """The training set's mean pose, and its mean pose at each frame, for every test trajectory."""
+    position_m, rotation = (np.concatenate([one.pose[i] for one in training]) for i in range(2))
+    mean, turn = position_m.mean(0), mean_rotation(rotation)
+    constant = [constant_pose(mean, turn, one.n_pairs) for one in test]
+    return {"mean_pose": constant, "mean_pose_at_frame": [_mean_pose_at_frame(training, one.n_pairs) for one in test]}
+
+
+def constant_pose(position_m: Array, rotation: Array, n_pairs: int) -> Pose:
+    """The same pose for every pair."""
+    return np.tile(position_m, (n_pairs, 1)), np.tile(rotation, (n_pairs, 1, 1))
+
+
+def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
+    """Mean pose of the training set at each frame; at its last frame for all later ones."""
+    last, positions, rotations = max(one.n_pairs for one in training) - 1, [], []
+    for step in np.minimum(np.arange(n_pairs), last):
+        known = [one.pose for one in training if one.n_pairs > step]
+        positions.append(np.mean([pose[0][step] for pose in known], axis=0))
+        rotations.append(mean_rotation(np.stack([pose[1][step] for pose in known])))
+    return np.stack(positions), np.stack(rotations)
+
+
+@dataclass(frozen=True)
+class Known:
+    """Trajectories with features of their pairs."""
+
+    trajectories: list[Trajectory]
+    """The trajectories."""
+    features: list[Array]
+    """Features (pairs, inputs) of each."""
+
+
+def ridge_poses(training: Known, validation: Known, features: list[Array]) -> list[Pose]:
+    """Poses from features (pairs, inputs) of each test trajectory by ridge regression fitted to the training pairs.
+
+    Features are standardised. The penalty is the one of the lowest squared error of position on validation.
+    """
+    position_m, rotation = (np.concatenate([one.pose[i] for one in training.trajectories]) for i in range(2))
+    turn = mean_rotation(rotation)
+    targets = np.concatenate([position_m, rotation_vectors(rotation @ turn.T)], axis=1)
+    fit = _Ridge(np.concatenate(training.features), targets)
+    known = np.concatenate([one.pose[0] for one in validation.trajectories])
+    unseen = fit.projected(np.concatenate(validation.features))
+    costs = [np.sum((fit.targets(unseen, penalty)[:, :3] - known) ** 2) for penalty in _PENALTIES]
+    best = _PENALTIES[int(np.argmin(costs))]
+    found = [fit.targets(fit.projected(one), best) for one in features]
+    return [
+        (one[:, :3], np.stack([matrix_from_rotation_vector(vector) @ turn for vector in one[:, 3:]])) for one in found
+    ]
+
+
+class _Ridge:
+    """Ridge regression from features (n, inputs) to targets (n, outputs), for any penalty."""
+
+    def __init__(self, features: Array, targets: Array):
+        self.mean, spread = features.mean(0), features.std(0)
+        self.scale = np.maximum(np.maximum(spread, 0.1 * spread.mean()), 1e-12)
+        self.centre, standard = targets.mean(0), self._standardised(features)
+        # With more features than pairs the matrix of inner products is the smaller one.
+        self.known = standard if features.shape[1] > len(features) else None
+        gram = standard @ standard.T if self.known is not None else standard.T @ standard
+        self.values, self.vectors = np.linalg.eigh(gram.astype(np.float64))
+        right = targets - self.centre if self.known is not None else standard.T @ (targets - self.centre)
+        self.right, self.unit = self.vectors.T @ right, float(np.mean(np.sum(standard**2, axis=1)))
+
+    def projected(self, features: Array) -> Array:
+        """Features (n, inputs) along the eigenvectors."""
+        inner = self._standardised(features)
+        return np.asarray((inner if self.known is None else inner @ self.known.T) @ self.vectors)
+
+    def targets(self, projected: Array, penalty: float) -> Array:
+        """Targets (n, outputs) of projected features, for a penalty in units of `_PENALTIES`."""
+        shrunk = self.right / (np.maximum(self.values, 0) + penalty * self.unit)[:, None]
+        return np.asarray(self.centre + projected @ shrunk)
+
+    def _standardised(self, features: Array) -> Array:
+        return np.asarray((features - self.mean) / self.scale)

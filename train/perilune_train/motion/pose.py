@@ -1,0 +1,117 @@
+"""Poses in O_L from a stack network: features of pairs, causal windows over a trajectory, pair by pair as in flight.
+
+The network is trained on sequences of `sequence_pairs` pairs from the zero state of the LSTM, and it is evaluated so:
+the pose at each pair comes from the window of the last `sequence_pairs` pairs, which is shorter at the start.
+"""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from perilune_train.models.navigator import Recurrent, StackNavigator
+from perilune_train.motion.data.trajectories import Pose, Trajectory
+from perilune_train.motion.network import Scales, decoded_rotation
+
+_PAIRS = {"cpu": 16, "cuda": 32}
+"""Pairs at a time through the backbone, to bound memory. More on a GPU, which would wait for launches of kernels."""
+
+
+def normalised_frames(frames: Tensor) -> Tensor:
+    """8-bit frames (..., height, width) as `perilune_train.data.frames.normalised` gives them, on their device."""
+    pixels = frames.float()
+    deviation, mean = torch.std_mean(pixels, dim=(-2, -1), correction=0, keepdim=True)
+    return (pixels - mean) / deviation.clamp(min=1.0)
+
+
+def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
+    """8-bit frames (n, height, width), resampled by homographies (n, 3, 3) from output to input image coordinates.
+
+    Float, between 0 and 255. Bicubic, because bilinear resampling blurs more, which a network would take for another
+    altitude. Beyond the edge the frame is reflected: no level of grey or edge appears that no camera sees.
+    """
+    height, width = (int(size) for size in frames.shape[1:])
+    x = torch.arange(width, device=frames.device) + 0.5
+    y = (torch.arange(height, device=frames.device) + 0.5)[:, None]
+    # Not as a product of matrices, which autocast would compute in bfloat16.
+    rows = homographies[:, :, :, None, None]
+    u, v, w = (rows[:, i, 0] * x + rows[:, i, 1] * y + rows[:, i, 2] for i in range(3))
+    grid = torch.stack([2 * u / (w * width) - 1, 2 * v / (w * height) - 1], dim=-1)
+    pixels = frames[:, None].float()
+    found = functional.grid_sample(pixels, grid, mode="bicubic", padding_mode="reflection", align_corners=False)
+    return found[:, 0].clamp(0, 255)
+
+
+def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tensor | None = None) -> Iterator[Tensor]:
+    """Averages of the backbone's features (pairs, inputs) of the pairs of consecutive 8-bit frames (n, height, width).
+
+    In portions, on the network's device. With homographies (n, 3, 3) the frames are warped first (`warped_frames`).
+    """
+    device = next(network.parameters()).device
+    at_once = _PAIRS.get(device.type, 16)
+    for start in range(0, len(frames) - 1, at_once):
+        span = slice(start, start + at_once + 1)
+        part = frames[span].to(device, non_blocking=True)
+        if homographies is not None:
+            part = warped_frames(part, homographies[span].to(device, non_blocking=True))
+        part = normalised_frames(part)
+        yield network.pooled(part[None, :-1], part[None, 1:])[0]
+
+
+def causal_outputs(recurrent: Recurrent, summaries: Tensor, n_pairs: int) -> Tensor:
+    """Outputs (pairs, 9), each from the last `n_pairs` of the summaries (pairs, inputs) up to it, from the zero state.
+
+    The first window also gives the outputs of the shorter windows before its end.
+    """
+    windows = summaries.unfold(0, min(n_pairs, len(summaries)), 1).transpose(1, 2).contiguous()
+    outputs, _ = recurrent.over_time(windows)
+    return torch.cat([outputs[0], outputs[1:, -1]])
+
+
+def pose_of(output: Tensor, scales: Scales) -> Pose:
+    """Poses of outputs (n, 9): positions (n, 3), metres, O_L, and rotation_camera_from_site (n, 3, 3)."""
+    output = output.float().cpu()
+    position_m = np.array(scales.mean_m) + np.array(scales.spread_m) * output[:, :3].double().numpy()
+    return position_m, decoded_rotation(output, scales).double().numpy() @ np.array(scales.mean_rotation)
+
+
+@torch.no_grad()
+def predict_pose(
+    network: Any, architecture: dict[str, Any], trajectory: Trajectory, features: Tensor | None = None
+) -> Pose:
+    """Poses at the later frames of a trajectory's pairs, with the network in evaluation mode.
+
+    `features` (pairs, inputs) are the backbone's, as `StackNavigator.features` gives them, if they are known.
+    """
+    if features is None:
+        frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)
+        features = network.scaled(torch.cat(list(pooled_features(network, frames))))
+    with network.recurrent.precision(features):
+        summaries = network.recurrent.summary(features)
+    output = causal_outputs(network.recurrent, summaries, architecture["sequence_pairs"])
+    return pose_of(output, Scales(**architecture["scales"]))
+
+
+@torch.no_grad()
+def predict_pose_by_pairs(network: Any, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Pose, float]:
+    """Poses of a trajectory, pair by pair as in flight, and mean seconds per pair.
+
+    In flight the last `sequence_pairs` summaries of pairs are kept. The time is from frames in memory to the pose,
+    without shrinking the frames.
+    """
+    frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)
+    scales, last = Scales(**architecture["scales"]), deque[Tensor](maxlen=architecture["sequence_pairs"])
+    poses = []
+    started = time.perf_counter()
+    for pair in range(trajectory.n_pairs):
+        (pooled,) = pooled_features(network, frames[pair : pair + 2])
+        last.append(network.recurrent.summary(network.scaled(pooled)))
+        output, _ = network.recurrent.over_time(torch.cat(list(last))[None])
+        poses.append(pose_of(output[0, -1:], scales))
+    seconds = (time.perf_counter() - started) / trajectory.n_pairs
+    return (np.concatenate([one[0] for one in poses]), np.concatenate([one[1] for one in poses])), seconds

@@ -1,0 +1,83 @@
+"""The evaluation of a run that learned the pose in O_L, beside its floors."""
+
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from perilune_shared.console.terminal import say_page
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import Array
+from perilune_train.motion.data.trajectories import Pose, Trajectory
+from perilune_train.motion.metrics.floors import Known, mean_poses, ridge_poses
+from perilune_train.motion.metrics.report import write_pose_evaluation
+from perilune_train.motion.network import build, load_navigator
+from perilune_train.motion.pose import predict_pose, predict_pose_by_pairs
+from perilune_train.motion.train.stored import stored_features
+from perilune_train.motion.train.task import NavigationTask
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.training.runs import RunFolder, choose_bf16, choose_device
+
+
+def check_one_area(dataset: Dataset) -> None:
+    """Raise UserError unless all trajectories of a dataset are over one scene."""
+    scenes = {str(row["scene_id"]) for row in dataset.table("trajectories").to_pylist()}
+    if len(scenes) != 1:
+        expected = "1, the landing area of navigate.stack.target=pose; render with dataset.nav.n_scenes=1"
+        raise UserError(dataset.store, "scenes", len(scenes), f"{expected} and split_by=trajectory")
+
+
+def evaluate_pose_run(
+    run: RunFolder,
+    task: NavigationTask,
+    trajectories: list[Trajectory],
+    backbone: dict[str, Tensor] | None,
+    details: Metrics,
+) -> None:
+    """Evaluate the best weights of a run on the test trajectories; write the tables and print the page."""
+    device = torch.device(choose_device(task.settings.device))
+    test = [one for one in trajectories if one.split == "test"]
+    network, architecture = load_navigator(run.best, "stack")
+    network.to(device)
+    started = time.monotonic()
+    poses: dict[str, list[Pose]] = {"stack": [predict_pose(network, architecture, one) for one in test]}
+    pairs, seconds = sum(one.n_pairs for one in test), time.monotonic() - started
+    poses |= mean_poses([one for one in trajectories if one.split == "train"], test)
+    if task.stores and backbone is not None:
+        poses["ridge"] = _ridge(task, backbone, [one.shrunk(task.own.size_px) for one in test], device)
+    _, seconds_by_pairs = predict_pose_by_pairs(network.cpu(), architecture, test[0])
+    own: Metrics = {
+        "test/pairs": pairs,
+        "test/ms_per_pair": round(1e3 * seconds / pairs, 2),
+        "test/ms_per_single_pair": round(1e3 * seconds_by_pairs, 2),
+        "network/parameters": sum(p.numel() for p in network.parameters()),
+    }
+    say_page(write_pose_evaluation(run.root, "stack", "test", test, poses, own | details))
+
+
+def _ridge(
+    task: NavigationTask, backbone: dict[str, Tensor], test: list[Trajectory], device: torch.device
+) -> list[Pose]:
+    """Poses by ridge regression on the features of the backbone as the detector gave it."""
+    frozen: Any = build(task.architecture)
+    frozen.backbone.load_state_dict(backbone, strict=False)
+    # The coarse stage stored its features at this scale.
+    for name in ("feature_mean", "feature_spread"):
+        getattr(frozen, name).copy_(getattr(task.network, name))
+    frozen.to(device, memory_format=torch.channels_last)
+    bf16 = choose_bf16(task.settings.precision, device.type)
+
+    def features(own: list[Trajectory]) -> list[Array]:
+        return [frozen.scaled(one).cpu().numpy() for one in stored_features(frozen, own, device, bf16)]
+
+    numbers = task.share.of(len(task.training_trajectories))
+    training = [task.training_trajectories[number] for number in numbers]
+    validation = [task.validation_trajectories[number] for number in task.validated]
+    known = {}
+    for split, own in (("train", training), ("val", validation)):
+        # Features of views come after those of the trajectories.
+        stored = [one[: sum(t.n_pairs for t in own)].cpu().numpy() for one in task.stored.get(split, [])]
+        known[split] = Known(own, stored or features(own))
+    return ridge_poses(known["train"], known["val"], features(test))

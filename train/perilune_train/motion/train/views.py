@@ -1,0 +1,58 @@
+"""Other views of training trajectories: poses near the descents, to which frames are warped over the ground plane."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
+from perilune_train.motion.data.trajectories import Trajectory
+from perilune_train.motion.geometry import ground_homography
+from perilune_train.motion.metrics.floors import mean_poses
+
+
+def other_views(trajectories: list[Trajectory], count: int, spread: float, seed: int) -> list[Trajectory]:
+    """`count` further versions of each training trajectory: all of the first version, then all of the second one.
+
+    A version has the poses of its view; its images are still those of the original. The pose of each frame is moved by
+    `spread` times the deviation of a random descent from the mean pose of that frame, with a random sign for each axis
+    of position and attitude. So the moves of a sequence are as large and change as smoothly as those of the descents.
+    """
+    deviations, versions = _deviations(trajectories) if count else [], []
+    for version in range(count):
+        for number, own in enumerate(trajectories):
+            rng = np.random.default_rng([seed, version, number])
+            moves = spread * rng.choice([-1.0, 1.0], 6) * deviations[rng.integers(len(deviations))]
+            # Beyond the end of the other descent its last deviation stays.
+            moves = moves[np.minimum(np.arange(len(own.position_m)), len(moves) - 1)]
+            turns = np.stack([matrix_from_rotation_vector(one) for one in moves[:, 3:]])
+            rotation = turns @ own.rotation_camera_from_site
+            versions.append(replace(own, position_m=own.position_m + moves[:, :3], rotation_camera_from_site=rotation))
+    return versions
+
+
+def _deviations(trajectories: list[Trajectory]) -> list[Array]:
+    """Each trajectory's deviation (n, 6) from the mean pose of each frame: metres in O_L, rotation vector in O_C."""
+    found = []
+    for own, (position_m, rotation) in zip(
+        trajectories, mean_poses(trajectories, trajectories)["mean_pose_at_frame"], strict=True
+    ):
+        turns = rotation_vectors(own.pose[1] @ np.swapaxes(rotation, 1, 2))
+        pairs = np.concatenate([own.pose[0] - position_m, turns], axis=1)
+        # Poses are those of the later frames of pairs. The first frame moves like the second one.
+        found.append(np.concatenate([pairs[:1], pairs]))
+    return found
+
+
+def view_homographies(trajectory: Trajectory, view: Trajectory) -> Tensor:
+    """Homographies (n, 3, 3), float32, from image coordinates of a view's frames to those of the trajectory's frames.
+
+    They are exact for points of the mean ground plane, z = 0 of O_L. A point h above it appears off by about
+    f h m / a^2 pixels, for a move by m metres, altitude a and focal length f.
+    """
+    own, other = (
+        ground_homography(trajectory.camera.matrix, one.position_m, one.rotation_camera_from_site)
+        for one in (trajectory, view)
+    )
+    return torch.from_numpy(own @ np.linalg.inv(other)).float()

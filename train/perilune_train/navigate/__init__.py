@@ -1,1 +1,0 @@
-"""Relative motion of a lander from pairs of consecutive frames."""

@@ -1,8 +1,0 @@
-"""The program `perilune-train`."""
-
-from perilune_shared.interrupts import start
-
-
-def main() -> None:
-    """Entry point: import the command line and run it."""
-    start("perilune_train.cli")

@@ -1,0 +1,135 @@
+"""Detections that a finished detect run wrote for its test split: sizes, and pictures as in the paper."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import open_single
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Address
+from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.evaluate.matching import Detections, find_overlaps
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.records.pictures import save_figure
+from perilune_train.records.spread import Interval, Resamples, draw_resamples, spreads
+
+LARGE_PX = (20.0, 50.0)
+"""Radii of large craters, pixels."""
+_BOX = ["x0_px", "y0_px", "x1_px", "y1_px"]
+
+
+@dataclass(frozen=True)
+class Detected:
+    """A run's detections on its test split."""
+
+    split: DetectSplit
+    """Test frames and labels."""
+    found: list[Detections]
+    """Detections at or above the run's threshold, one entry for each frame."""
+
+
+def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
+    """Read a run's detections. Raises UserError if they are missing, damaged or of other frames.
+
+    `trained` is the folder of the network's run, by default `run`; it has the settings and the threshold.
+    """
+    trained = trained or run
+    split = load_split(open_single(dataset), "test", config_of_run(trained).labels)
+    path = run / "detections.parquet"
+    if not path.is_file():
+        raise UserError(path, "detections", "no such file", "the detections of a finished run")
+    try:
+        table = pd.read_parquet(path, columns=["frame_id", *_BOX, "score"])
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+        raise UserError(path, "detections", error, f"columns frame_id, {', '.join(_BOX)}, score") from None
+    for name in (*_BOX, "score"):
+        if not pd.api.types.is_numeric_dtype(table[name]):
+            raise UserError(path, name, table[name].dtype, "finite numbers")
+        unusable = table[name][~np.isfinite(table[name])]
+        if len(unusable):
+            raise UserError(path, name, unusable.iloc[0], "finite numbers")
+    table = table[table["score"] >= chosen_threshold(trained)]
+    of_frame = {str(name): own for name, own in table.groupby("frame_id")}
+    names = split.frames.table["frame_id"].tolist()
+    unknown = set(of_frame) - set(names)
+    if unknown:
+        raise UserError(path, "frame_id", min(unknown), f"a test frame of {dataset}")
+    parts = [of_frame.get(name, table.iloc[:0]) for name in names]
+    return Detected(
+        split, [Detections(part[_BOX].to_numpy(np.float64), part["score"].to_numpy(np.float64)) for part in parts]
+    )
+
+
+@dataclass(frozen=True)
+class WidthRatio:
+    """Width of detected large craters, divided by that of their labels."""
+
+    median: float
+    """Median over the craters."""
+    interval: Interval | None
+    """95 % interval over trajectories, or over scenes; None with fewer than five of them."""
+
+
+def width_ratio(detected: Detected) -> WidthRatio | None:
+    """Width of the large craters that were found, relative to the truth; None if none was found."""
+    split = detected.split
+    height, width = split.frames.images.shape[1:]
+    sizes = np.tile((width, height), (len(split), 1))
+    overlaps = find_overlaps(detected.found, list(split.labels), sizes)
+    matches = overlaps.match(0.5, split.radius_px)
+    hit = matches.label >= 0
+    radius_px = overlaps.label_radius_px[matches.label[hit]]
+    ours, truth = overlaps.boxes[hit], overlaps.label_boxes[matches.label[hit]]
+    large = (radius_px >= LARGE_PX[0]) & (radius_px <= LARGE_PX[1])
+    ratios = ((ours[:, 2] - ours[:, 0]) / (truth[:, 2] - truth[:, 0]))[large]
+    if not len(ratios):
+        return None
+    order, frames = np.argsort(ratios), matches.frame[hit][large]
+
+    def medians(resamples: Resamples) -> dict[str, NDArray[np.float64]]:
+        weights = np.cumsum(resamples.weights[:, resamples.of_row[frames[order]]], axis=1)
+        # A resample without large craters has no median.
+        middle = (weights < weights[:, -1:] / 2).sum(axis=1)
+        return {"ratio": np.where(weights[:, -1] > 0, ratios[order][np.minimum(middle, len(ratios) - 1)], np.nan)}
+
+    table = split.frames.table
+    scenes, trajectories, ids = (list(map(str, table[name])) for name in ("scene_id", "trajectory_id", "frame_id"))
+    resamples = draw_resamples(scenes, trajectories, ids, np.random.default_rng(0))
+    return WidthRatio(float(np.median(ratios)), spreads(medians, frames, resamples)["ratio"].interval)
+
+
+def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
+    """Draw the frames with the smallest and with the largest labels: truth red, detections cyan, as in the paper.
+
+    Both frames have at least a quarter of the most labels that a frame has.
+    """
+    split = next(iter(by_network.values())).split
+    counts = np.array([int(labels.selected.sum()) for labels in split.labels])
+    radii = np.array(
+        [labels.radius_px[labels.selected].mean() if any(labels.selected) else 0 for labels in split.labels]
+    )
+    candidates = np.flatnonzero(counts >= max(1, counts.max() // 4))
+    chosen = {
+        "small craters": int(candidates[np.argmin(radii[candidates])]),
+        "large craters": int(candidates[np.argmax(radii[candidates])]),
+    }
+    figure = Figure(figsize=(6 * len(chosen), 6.3 * len(by_network)), layout="constrained")
+    axes = np.atleast_2d(figure.subplots(len(by_network), len(chosen), squeeze=False))
+    for row, (network, detected) in zip(axes, by_network.items(), strict=True):
+        for one, (what, index) in zip(row, chosen.items(), strict=True):
+            image = split.frames.images[index]
+            one.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, image.shape[1], image.shape[0], 0))
+            labels = split.labels[index]
+            for boxes, colour in ((labels.boxes[labels.selected], "red"), (detected.found[index].boxes, "cyan")):
+                for x0, y0, x1, y1 in boxes:
+                    one.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.8, color=colour))
+            one.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+            one.set_title(f"{network}, {what}: {split.frames.table['frame_id'][index]}", fontsize=9)
+            one.axis("off")
+    save_figure(path, figure)

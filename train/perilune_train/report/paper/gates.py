@@ -1,0 +1,117 @@
+"""The attention gates of the explain run: PCC1 to PCC4 with their nulls, and the paper's claims on them."""
+
+from collections.abc import Callable, Sequence
+
+from perilune_train.records.markdown import table
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.spread import MIN_UNITS
+from perilune_train.report.paper.claimed import (
+    DEEP_ALIKE,
+    DEEP_ALIKE_GATES,
+    MODERATE,
+    MOTION_GATES,
+    SHALLOW_CRATER_GATES,
+    STILL_GATES,
+)
+from perilune_train.report.paper.rule import Answer, Verdict
+
+_PIXELS = {
+    "_all_pixels": "all pixels, 0 where the other half is not seen",
+    "": "pixels that both halves see",
+}
+"""PCC3 and PCC4 by the pixels that they are computed over."""
+_CORRELATIONS = {
+    "pcc1_craterness": "PCC1: mask and craters",
+    "pcc2": "PCC2: masks of two frames",
+    "pcc3": "PCC3: halves",
+    "pcc4": "PCC4: halves, one moved by the true motion",
+    "pcc4_minus_pcc3": "PCC4 - PCC3",
+}
+
+
+def gate_verdicts(explained: Metrics) -> list[Verdict]:
+    """Claims on gates: each holds if it is true of all of its gates, does not hold if of none, and is open otherwise.
+
+    A gate's figure has no interval, so over fewer than `MIN_UNITS` scenes every claim is open.
+    """
+    shallow = f"PCC1 of {' and '.join(SHALLOW_CRATER_GATES)} is moderate (here: at least {MODERATE} in size)"
+    deep = f"PCC2 of {', '.join(DEEP_ALIKE_GATES)} is above {DEEP_ALIKE}"
+    moved = f"PCC4 is above PCC3 for {', '.join(MOTION_GATES)}"
+    still = "PCC3 is above PCC4 from B_37 on"
+    craters, alike = _of(explained, "pcc1_background", SHALLOW_CRATER_GATES), _of(explained, "pcc2", DEEP_ALIKE_GATES)
+    found = [
+        _judged(explained, (shallow, "figure only"), craters, lambda value: abs(value) >= MODERATE, "pcc1_background"),
+        _judged(explained, (deep, f"> {DEEP_ALIKE}"), alike, lambda value: value > DEEP_ALIKE, "pcc2"),
+    ]
+    for claim, figure, ok, gates in (
+        (moved, "> 0", _is_positive, MOTION_GATES),
+        (still, "< 0", _is_negative, STILL_GATES),
+    ):
+        for pixels, words in _PIXELS.items():
+            one, other = (_of(explained, f"{measure}{pixels}", gates) for measure in ("pcc4", "pcc3"))
+            difference = {gate: one[gate] - other[gate] for gate in one if gate in other}
+            text = f"{claim} (PCC4 - PCC3, {words})", figure
+            null = "" if pixels else "pcc4_minus_pcc3"
+            found.append(_judged(explained, text, difference, ok, null))
+    return found
+
+
+def _is_positive(value: float) -> bool:
+    return value > 0
+
+
+def _is_negative(value: float) -> bool:
+    return value < 0
+
+
+def _of(explained: Metrics, measure: str, gates: Sequence[str]) -> dict[str, float]:
+    found = {gate: explained.get(f"{measure}/{gate}") for gate in gates}
+    return {gate: float(value) for gate, value in found.items() if isinstance(value, int | float)}
+
+
+def _judged(
+    explained: Metrics, claim: tuple[str, str], values: dict[str, float], ok: Callable[[float], bool], null: str
+) -> Verdict:
+    """Verdict on a claim (text, the paper's figure) from the value of each gate; `null` names its nulls, if any."""
+    if not values:
+        return Verdict(*claim, "-", "-", "not measured")
+    scenes = explained.get("pair_scenes" if "PCC4" in claim[0] else "scenes")
+    fit = sum(map(ok, values.values()))
+    few = not isinstance(scenes, int) or scenes < MIN_UNITS
+    answer: Answer = "open"
+    if not few and fit in (0, len(values)):
+        answer = "holds" if fit else "does not hold"
+    listed = ", ".join(f"{gate} {value:.2f}" for gate, value in values.items())
+    nulls = f"; nulls: {_nulls(explained, null, values)}" if null and _nulls(explained, null, values) else ""
+    counted = f"{scenes if isinstance(scenes, int) else 'unknown number of'} scene{'s' * (scenes != 1)}"
+    return Verdict(*claim, f"{fit} of {len(values)}: {listed}{nulls}; {counted}", "one training", answer)
+
+
+def gate_table(explained: Metrics) -> list[str]:
+    """Ranges of PCC1 to PCC4 over all gates, with those of each null, as lines of Markdown."""
+    rows = []
+    for measure, title in _CORRELATIONS.items():
+        names = [key.removeprefix(f"{measure}/") for key in explained if key.startswith(f"{measure}/B_")]
+        own = _of(explained, measure, [name for name in names if not name.endswith(("_low", "_high"))])
+        if not own:
+            continue
+        # A gate without nulls has no such key.
+        beats = [bool(one) for gate in own if (one := explained.get(f"{measure}_beats_nulls/{gate}")) is not None]
+        beating = f"{sum(beats)} of {len(beats)}" if beats else "-"
+        rows.append([title, _range(list(own.values())), _nulls(explained, measure, own) or "-", beating])
+    return table(["correlation", "gates", "nulls", "gates that beat every null"], rows)
+
+
+def _nulls(explained: Metrics, measure: str, gates: dict[str, float]) -> str:
+    """Range of each null over the gates; empty without nulls."""
+    found: dict[str, list[float]] = {}
+    for gate in gates:
+        prefix = f"{measure}_null/{gate}/"
+        for key, value in explained.items():
+            if key.startswith(prefix) and isinstance(value, float):
+                found.setdefault(key.removeprefix(prefix), []).append(value)
+    return ", ".join(f"{null} {_range(values)}" for null, values in found.items())
+
+
+def _range(values: Sequence[float]) -> str:
+    return f"{min(values):.2f} to {max(values):.2f}"

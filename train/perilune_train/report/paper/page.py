@@ -1,0 +1,247 @@
+"""The page of the paper's experiment, from the runs that are finished: verdicts, tables, figures, deviations."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Address
+from perilune_train.detect.finished_run import config_of_run
+from perilune_train.records.markdown import table, write_markdown
+from perilune_train.records.metrics_file import Metrics, write_metrics
+from perilune_train.report.paper.curves import (
+    AP_KEY,
+    POSITION_KEY,
+    draw_curve,
+    draw_learning,
+    draw_trajectory_errors,
+)
+from perilune_train.report.paper.detections import Detected, draw_detections, read_detections, width_ratio
+from perilune_train.report.paper.gates import gate_table
+from perilune_train.report.paper.prose import CAUSES, DEVIATIONS, lead, verdict_note
+from perilune_train.report.paper.rule import Verdict
+from perilune_train.report.paper.runs import (
+    ATTENTION,
+    HEADLINE,
+    NAMES,
+    NAVIGATORS,
+    READINGS,
+    SPARSE,
+    TRANSFER,
+    USUAL,
+    PaperRuns,
+    detect_name,
+    navigate_name,
+    nearest_share,
+)
+from perilune_train.report.paper.tables import curve_table, read_causes, table_2, table_3
+from perilune_train.report.paper.verdicts import verdicts
+
+PAGE, FIGURES = "paper.md", "paper.json"
+NOT_RUN = "Not run."
+_EXPLAINED = ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png")
+_READINGS = {
+    "pose": "Pose in O_L: position and attitude in the landing frame, the reading of the paper",
+    "attitude": "Pose in O_L over descents with attitude noise, on the backbones of the descents without",
+    "motion": "Motion from frame to frame",
+}
+
+
+def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline_share: str | None = None) -> Path:
+    """Write paper.md, paper.json and pictures into the folder of the experiment's runs; returns the page.
+
+    `dataset` is the detection dataset of the headline ground. `about` are lines that say how the experiment was made
+    and what was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the
+    curve with the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is
+    finished.
+    """
+    runs = PaperRuns(root)
+    if not root.is_dir():
+        raise UserError(root, "runs", "no such folder", "the folder of the experiment: make paper")
+    read = runs.all_finished()
+    if not read:
+        raise UserError(root, "runs", "no finished run", "at least one: make paper")
+    share = headline_share or nearest_share(runs.curve())
+    detected = _detected(runs, dataset)
+    attended = detected.get("attention-yolov3")
+    found = verdicts(runs, None if attended is None else width_ratio(attended))
+    sections = {
+        "Claims": _claims(found),
+        "Table II: crater detection": _table_2(runs),
+        "Density of craters": _curve(runs, share),
+        "Detections": _detections(root, detected),
+        "Table III: navigation": _table_3(runs),
+        "Three causes": _causes(runs),
+        "Learning curves": _learning(runs),
+        "Attention": _attention(runs),
+        "Deviations that remain": [f"- {line}" for line in DEVIATIONS],
+    }
+    lines = ["# The paper's experiment", "", lead(runs, share, given=headline_share is not None)]
+    if settings := [f"- {line}" for line in (*about, *_settings(runs))]:
+        lines += ["", *settings]
+    for title, own in sections.items():
+        lines += ["", f"## {title}", "", *own]
+    write_markdown(root / PAGE, "\n".join([*lines, ""]))
+    write_metrics(root, _figures(read, found), FIGURES)
+    return root / PAGE
+
+
+def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
+    """Detections of the finished trainings on the headline ground, by network."""
+    folders = {network: runs.detector(detect_name(network)) for network, own in runs.detections().items() if own}
+    return {
+        network: read_detections(folder, dataset)
+        for network, folder in folders.items()
+        if (folder / "detections.parquet").is_file()
+    }
+
+
+def _settings(runs: PaperRuns) -> list[str]:
+    """Settings of the detectors on the headline ground, from the first finished one."""
+    folders = [runs.detector(detect_name(network)) for network, own in runs.detections().items() if own]
+    known = [folder for folder in folders if (folder / "config.yaml").is_file()]
+    if not known:
+        return []
+    config = config_of_run(known[0])
+    loss = config.loss
+    return [
+        f"detectors: width {config.width:g}, {config.in_channels} channels, strides "
+        f"{' '.join(map(str, config.strides))}, labels `{config.labels.selection}`, loss of {loss.reduction}, CIoU "
+        f"({loss.aspect} prior) x {loss.lambda_iou:g}, objectness ({loss.objectness}) x {loss.lambda_obj:g}, "
+        f"{config.assignment} predictor{'s' * (config.assignment != 'one')} per label, {config.epochs} epochs, batch "
+        f"{config.batch_size}"
+    ]
+
+
+def _claims(found: list[Verdict]) -> list[str]:
+    answers = [one.answer for one in found]
+    counted = ", ".join(f"{answer}: {answers.count(answer)}" for answer in dict.fromkeys(answers))
+    rows = [[one.claim, one.claimed, one.measured, one.trainings, f"**{one.answer}**"] for one in found]
+    head = ["claim", "the paper", "measured here, with against without attention", "trainings", "verdict"]
+    return [f"{len(found)} claims of the paper: {counted}.", "", *table(head, rows), "", verdict_note()]
+
+
+def _table_2(runs: PaperRuns) -> list[str]:
+    if not any(own for own in (*runs.detections().values(), *runs.halves().values())) and not _elsewhere(runs):
+        return [NOT_RUN]
+    note = (
+        "*In brackets: 95 % intervals over trajectories for one training, the range of the trainings for several. Test "
+        "frames are frames of the training trajectories' terrain, as in the paper; the locked benchmark has other "
+        f"terrain.{_starts(runs)}*"
+    )
+    return [note, "", *table_2(runs)]
+
+
+def _elsewhere(runs: PaperRuns) -> bool:
+    """Whether any detector on another ground than the headline, or on the benchmark, is finished."""
+    found = [own for ground in (SPARSE, USUAL, TRANSFER) for own in runs.detections(ground).values()]
+    return any(found) or any(runs.scored(network) for network in ATTENTION)
+
+
+def _starts(runs: PaperRuns) -> str:
+    """A sentence on the weights that the headline rows, and rows after transfer, start from; empty if unknown."""
+    found = []
+    for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "rows after transfer")):
+        starts = {
+            str(one["train/start"]) for own in runs.detections(ground).values() for one in own if "train/start" in one
+        }
+        found += [f"{title} from {' or '.join(map(_start, sorted(starts)))}"] if starts else []
+    return f" Weights: {', '.join(found)}." if found else ""
+
+
+def _start(start: str) -> str:
+    """Initial weights in words, from train/start of metrics.json."""
+    path = Path(start)
+    if path.suffix == ".ckpt":
+        return f"our own network `{path.parent.parent.name}`, in place of YOLOv3 trained on COCO"
+    return start if start == "random weights" else f"`{path.name}`"
+
+
+def _curve(runs: PaperRuns, share: str | None) -> list[str]:
+    curve = runs.curve(share)
+    if not curve:
+        return [NOT_RUN]
+    draw_curve(runs.root / "curve.png", curve, share)
+    picture = "![AP of YOLOv3 against the density of craters](curve.png)"
+    return [picture, "", *curve_table(curve, share)]
+
+
+def _detections(root: Path, detected: dict[str, Detected]) -> list[str]:
+    if not detected:
+        return [NOT_RUN]
+    draw_detections(root / "detections.png", {NAMES[network]: own for network, own in detected.items()})
+    return ["![Detections on the headline ground](detections.png)", "", "*Truth red, detections cyan.*"]
+
+
+def _table_3(runs: PaperRuns) -> list[str]:
+    lines = []
+    for reading, title in _READINGS.items():
+        lines += [f"**{title}**", "", *(table_3(runs, reading) if runs.navigation(reading) else [NOT_RUN]), ""]
+    files = {
+        reading: {
+            name: runs.navigator(navigate_name(own, reading)) / "errors.parquet" for name, own in NAVIGATORS.items()
+        }
+        for reading in READINGS
+    }
+    if draw_trajectory_errors(runs.root / "trajectory.png", files):
+        lines += ["![Errors along a test trajectory](trajectory.png)", ""]
+    if any(runs.scored(name) for name in NAVIGATORS.values()):
+        lines += [
+            "*The locked benchmark has 40 frames a descent. Where the experiment has more, steps of the benchmark are "
+            "longer than in training, so the error there is not that of new ground alone.*",
+            "",
+        ]
+    return lines[:-1]
+
+
+def _causes(runs: PaperRuns) -> list[str]:
+    found = read_causes(runs)
+    lines = []
+    for cause in dict.fromkeys([*CAUSES, *found]):
+        measured = found.get(cause, ["Ablation: not run."])
+        lines += [CAUSES.get(cause, f"**{cause}**"), "", *measured, ""]
+    return lines[:-1]
+
+
+def _learning(runs: PaperRuns) -> list[str]:
+    navigators = {
+        reading: {name: runs.navigator(navigate_name(own, reading)) for name, own in NAVIGATORS.items()}
+        for reading in READINGS
+    }
+    panels = {
+        "detectors, headline ground": (
+            AP_KEY,
+            {NAMES[network]: runs.detector(detect_name(network)) for network in ATTENTION},
+        ),
+        **{f"navigators, {reading}": (POSITION_KEY, own) for reading, own in navigators.items()},
+    }
+    drawn = draw_learning(runs.root / "learning.png", panels)
+    return ["![Learning curves](learning.png)"] if drawn else [NOT_RUN]
+
+
+def _attention(runs: PaperRuns) -> list[str]:
+    explained = runs.explanation()
+    if explained is None:
+        return [NOT_RUN]
+    lines = [
+        "Correlations do not depend on the range of a mask. Read them beside the masks: some may be nearly constant. A "
+        "gate beats a null if its mean is above that of the null by a test over scenes; one scene decides nothing.",
+        "",
+        *gate_table(explained),
+    ]
+    for name in _EXPLAINED:
+        if (runs.explained / name).is_file():
+            shutil.copyfile(runs.explained / name, runs.root / name)
+            lines += ["", f"![{name[:-4].replace('_', ' ')}]({name})"]
+    return lines
+
+
+def _figures(read: dict[str, Metrics], found: list[Verdict]) -> Metrics:
+    """Flat keys: <folder of a run>/<metric>, verdict/<number>/<part>."""
+    figures: Metrics = {}
+    for folder, metrics in read.items():
+        figures |= {f"{folder}/{key}": value for key, value in metrics.items() if not key.startswith("run/")}
+    parts = ("claim", "measured", "trainings", "answer")
+    for place, one in enumerate(found, 1):
+        figures |= {f"verdict/{place}/{part}": getattr(one, part) for part in parts}
+    return figures

@@ -1,0 +1,181 @@
+"""The runs of the paper's experiment: names of their folders, and which of them are finished.
+
+Below the root of the runs:
+
+    detect/curve-<share>            YOLOv3 without attention on grounds of rising density; <share> is the
+                                    equilibrium_share as text, or `lunar` for our usual ground
+    detect/<network>                headline ground, full width; networks are the keys of `ATTENTION`
+    detect/<network>-half-<seed>    the same at half width, seeds `SEEDS`
+    detect/sparse-<network>         sparse ground, full width
+    detect/lunar-<network>          our usual ground by the paper's rule of labels
+    detect/long-<network>           headline ground, full width, more epochs
+    detect/transfer-<network>       headline ground, started from our own network, with frozen epochs
+    navigate/<navigator>-stack, navigate/<navigator>-attitude-stack, navigate/<navigator>-motion-stack
+                                    pose in O_L (the paper's reading), the same with attitude noise, and motion
+                                    between frames
+    explain/attention
+    benchmark/<network>, benchmark/<navigator>
+                                    the locked benchmark; of navigators, that for motion: the landing frame of other
+                                    ground is unknown
+    paper-causes.json               ablations (`read_causes` in tables.py)
+
+Any of them may be missing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
+from perilune_train.report.paper.claimed import TARGET_AP
+
+DETECTORS = {"YOLOv3": "yolov3", "attention-YOLOv3": "attention-yolov3"}
+"""Folders of the paper's detectors, by the paper's names."""
+ATTENTION = {"yolov3": "none", "attention-yolov3": "cbam", "attention-identity": "cbam_identity"}
+"""Value of detect.attention of each detector, by its folder."""
+NAMES = {
+    "yolov3": "YOLOv3",
+    "attention-yolov3": "attention-YOLOv3, plain CBAM",
+    "attention-identity": "attention-YOLOv3, gates from identity",
+}
+"""Names of the detectors on the page."""
+SEEDS = (0, 1, 2)
+"""Random seeds of the trainings at half width."""
+HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
+"""Grounds, and the headline ground after transfer and with more epochs: the first part of a run's name."""
+SPARSE_SHARE = "0.1"
+"""equilibrium_share of the sparse ground."""
+CURVE = "curve"
+"""First part of the names of the runs on grounds of rising density."""
+NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
+"""First part of the names of the navigate runs, by the paper's names; their folders end in -stack."""
+READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
+"""End of the names of the navigate runs: pose in O_L, with attitude noise, motion between frames."""
+EXPLAINED = "attention"
+"""Name of the explain run."""
+CAUSES = "paper-causes.json"
+"""Ablations of the three causes."""
+BENCHMARK_FILE = "benchmark.json"
+
+
+def detect_name(network: str, ground: str = HEADLINE, seed: int | None = None) -> str:
+    """Name of the training of a detector, a key of `ATTENTION`; with a seed, of the one at half width."""
+    half = [] if seed is None else ["half", str(seed)]
+    return "-".join([*([ground] if ground else []), network, *half])
+
+
+def curve_name(share: str) -> str:
+    """Name of the training on the ground of this equilibrium_share, or on our usual one (`lunar`)."""
+    return f"{CURVE}-{share}"
+
+
+def navigate_name(navigator: str, reading: str = "pose") -> str:
+    """Name of the training of a navigator, a value of `NAVIGATORS`, in one of the `READINGS`."""
+    return navigator + READINGS[reading]
+
+
+def nearest_share(curve: Mapping[str, Metrics], account: str = "") -> str | None:
+    """Share of the curve, except `lunar`, at which the AP on validation is nearest to the AP of the paper's YOLOv3.
+
+    `account` is "" (usual) or "strict/". None if the curve has no AP.
+    """
+    found = {share: metrics.get(f"val/{account}ap50_paper") for share, metrics in curve.items() if share != USUAL}
+    known = {share: abs(ap - TARGET_AP) for share, ap in found.items() if isinstance(ap, int | float)}
+    return min(known, key=lambda share: known[share], default=None)
+
+
+@dataclass(frozen=True)
+class PaperRuns:
+    """Folders and metrics of the experiment's runs. Methods raise UserError on damaged metrics only."""
+
+    root: Path
+    """The folder that holds all of them, such as runs/paper."""
+
+    def detector(self, name: str) -> Path:
+        """Folder of a detect run, from its name."""
+        return self.root / "detect" / name
+
+    def navigator(self, name: str) -> Path:
+        """Folder of a navigate run, from its name."""
+        return self.root / "navigate" / f"{name}-stack"
+
+    @property
+    def explained(self) -> Path:
+        """Folder of the explain run."""
+        return self.root / "explain" / EXPLAINED
+
+    def benchmark(self, name: str) -> Path:
+        """Folder of the score on the locked benchmark of a detector or navigator, by its folder's name."""
+        return self.root / "benchmark" / name
+
+    def detections(self, ground: str = HEADLINE) -> dict[str, list[Metrics]]:
+        """Metrics of the finished trainings at full width on a ground, at most one for each network."""
+        return {network: self._detect(detect_name(network, ground)) for network in ATTENTION}
+
+    def halves(self) -> dict[str, list[Metrics]]:
+        """Metrics of the finished trainings at half width on the headline ground, for each network."""
+        names = {network: [detect_name(network, seed=seed) for seed in SEEDS] for network in ATTENTION}
+        return {network: self._detect(*own) for network, own in names.items()}
+
+    def curve(self, headline: str | None = None) -> dict[str, Metrics]:
+        """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
+
+        Runs on the sparse, the headline and our usual ground are points too if their networks are as large, and train
+        for as many epochs, as in the runs of the curve. `headline` is the share of the headline ground.
+        """
+        found = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
+        read = {share: finished(self.detector(name)) for share, name in found.items()}
+        plain = next(iter(ATTENTION))
+        sizes = {_size(metrics) for metrics in read.values() if metrics is not None}
+        others = [(SPARSE_SHARE, detect_name(plain, SPARSE)), (USUAL, detect_name(plain, USUAL))]
+        others += [(headline, detect_name(plain, seed=seed)) for seed in (None, SEEDS[0]) if headline is not None]
+        for share, name in others:
+            metrics = finished(self.detector(name))
+            if metrics is not None and read.get(share) is None and _size(metrics) in sizes:
+                read[share] = metrics
+        shares = sorted((share for share in read if _is_number(share)), key=float)
+        ordered = {share: read[share] for share in [*shares, *({USUAL} & set(read))]}
+        return {share: metrics for share, metrics in ordered.items() if metrics is not None}
+
+    def navigation(self, reading: str) -> dict[str, Metrics]:
+        """Metrics of the finished navigators of a reading, by the paper's names."""
+        folders = {name: self.navigator(navigate_name(own, reading)) for name, own in NAVIGATORS.items()}
+        read = {name: finished(folder) for name, folder in folders.items()}
+        return {name: metrics for name, metrics in read.items() if metrics is not None}
+
+    def explanation(self) -> Metrics | None:
+        """Metrics of the explain run."""
+        return finished(self.explained)
+
+    def scored(self, name: str) -> Metrics | None:
+        """Figures of a detector or navigator on the locked benchmark."""
+        return finished(self.benchmark(name), BENCHMARK_FILE)
+
+    def all_finished(self) -> dict[str, Metrics]:
+        """Metrics of every finished run by its folder below the root, such as detect/yolov3."""
+        files = sorted(path for kind in ("detect", "navigate") for path in self.root.glob(f"{kind}/*/{METRICS_FILE}"))
+        files += [self.explained / METRICS_FILE, *sorted(self.root.glob(f"benchmark/*/{BENCHMARK_FILE}"))]
+        read = {path.parent.relative_to(self.root).as_posix(): finished(path.parent, path.name) for path in files}
+        return {name: metrics for name, metrics in read.items() if metrics is not None}
+
+    def _detect(self, *names: str) -> list[Metrics]:
+        read = [finished(self.detector(name)) for name in names]
+        return [metrics for metrics in read if metrics is not None]
+
+
+def finished(folder: Path, file: str = METRICS_FILE) -> Metrics | None:
+    """Metrics of a run; None if it is missing or not finished."""
+    return read_metrics(folder, file) if (folder / file).is_file() else None
+
+
+def _size(metrics: Metrics) -> tuple[object, object]:
+    """Size of a detector and of its training."""
+    return metrics.get("parameters"), metrics.get("train/epochs")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

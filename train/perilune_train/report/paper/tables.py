@@ -1,0 +1,214 @@
+"""Tables of the page: Table II, the curve, Table III, ablations of the causes."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+
+from perilune_shared.errors import UserError
+from perilune_train.records.markdown import number, table
+from perilune_train.records.metrics_file import Metrics
+from perilune_train.records.spread import read_spread
+from perilune_train.report.paper.claimed import DETECTION, NAVIGATION
+from perilune_train.report.paper.runs import (
+    CAUSES,
+    HEADLINE,
+    LONG,
+    NAMES,
+    NAVIGATORS,
+    SPARSE,
+    SPARSE_SHARE,
+    TRANSFER,
+    USUAL,
+    PaperRuns,
+)
+
+_DETECTION = {
+    "ap50_paper": "AP",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+    "ap75_paper": "AP at IoU 0.75",
+    "strict/ap50_paper": "AP, strict",
+    "strict/precision": "precision, strict",
+}
+_GROUNDS = {
+    HEADLINE: "headline",
+    LONG: "headline with more epochs",
+    SPARSE: f"sparse ({SPARSE_SHARE})",
+    USUAL: "our usual",
+    TRANSFER: "headline after transfer",
+}
+_HALF = "headline at half width"
+_PLAIN_ONLY = (_GROUNDS[LONG], _GROUNDS[TRANSFER])
+"""Where gates from identity are not planned."""
+_IDENTITY_ONLY = (_GROUNDS[USUAL],)
+"""Where plain CBAM is not planned."""
+_POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
+_ORIENTATION = "orientation_rmse_per_component_deg"
+_NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
+"""Columns of Table III, with decimals."""
+FLOORS = {
+    "mean_pose": "mean pose of the training",
+    "mean_pose_at_frame": "mean pose of the training at that frame",
+    "ridge": "ridge regression on the frozen features",
+    "mean": "mean motion of the training",
+    "mean_at_step": "mean motion of the training at that step",
+    "nominal": "nominal motion",
+}
+"""What a navigator must beat: methods without images, and linear regression on the features that it starts from."""
+_METHODS = {"klt": "KLT tracks, without training", "alignment": "direct alignment, without training"}
+
+
+def table_2(runs: PaperRuns) -> list[str]:
+    """Table II as lines of Markdown, and one line that names what was not run."""
+    rows, missing = [], []
+    for network, figures in DETECTION.items():
+        cells = [f"{figures[key]:.4f}" if key in figures else "-" for key in _DETECTION]
+        rows.append(["the paper", network, "-", "-", *cells, "-"])
+    groups = {_GROUNDS[HEADLINE]: runs.detections(), _HALF: runs.halves()}
+    groups |= {title: runs.detections(ground) for ground, title in _GROUNDS.items() if ground != HEADLINE}
+    scored = {network: runs.scored(network) for network in NAMES}
+    for title, trainings in groups.items():
+        planned = [
+            network
+            for network in NAMES
+            if not (network == "attention-identity" and title in _PLAIN_ONLY)
+            and not (network == "attention-yolov3" and title in _IDENTITY_ONLY)
+        ]
+        absent = [NAMES[network] for network in planned if not trainings[network]]
+        missing += [title if len(absent) == len(planned) else f"{title} ({'; '.join(absent)})"] if absent else []
+        for network, own in trainings.items():
+            if own:
+                cells = [values(own, f"test/{key}") for key in _DETECTION]
+                rows.append([title, NAMES[network], str(len(own)), epochs(own), *cells, labels_a_frame(own[0])])
+    for network, metrics in scored.items():
+        if metrics is not None:
+            cells = [values([metrics], f"paper/{key}") for key in _DETECTION]
+            rows.append(["locked benchmark", NAMES[network], "1", "-", *cells, labels_a_frame(metrics, "paper")])
+    lines = table(["ground", "network", "trainings", "epochs", *_DETECTION.values(), "labels a frame"], rows)
+    return [*lines, "", f"Not run: {', '.join(missing)}."] if missing else lines
+
+
+def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]:
+    """The curve of AP against equilibrium_share as lines of Markdown, the headline ground marked."""
+    rows = []
+    for share, metrics in curve.items():
+        name = "lunar (our usual ground)" if share == USUAL else share
+        keys = ("val/ap50_paper", "test/ap50_paper", "test/strict/ap50_paper", "test/precision", "test/recall")
+        cells = [values([metrics], key) for key in keys]
+        rows.append([f"**{name}, headline**" if share == headline else name, labels_a_frame(metrics), *cells])
+    head = ["equilibrium_share", "labels a frame", "AP, validation", "AP, test", "AP, test, strict"]
+    return table([*head, "precision", "recall"], rows)
+
+
+def table_3(runs: PaperRuns, reading: str) -> list[str]:
+    """Table III in one reading as lines of Markdown, with the RMSE of the vector's length beside the components'."""
+    rows = []
+    found = runs.navigation(reading)
+    for network, claimed in NAVIGATION.items():
+        given = [f"{claimed['position_m']:g}", "-", f"{claimed['orientation_deg']:g}", f"{claimed['seconds']:g}"]
+        rows.append([network, "the paper", *given])
+        if network in found:
+            metrics = found[network]
+            floor = lost_to(metrics)
+            here = f"here; **does not beat the {FLOORS[floor]}**" if floor else "here"
+            rows.append([network, here, *_errors(metrics, "test"), seconds(metrics)])
+        scored = runs.scored(NAVIGATORS[network]) if reading == "motion" else None
+        if scored is not None:
+            rows.append([network, "here, locked benchmark", *_errors(scored, "stack"), seconds(scored)])
+    others: dict[str, list[str]] = {}
+    for network, metrics in found.items():
+        for method, name in (FLOORS | _METHODS).items():
+            # The features come from the network's own backbone.
+            title = f"{name} of {network}" if method == "ridge" else name
+            if f"baseline/{method}/{_POSITION}" in metrics:
+                others.setdefault(title, [title, "here", *_errors(metrics, f"baseline/{method}"), "-"])
+    head = ["network or method", "measured by", "position RMSE, per component (m)", "vector (m)"]
+    return table([*head, "orientation RMSE, per component (deg)", "seconds per pair, CPU"], [*rows, *others.values()])
+
+
+def floor(metrics: Metrics) -> str | None:
+    """The best of the `FLOORS` of a navigate run by the RMSE of position; None if it has none."""
+    found = {name: metrics.get(f"baseline/{name}/{_POSITION}") for name in FLOORS}
+    known = {name: value for name, value in found.items() if isinstance(value, int | float)}
+    return min(known, key=lambda name: known[name], default=None)
+
+
+def lost_to(metrics: Metrics) -> str | None:
+    """The best floor, if the network of a navigate run is not better; otherwise None."""
+    best, own = floor(metrics), metrics.get(f"test/{_POSITION}")
+    if best is None or not isinstance(own, int | float):
+        return None
+    value = metrics[f"baseline/{best}/{_POSITION}"]
+    return best if isinstance(value, int | float) and own >= value else None
+
+
+def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
+    """Tables of the ablations by cause, as lines of Markdown; empty if there are none.
+
+    Keys of paper-causes.json are <cause>/<row>/<column>, with cause loss, gates or ground; values are numbers or texts.
+    Other keys are not shown.
+    """
+    path = runs.root / CAUSES
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(path, "content", str(error), "the file that make bench-paper-causes writes") from None
+    if not isinstance(content, dict):
+        raise UserError(path, "content", type(content).__name__, "the file that make bench-paper-causes writes")
+    # The record of the run is an object.
+    figures = {key: value for key, value in content.items() if isinstance(value, str | int | float)}
+    causes: dict[str, dict[str, dict[str, str]]] = {}
+    for key, value in figures.items():
+        cause, _, rest = key.partition("/")
+        row, _, column = rest.rpartition("/")
+        if row and cause != "run":
+            shown = value if isinstance(value, str) else number(value)
+            causes.setdefault(cause, {}).setdefault(row, {})[column] = shown
+    found = {}
+    for cause, rows in causes.items():
+        columns = list(dict.fromkeys(column for cells in rows.values() for column in cells))
+        lines = [[row, *[cells.get(column, "-") for column in columns]] for row, cells in rows.items()]
+        found[cause] = table(["changed", *columns], lines)
+    return found
+
+
+def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
+    """A figure with its interval; of several trainings, the mean with the range; a dash if undefined."""
+    known = numbers(trainings, key)
+    if not known:
+        return "-"
+    if len(known) > 1:
+        return f"{sum(known) / len(known):.{places}f} ({min(known):.{places}f} to {max(known):.{places}f})"
+    limits = read_spread(trainings[0], key).interval
+    return f"{known[0]:.{places}f}" + (f" ({limits[0]:.{places}f} to {limits[1]:.{places}f})" if limits else "")
+
+
+def numbers(trainings: Sequence[Metrics], key: str) -> list[float]:
+    """The finite values of a figure."""
+    found = [metrics.get(key) for metrics in trainings]
+    return [float(value) for value in found if isinstance(value, int | float) and math.isfinite(value)]
+
+
+def epochs(trainings: Sequence[Metrics]) -> str:
+    """Epochs of the trainings; a dash if unknown."""
+    found = {str(metrics["train/epochs"]) for metrics in trainings if "train/epochs" in metrics}
+    return " or ".join(sorted(found, key=int)) or "-"
+
+
+def labels_a_frame(metrics: Metrics, prefix: str = "test") -> str:
+    """Mean number of selected labels in a frame; a dash if unknown."""
+    labels, frames = (metrics.get(f"{prefix}/{key}") for key in ("labels", "frames"))
+    return f"{labels / frames:.1f}" if isinstance(labels, int) and isinstance(frames, int) and frames else "-"
+
+
+def seconds(metrics: Metrics) -> str:
+    """Seconds of a pair; a dash if unknown."""
+    found = metrics.get("test/ms_per_single_pair")
+    return f"{found / 1e3:.3f}" if isinstance(found, int | float) else "-"
+
+
+def _errors(metrics: Metrics, prefix: str) -> list[str]:
+    return [values([metrics], f"{prefix}/{key}", places) for key, places in _NAVIGATION.items()]
