@@ -2,11 +2,12 @@
 
     python examples/closed_loop.py [--out runs/closed-loop] [--seed 0]
 
-The lander starts 1400 m above the site with an error of 60 m on each axis in what it believes, and flies to a gate
-150 m above the site in 60 s. Each second it gets an image, finds craters with the installed detector and matches them
-to a catalogue with errors; between the images it integrates its inertial unit. Guidance is the quadratic law of Klumpp
-(1974, doi 10.1016/0005-1098(74)90019-3) on the filter's estimate. The same flight without camera is the control. Prints
-the distances by which the gate is missed, and draws both paths. The attitude is level but for a small sway.
+The lander starts 1400 m above the site and flies to a gate 150 m above the site in 60 s. Its initial estimate is off by
+60 m on each axis (one standard deviation). Each second it receives an image, finds craters with the installed detector
+and matches them to a catalogue with errors; between the images it integrates its inertial measurements. Guidance is the
+quadratic law of Klumpp (1974, doi 10.1016/0005-1098(74)90019-3) on the filter's estimate. A second flight without
+camera is the control. The program prints the distance by which each flight misses the gate, and draws both paths. The
+attitude is level except for a small sway.
 """
 
 import argparse
@@ -49,16 +50,16 @@ START_M, START_MPS = np.array([520.0, -260.0, 1400.0]), np.array([-14.0, 7.0, -2
 GATE_M, GATE_MPS = np.array([0.0, 0.0, 150.0]), np.array([0.0, 0.0, -3.0])
 DURATION_S, STEP_S, FRAME_S = 60.0, 0.02, 1.0
 PRIOR_M, PRIOR_MPS, PRIOR_DEG = 60.0, 0.5, 0.5
-"""Standard deviations of the belief at the start, on each axis."""
+"""Standard deviations of the initial estimate, on each axis."""
 MOST_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
 SHOWN_S = (0.0, 30.0, 60.0)
 """Times of the frames in the picture."""
 LAST_S = 4.0
-"""Time to go below which guidance keeps its last command, which would otherwise grow without limit."""
+"""Remaining time below which guidance keeps its last command, since the law divides by the remaining time."""
 
 
 @dataclass(frozen=True)
-class Shown:
+class DrawnFrame:
     """A frame for the picture."""
 
     height_m: float
@@ -71,12 +72,12 @@ class Shown:
 
 @dataclass
 class Flight:
-    """What a flight did, one entry per frame."""
+    """The record of a flight, one entry per frame."""
 
     true_m: list[Array] = field(default_factory=list)
-    believed_m: list[Array] = field(default_factory=list)
+    estimated_m: list[Array] = field(default_factory=list)
     matched: list[int] = field(default_factory=list)
-    shown: list[Shown] = field(default_factory=list)
+    shown: list[DrawnFrame] = field(default_factory=list)
     """Frames for the picture."""
 
     @property
@@ -87,7 +88,7 @@ class Flight:
     @property
     def errors_m(self) -> Array:
         """Length of the error of the estimate at each frame (N,)."""
-        return np.linalg.norm(np.array(self.true_m) - np.array(self.believed_m), axis=1)
+        return np.linalg.norm(np.array(self.true_m) - np.array(self.estimated_m), axis=1)
 
 
 @contextmanager
@@ -101,9 +102,9 @@ def server() -> Iterator[str]:
             printed = ""
             for line in process.stderr:
                 printed = line
-                found = re.search(r"perilune_shared\.client at (tcp://\S+)", line)
-                if found:
-                    yield found[1]
+                match = re.search(r"perilune_shared\.client at (tcp://\S+)", line)
+                if match:
+                    yield match[1]
                     break
             else:
                 raise UserError("server", "start", printed.strip(), "a server that starts")
@@ -127,7 +128,7 @@ def sway(time_s: float) -> Array:
 
 
 def lander_of(scene: SceneClient, catalogue: Catalogue, rng: np.random.Generator) -> Lander:
-    """The filter, which believes a wrong start."""
+    """The filter, starting from a wrong estimate."""
     unit = GRADES["tactical"]
     sigmas = start_sigmas(PRIOR_M, PRIOR_MPS, PRIOR_DEG, unit)
     tilt = matrix_from_rotation_vector(np.radians(PRIOR_DEG) * rng.normal(size=3))
@@ -136,8 +137,8 @@ def lander_of(scene: SceneClient, catalogue: Catalogue, rng: np.random.Generator
     return Lander(State.starting(*start, sigmas, RELIEF_M), InertialNoise.of(unit), around)
 
 
-class Eye:
-    """The camera of the lander: images from the server, craters from the installed detector."""
+class CraterCamera:
+    """Camera of the lander: images from the server, craters by the installed detector."""
 
     def __init__(self, scene: SceneClient):
         run = shipped_run("detect")
@@ -146,17 +147,19 @@ class Eye:
         self._detector = open_detector(RunFolder(run).best, config)
         self._tiling = Tiling(scales=tuple(config.evaluation.scales))
 
-    def look(self, position_m: Array, rotation_site_from_body: Array, velocity_mps: Array) -> tuple[Sightings, Shown]:
-        """Craters in the image of a true pose, and the image."""
+    def look(
+        self, position_m: Array, rotation_site_from_body: Array, velocity_mps: Array
+    ) -> tuple[Sightings, DrawnFrame]:
+        """Craters in the image at a true pose, and the frame for the picture."""
         rotation = ROTATION_CAMERA_FROM_BODY @ rotation_site_from_body.T
         frame = self._scene.frame(position_m, quaternion_from_matrix(rotation), velocity_mps=velocity_mps)
-        found = above(detect_image(self._detector, frame.image, self._tiling), self._threshold)
-        boxes = np.asarray(found.boxes, np.float64)
-        return Sightings.of_boxes(boxes, found.scores), Shown(float(position_m[2]), frame.image, boxes)
+        detections = above(detect_image(self._detector, frame.image, self._tiling), self._threshold)
+        boxes = np.asarray(detections.boxes, np.float64)
+        return Sightings.of_boxes(boxes, detections.scores), DrawnFrame(float(position_m[2]), frame.image, boxes)
 
 
-def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Flight:
-    """Fly once; without an eye the filter has its inertial unit and the altimeter alone."""
+def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: int) -> Flight:
+    """Fly once. Without a camera the filter uses inertial unit and altimeter only."""
     rng = np.random.default_rng([seed, 2])
     n_steps = round(DURATION_S / STEP_S)
     gyro, force = drawn_errors(GRADES["tactical"], np.full(n_steps, STEP_S), rng)
@@ -168,15 +171,15 @@ def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Fligh
             ground = float(scene.heights(position[:1], position[1:2])[0])
             lander.range(position[2] - ground + RANGE_NOISE_M * rng.normal())
             located = None
-            if eye is not None:
-                sightings, shown = eye.look(position, sway(time_s), velocity)
+            if camera is not None:
+                sightings, shown = camera.look(position, sway(time_s), velocity)
                 located = lander.sightings(sightings)
                 if time_s in SHOWN_S:
                     flight.shown.append(shown)
             flight.true_m.append(position.copy())
-            flight.believed_m.append(lander.state.position_m.copy())
+            flight.estimated_m.append(lander.state.position_m.copy())
             flight.matched.append(len(located.fix.crater) if located else 0)
-            if eye is not None:
+            if camera is not None:
                 say(
                     f"{time_s:3.0f} s, height {position[2]:6.1f} m, error {flight.errors_m[-1]:6.2f} m, "
                     f"{flight.matched[-1]} craters matched"
@@ -239,10 +242,10 @@ def main() -> None:
             for names in (("x_m", "y_m", "z_m"), ("normal_x", "normal_y", "normal_z"))
         )
         exact = Catalogue(places, normals, craters["diameter_m"][large] / 2, 0.0, 0.0)
-        for name, eye in (("with camera", Eye(scene)), ("without camera", None)):
+        for name, camera in (("with camera", CraterCamera(scene)), ("without camera", None)):
             rng = np.random.default_rng([given.seed, 1])
             catalogue = with_errors(exact, CatalogueErrors(), rng)
-            flown[name] = fly(scene, lander_of(scene, catalogue, rng), eye, given.seed)
+            flown[name] = fly(scene, lander_of(scene, catalogue, rng), camera, given.seed)
     figures = {
         name: {"miss_m": flight.miss_m, "error_at_the_end_m": float(flight.errors_m[-1])}
         for name, flight in flown.items()
@@ -250,7 +253,7 @@ def main() -> None:
     (given.out / "closed_loop.json").write_text(json.dumps(figures, indent=2) + "\n")
     draw(given.out / "closed_loop.png", flown)
     for name, flight in flown.items():
-        say(f"{name}: the gate is missed by {flight.miss_m:.1f} m; error of the estimate {flight.errors_m[-1]:.1f} m")
+        say(f"{name}: misses the gate by {flight.miss_m:.1f} m; error of the estimate {flight.errors_m[-1]:.1f} m")
     say(f"look at {given.out / 'closed_loop.png'}")
 
 

@@ -17,6 +17,8 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
             continue
         pieces.append(f"```python\n{cell.source}\n```")
         for output in cell.outputs:
+            if output.get("name") == "stderr":  # progress
+                continue
             data = output.get("data", {})
             if "image/png" in data:
                 name = f"{path.stem}-{len(pictures) + 1}.png"

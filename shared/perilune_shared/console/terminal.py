@@ -22,7 +22,8 @@ from rich.text import Text
 
 from perilune_shared.errors import one_line
 
-console = Console(stderr=True)
+# In Jupyter, Rich would draw widgets, which need another package, and warn without it.
+console = Console(stderr=True, force_jupyter=False)
 """Console on standard error of the progress bar; text that it prints appears above the bar."""
 _LOG_INTERVAL_S = 60.0
 _LOG_WIDTH = 120

@@ -120,7 +120,7 @@ def test_every_section_of_finished_runs(runs, dataset):
     assert "| headline at half width | YOLOv3 | 3 | - | 0.810 (0.800 to 0.820) |" in table
     for ground in ("sparse (0.1)", "our usual", "headline after transfer"):
         assert f"| {ground} | attention-YOLOv3, plain CBAM | 1 | - | 0.850" in table
-    assert "Weights: those after transfer from our own network `own`, in place of YOLOv3 trained on COCO." in table
+    assert "Weights: rows after transfer from our own network `own`, in place of YOLOv3 trained on COCO." in table
     curve = page["Density of craters"]
     assert "| **0.4, headline** | 25.0 | 0.895 | 0.900 (0.890 to 0.910) | 0.800 (0.790 to 0.810) |" in curve
     assert [line.split(" | ")[0].strip("|* ") for line in curve.splitlines() if line.startswith("| ")][2:] == [
@@ -171,7 +171,7 @@ def test_the_first_paragraph(runs, dataset):
     assert text == write_page(runs, str(dataset)).read_text().splitlines()[2]
     assert "The headline ground has `equilibrium_share` 0.4: a ground of the paper's difficulty" in text
     assert "Of 4 grounds it has the validation AP (0.895) nearest to the paper's 0.893." in text
-    assert "By the strict account it would be 0.1 (0.870)." in text
+    assert "By the strict scoring rule it would be 0.1 (0.870)." in text
     assert "(precision 0.840 at recall 0.926; here 0.800 usual and 0.700 strict at recall 0.800)" in text
     assert "At half width there are 3 trainings of each network." in text
     assert "It was given; on the curve 0.4 is nearer to 0.893." in paragraph("0.8")

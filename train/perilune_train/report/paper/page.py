@@ -139,9 +139,9 @@ def _elsewhere(runs: PaperRuns) -> bool:
 
 
 def _starts(runs: PaperRuns) -> str:
-    """A sentence on the weights that the headline rows, and those after transfer, start from; empty if unknown."""
+    """A sentence on the weights that the headline rows, and rows after transfer, start from; empty if unknown."""
     found = []
-    for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "those after transfer")):
+    for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "rows after transfer")):
         starts = {
             str(one["train/start"]) for own in runs.detections(ground).values() for one in own if "train/start" in one
         }

@@ -7,49 +7,50 @@ from perilune_train.report.paper.runs import PaperRuns, nearest_share
 from perilune_train.report.paper.tables import numbers
 
 CAUSES = {
-    "loss": "**Loss.** In a common family of YOLO code 0.05 and 1 are the weights of means over boxes and cells. With "
-    "plain sums there are far more cells than boxes, and the boxes are hardly trained.",
+    "loss": "**Loss.** In common YOLO implementations, 0.05 and 1 weight means over boxes and cells. With plain "
+    "sums, cells far outnumber boxes, and the boxes are hardly trained.",
     "gates": "**Gates.** A plain CBAM module scales its input by about 0.25 at the start, and there are 23 of them. "
-    "Put into a frozen backbone that was trained without them, they leave the later layers next to no signal. Gates "
+    "In a frozen backbone that was trained without gates, they leave almost no signal for the later layers. Gates "
     "from identity start at 1.",
-    "ground": "**Ground.** Our usual ground has many craters, many of them too faint to see, and the paper's rule of "
-    "labels takes them all. The curve above has the same network on sparser ground.",
+    "ground": "**Ground.** perilune's usual ground has many craters, many of them too faint to see, and the paper's "
+    "rule labels them all. The curve above shows the network on sparser ground.",
 }
 """By the first part of the keys of paper-causes.json."""
 
 DEVIATIONS = (
     "Frames are rendered by perilune in place of PANGU. The paper does not publish its data, camera or Sun. The "
-    "headline ground is chosen by its difficulty for YOLOv3 alone.",
-    "The grey frame is repeated in three channels, as PANGU's images of a grey ground are.",
+    "headline ground is chosen by its difficulty for YOLOv3 only.",
+    "The grey frame is repeated in three channels, as in PANGU's images of grey ground.",
     "Loss: `detect.loss.reduction=means` in place of the paper's sums over cells and boxes. Sums are an ablation.",
     "YOLOv3 ignores predictors that overlap a label by an IoU above 0.5 without being its best one. Here they are "
     "negative.",
-    "COCO is not used. In the rows after transfer a network of our own stands in for YOLOv3 trained on it.",
+    "COCO is not used. In the rows after transfer, one of perilune's networks replaces YOLOv3 trained on COCO.",
     "Gates: plain CBAM is the paper's. Gates from identity are CBAM with twice the sigmoid, and their last weights "
     "start at zero.",
     "Optimiser (AdamW with warm-up and one cosine for detection), learning rate, batch and epochs of detection, and "
-    "the weight of empty cells in the objectness loss (1) are ours; the paper does not state them.",
+    "the weight of empty cells in the objectness loss (1) are perilune's choices; the paper does not state them.",
     "Craters with a radius just outside 2 to 50 px, or with their centre off the frame, are neither positive nor "
-    "negative in training. The usual account ignores detections on them; the strict one counts these as false.",
+    "negative in training. The usual scoring rule ignores detections on them; the strict rule counts these as false "
+    "positives.",
     "A cell can place a centre up to half a cell outside itself. There is no class output. The initial objectness is "
     "0.01 in every cell.",
     "Navigation: in the paper the network gives the pose in the landing frame; motion between frames is a second "
     "reading. The backbone starts from the detector. It is frozen in the coarse stage, and its features are stored.",
-    "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, and "
-    "the orientation error says nothing. Descents with attitude noise (ATTITUDE=1) measure it.",
+    "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, so "
+    "the orientation error carries no information. Descents with attitude noise (ATTITUDE=1) measure it.",
     "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
-    "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own, and "
-    "in the fine stage that of the backbone is a hundredth of the paper's 1e-4. Training sequences "
-    "are also of further views, warped over the ground plane.",
+    "pose, the axes are weighted between metres and spreads. The coarse stage has a higher learning rate. In the fine "
+    "stage the learning rate of the backbone is a hundredth of the paper's 1e-4. Training sequences include further "
+    "views, warped over the ground plane.",
     "Features of the backbone are standardised before the LSTM, and its batch statistics stay as in the detector. "
-    "Poses are evaluated in causal windows as long as the training's, not with a state carried over the descent.",
-    "The best epoch on validation is tested.",
+    "Poses are evaluated in causal windows of the training's length, without a state carried over the descent.",
+    "The epoch that is best on validation is tested.",
 )
 
 
 def lead(runs: PaperRuns, share: str | None, *, given: bool) -> str:
     """The paragraph; `share` is the equilibrium_share of the headline ground, `given` if the caller named it."""
-    return " ".join([_ground(runs, share, given), _account(runs), _trainings(runs)])
+    return " ".join([_ground(runs, share, given), _scoring(runs), _trainings(runs)])
 
 
 def verdict_note() -> str:
@@ -59,8 +60,8 @@ def verdict_note() -> str:
         "if every training with attention is better than every one without, and *does not hold* if every one is worse. "
         "With one training of each, it holds or does not hold only if the 95 % intervals over trajectories are "
         "separated; these intervals say nothing about another training. Otherwise it is *open*. Times count as equal "
-        f"within {100 * (AS_FAST - 1):.0f} % in either direction. A claim on gates holds if it is true of all of its "
-        "gates, does not hold if of none, and is open over fewer than five scenes; the experiment has one."
+        f"within {100 * (AS_FAST - 1):.0f} % in either direction. A claim on gates holds if it is true for all of its "
+        "gates, does not hold if it is true for none, and is open over fewer than five scenes; the experiment has one."
     )
 
 
@@ -83,16 +84,16 @@ def _ground(runs: PaperRuns, share: str | None, given: bool) -> str:
     strict = nearest_share(curve, "strict/")
     if strict is not None and strict != share:
         ap = number(curve[strict].get("val/strict/ap50_paper"))
-        text += f" By the strict account it would be {strict} ({ap})."
+        text += f" By the strict scoring rule it would be {strict} ({ap})."
     return text
 
 
-def _account(runs: PaperRuns) -> str:
+def _scoring(runs: PaperRuns) -> str:
     paper = DETECTION["YOLOv3"]
     text = (
-        "**Account.** Labels follow the paper's rule, radii of 2 to 50 px. Headline figures are of the usual account, "
-        "which ignores detections that the labels cannot decide. The strict account counts a detected crater just "
-        "below 2 px as false. The paper must have used the strict one, since it names no ignored detections"
+        "**Scoring.** Labels follow the paper's rule, radii of 2 to 50 px. Headline figures use the usual scoring "
+        "rule, which ignores detections that the labels cannot decide. The strict rule counts a detected crater just "
+        "below 2 px as a false positive. The paper must have used the strict rule, since it names no ignored detections"
     )
     own = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
     usual, strict, recall = (numbers(own, f"test/{key}") for key in ("precision", "strict/precision", "recall"))
@@ -101,7 +102,7 @@ def _account(runs: PaperRuns) -> str:
             f" (precision {paper['precision']:.3f} at recall {paper['recall']:.3f}; here {usual[0]:.3f} usual and "
             f"{strict[0]:.3f} strict at recall {recall[0]:.3f})"
         )
-    return f"{text}. The usual one is the headline here, since a crater just below 2 px is not a false detection."
+    return f"{text}. The usual rule is the headline here, since a crater just below 2 px is not a false detection."
 
 
 def _trainings(runs: PaperRuns) -> str:
