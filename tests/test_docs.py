@@ -163,6 +163,20 @@ def leaves(nav: Any) -> Iterator[str]:
             yield from leaves(each)
 
 
+def test_every_picture_is_shown():
+    """A page without it leaves a file that every clone carries."""
+    pages = [page.read_text(encoding="utf-8") for page in PAGES]
+    pictures = [path for path in (DOCS / "pictures").rglob("*") if path.is_file()]
+    unused = [path.name for path in pictures if not any(path.name in text for text in pages)]
+    assert pictures and not unused, f"delete {', '.join(unused)}"
+
+
+def test_pictures_are_small():
+    """In kilobytes, of 1024 bytes: JPEGs of quality 70, PNGs with few colours."""
+    large = {path.name: path.stat().st_size // 1024 for path in (DOCS / "pictures").rglob("*.*")}
+    assert {name: size for name, size in large.items() if size > 320} == {}
+
+
 def test_every_page_is_in_the_navigation_once():
     nav = yaml.safe_load((TOP / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
     listed = sorted(leaves(on_config(SimpleNamespace(nav=nav)).nav))
