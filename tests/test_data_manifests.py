@@ -57,6 +57,7 @@ def test_all_are_here():
     benchmark = [f"benchmark-{k}-{part}" for k in kinds for part in PARTS]
     assert sorted([*of_presets, *benchmark, "shipped-detect", "shipped-nav", "south-pole-detect"]) == NAMES
     counts = {name: open_dataset(FOLDER / name).info.counts for name in NAMES}
+    assert {open_dataset(FOLDER / name).info.licence for name in NAMES} == {"CC-BY-4.0"}, "as LICENSE says"
     assert [counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds] == [343, 49, 343, 49]
     assert all(
         counts[f"{p}-{k}"].frames == 100 * counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds

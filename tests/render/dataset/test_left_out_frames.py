@@ -8,6 +8,7 @@ from tests.helpers.rendered import QUICK
 
 from perilune_render.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import NOT_STATED
 from perilune_shared.editing.diff import differences
 from perilune_shared.validation.validate import validate
 
@@ -34,6 +35,10 @@ def test_the_frames_come_back(plan, without_frames, tmp_path):
     made = open_dataset(tmp_path / "again")
     assert validate(made) == [] and list(differences(open_dataset(plan), made)) == []
     assert (tmp_path / "again/dataset.json").read_bytes() == (plan / "dataset.json").read_bytes()
+
+
+def test_what_a_user_plans_has_no_licence(plan):
+    assert open_dataset(plan).info.licence == NOT_STATED
 
 
 def test_nothing_is_rendered_without_them(without_frames, tmp_path):
