@@ -171,6 +171,17 @@ def test_every_picture_is_shown():
     assert pictures and not unused, f"delete {', '.join(unused)}"
 
 
+def test_every_record_is_named():
+    """By a row of the results, a page, or code that reads it."""
+    folders = ("benchmarks", "scripts", "tests", "train")
+    code = [path.read_text(encoding="utf-8") for folder in folders for path in (TOP / folder).rglob("*.py")]
+    named = "\n".join([*(page.read_text(encoding="utf-8") for page in PAGES), *code])
+    rows = re.findall(r'^record = "([^"]+)"', (TOP / "results/headline.toml").read_text(encoding="utf-8"), re.MULTILINE)
+    records = [path for path in (TOP / "results").iterdir() if path.suffix != ".toml"]
+    unused = [path.name for path in records if path.stem not in rows and path.name not in named]
+    assert records and not unused, f"delete {', '.join(unused)}"
+
+
 def test_pictures_are_small():
     """In kilobytes, of 1024 bytes: JPEGs of quality 70, PNGs with few colours."""
     large = {path.name: path.stat().st_size // 1024 for path in (DOCS / "pictures").rglob("*.*")}
