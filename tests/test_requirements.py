@@ -2,7 +2,7 @@
 
 import pytest
 from packaging.requirements import Requirement
-from scripts.requirements_of import constraints_of, requirements_of
+from scripts.python_versions import constraints_of, requirements_of, unfit
 
 VERSIONS = ("3.11", "3.12", "3.13")
 
@@ -26,3 +26,13 @@ def test_blender_is_for_one_version_only():
         version: next(line for line in constraints_of(version) if line.startswith("numpy==")) for version in VERSIONS
     }
     assert numpy["3.11"].startswith("numpy==1.") and numpy["3.12"] == numpy["3.13"] != numpy["3.11"]
+
+
+def test_a_package_for_another_python_is_named():
+    packages = [
+        {"name": "a", "version": "1", "requires_python": ">=3.12"},
+        {"name": "b", "version": "2", "requires_python": "==3.11.*"},
+        {"name": "c", "version": "3"},
+    ]
+    assert unfit(packages, "3.11") == ["a 1 requires Python >=3.12"]
+    assert unfit(packages, "3.13") == ["b 2 requires Python ==3.11.*"]

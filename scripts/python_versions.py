@@ -1,16 +1,19 @@
-"""Write what a Python version needs: requirements.txt of all packages, and constraints.txt with the pins for it.
+"""Write what a Python version needs, and check what pip resolved for it. Used by scripts/test-resolves.
 
-    python scripts/requirements_of.py 3.13 FOLDER
+    python scripts/python_versions.py write 3.13 FOLDER    # requirements.txt of all packages, constraints.txt of pins
+    python scripts/python_versions.py check 3.13 FOLDER    # report.json of pip
 
-pip compares markers such as `python_version < "3.12"` with the Python that runs it, also where it resolves for another
-one. So they are compared here. Used by scripts/test-resolves.
+pip compares markers such as `python_version < "3.12"`, and the Python that a package requires, with the Python that
+runs it, also where it resolves for another one. So both are compared here.
 """
 
+import json
 import sys
 import tomllib
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("shared", "render", "train", "perilune")
@@ -39,11 +42,29 @@ def constraints_of(version: str) -> list[str]:
     return [f"{pin.name}{pin.specifier}" for pin in pins if pin.marker is None or pin.marker.evaluate(environment)]
 
 
-def main(version: str, folder: Path) -> None:
+def write(version: str, folder: Path) -> None:
     """Write both files."""
     for name, lines in (("requirements", requirements_of(version)), ("constraints", constraints_of(version))):
         (folder / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
+def check(version: str, folder: Path) -> None:
+    """Print how many packages pip resolved; end with an error if one is not for this Python."""
+    packages = json.loads((folder / "report.json").read_text(encoding="utf-8"))["install"]
+    refused = unfit([package["metadata"] for package in packages], version)
+    if refused:
+        sys.exit(f"Python {version}: {', '.join(refused)}")
+    print(f"Python {version}: {len(packages)} packages resolved")
+
+
+def unfit(packages: list[dict[str, str]], version: str) -> list[str]:
+    """Packages, by their metadata, that require another Python than a version."""
+    return [
+        f"{each['name']} {each['version']} requires Python {each['requires_python']}"
+        for each in packages
+        if not SpecifierSet(each.get("requires_python") or "").contains(f"{version}.0")
+    ]
+
+
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    {"write": write, "check": check}[sys.argv[1]](sys.argv[2], Path(sys.argv[3]))
