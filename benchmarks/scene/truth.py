@@ -13,7 +13,6 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from benchmarks.figures import write_figures
-from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig, KindConfig, RenderConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
@@ -122,6 +121,9 @@ def rendered_frames() -> list[Frame]:
     config = DatasetConfig(detect=kind, nav=kind, terrain=terrain, render=RenderConfig(samples=2, exr=True))
     scene = grow_scene(config, view_envelope(CAMERA, config.detect.flight), 3)
     caster, found = Caster(scene), []
+    # Here, since tests of the other engine import this module where Blender is not installed.
+    from perilune_render.blender.renderer import Renderer
+
     with (
         tempfile.TemporaryDirectory() as folder,
         Renderer(scene, config, CAMERA, sun_direction(60, 30)) as renderer,
