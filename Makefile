@@ -58,7 +58,7 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@$(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || { echo "$(VENV): got $$($(BIN)/python -V), expected Python 3.11, which Blender's module needs: type  mv $(VENV) $(VENV)-old  and then  make setup PYTHON=python3.11" >&2; exit 2; }
 	@echo "installing into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
-	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[geo]" -e perilune
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e "render[blender]" -e "train[geo]" -e perilune
 	@touch $@
 
 setup-dev: $(VENV)/.ready-dev ## also install the tools of tests, checks, documentation and benchmarks

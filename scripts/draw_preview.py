@@ -26,7 +26,7 @@ def main() -> None:
         image = cv2.imread(str(sheet))
     height_px = round(image.shape[0] * WIDTH_PX / image.shape[1])
     small = cv2.resize(image, (WIDTH_PX, height_px), interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(PICTURE), small, [cv2.IMWRITE_JPEG_QUALITY, 84])
+    cv2.imwrite(str(PICTURE), small, [cv2.IMWRITE_JPEG_QUALITY, 70, cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED, PAGES = ROOT / "train/perilune_train/shipped", ROOT / "docs/reference/models"
-MAX_MB = {"crater-detector": 16.0, "lander-navigator": 8.0}
-"""Largest size of the weights, MB."""
+MAX_MB = {"crater-detector": 8.0, "lander-navigator": 1.0}
+"""Largest size of the weights, MB. Every clone and every wheel carries them."""
 MANIFESTS = {"crater-detector": "shipped-detect", "lander-navigator": "shipped-nav"}
 """Shared manifests of the training data."""
 
@@ -60,7 +60,8 @@ def install(
     size = (folder / WEIGHTS).stat().st_size / 1e6
     if size > MAX_MB[name]:
         (folder / WEIGHTS).unlink()
-        raise UserError(folder / WEIGHTS, "size", f"{size:.1f} MB", f"at most {MAX_MB[name]:g} MB")
+        expected = f"at most {MAX_MB[name]:g} MB; --eight-bits stores half of it"
+        raise UserError(folder / WEIGHTS, "size", f"{size:.1f} MB", expected)
     # The command may have paths of the machine that trained it.
     kept = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
     write_text(folder / METRICS_FILE, json.dumps(kept, indent=2) + "\n")

@@ -1,5 +1,6 @@
 """Datasets rendered by the command line itself, shared by all tests that read one."""
 
+import importlib.util
 import os
 import shutil
 import signal
@@ -47,8 +48,10 @@ def shared_folder(tmp_path_factory) -> Path:
 def tiny(shared_folder) -> Path:
     """Folder with the `tiny` preset's datasets `detect` and `nav`, rendered by Blender. Read only.
 
-    For tests whose subject is what Blender renders; the others use `quick`.
+    For tests whose subject is what Blender renders, which are skipped without it; the others use `quick`.
     """
+    if importlib.util.find_spec("bpy") is None:
+        pytest.skip("Blender's module is not installed")
     return rendered_once(shared_folder / "tiny", in_a_process, "dataset", "--preset", "tiny")
 
 

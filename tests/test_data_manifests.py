@@ -1,6 +1,7 @@
 """The shared manifests are whole, and a frame of each comes out as it did when they were written."""
 
 import hashlib
+import json
 import os
 import re
 from collections import defaultdict
@@ -12,6 +13,7 @@ import pyarrow as pa
 import pytest
 from rich.progress import Progress
 
+from perilune_render.dataset.manifest_only import frames_left_out, write_left_out_frames
 from perilune_render.dataset.regenerate import OUTLIERS, png_outlier_share, regenerate
 from perilune_render.dataset.tables import frame_table
 from perilune_render.flight.plan import make_plan
@@ -24,6 +26,30 @@ FOLDER = Path(__file__).parent.parent / "data_manifests"
 NAMES = sorted(path.parent.name for path in FOLDER.glob("*/dataset.json"))
 PARTS = ("highland", "mare", "camera", "npb", "npc")
 REAL = os.environ.get("PERILUNE_REAL_DEM")
+LEFT_OUT = {
+    "paper-detect": "ab9d3a3410fd2316ef245586c5eee6cd86a3ed18525f9c17f5bca51dda905949",
+    "paper-nav": "68e4ddec9f50e3510b6d72b6d7e855d1f73c259ea4f694b08ecefec872978646",
+    "shipped-detect": "20ecd82e3a10d5e3efa428cf3393b111bcb5545b660ee4ecc0e19e0fc14c1aa5",
+    "large-nav": "a2515951e5cc670ba29a27220a082002c00131cf5d7b8f734e40ebfce067052d",
+}
+"""Manifests without the table `frames`, and the SHA-256 of its rows, as JSON, from before it was left out."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Open a shared manifest with all its tables."""
+    made = {}
+
+    def opened(name):
+        if name not in LEFT_OUT:
+            return open_dataset(FOLDER / name)
+        if name not in made:
+            made[name] = tmp_path_factory.mktemp("whole") / name
+            with Progress(disable=True) as progress:
+                write_left_out_frames(open_dataset(FOLDER / name), made[name], progress)
+        return open_dataset(made[name])
+
+    return opened
 
 
 def test_all_are_here():
@@ -32,6 +58,7 @@ def test_all_are_here():
     benchmark = [f"benchmark-{k}-{part}" for k in kinds for part in PARTS]
     assert sorted([*of_presets, *benchmark, "shipped-detect", "shipped-nav", "south-pole-detect"]) == NAMES
     counts = {name: open_dataset(FOLDER / name).info.counts for name in NAMES}
+    assert {open_dataset(FOLDER / name).info.licence for name in NAMES} == {"CC-BY-4.0"}, "as LICENSE says"
     assert [counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds] == [343, 49, 343, 49]
     assert all(
         counts[f"{p}-{k}"].frames == 100 * counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds
@@ -43,8 +70,8 @@ LARGE = ("large-detect", "paper-detect")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in NAMES])
-def test_it_is_whole_and_named_in_the_readme(name):
-    dataset = open_dataset(FOLDER / name)
+def test_it_is_whole_and_named_in_the_readme(name, whole):
+    dataset = whole(name)
     assert validate(dataset) == [] and dataset.info.images == "planned"
     sha256 = hashlib.sha256((FOLDER / name / "dataset.json").read_bytes()).hexdigest()
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
@@ -72,14 +99,22 @@ def test_the_benchmark_has_test_frames_under_low_and_high_suns(kind):
     assert min(altitude) < 220 and max(altitude) > 1480
 
 
-OF_PRESETS = [n for n in NAMES if n.startswith(("small", "paper", "large", "shipped"))]
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in LEFT_OUT])
+def test_frames_that_were_left_out_come_back(name, whole):
+    """To the last bit; with the libraries of constraints.txt also the same dataset.json, which holds all hashes."""
+    assert frames_left_out(open_dataset(FOLDER / name))
+    rows = whole(name).table("frames").sort_by("frame_id").to_pylist()
+    assert hashlib.sha256(json.dumps(rows).encode()).hexdigest() == LEFT_OUT[name]
+
+
+OF_PRESETS = [n for n in NAMES if n.startswith(("small", "large-detect", "shipped-nav"))]
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in OF_PRESETS])
 def test_the_frames_follow_from_the_recipe(name):
-    """In seconds and without ground, to the last bit, so the table `frames` could be left out of the tree.
+    """In seconds and without ground, to the last bit.
 
-    Only the attitudes of large-detect differ in the last bits: they were drawn by earlier code.
+    Only the attitudes of large-detect differ in the last bits: earlier code drew them. So its table `frames` is kept.
     """
     manifest = open_dataset(FOLDER / name)
     recipe = manifest.info.recipe()
@@ -100,7 +135,7 @@ def test_the_frames_follow_from_the_recipe(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_a_frame_is_made_again(name, tmp_path):
+def test_a_frame_is_made_again(name, whole, tmp_path):
     """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""
     dem = None
     if name.startswith("south-pole") or name.endswith(("npb", "npc")):
@@ -110,7 +145,7 @@ def test_a_frame_is_made_again(name, tmp_path):
     (reference,) = (FOLDER / "reference_frames" / name).rglob("*.png")
     frame_id = reference.relative_to(FOLDER / "reference_frames" / name).with_suffix("").as_posix()
     with Progress(disable=True) as progress:
-        (outcome,) = regenerate(open_dataset(FOLDER / name), [frame_id], tmp_path, progress, dem)
+        (outcome,) = regenerate(whole(name), [frame_id], tmp_path, progress, dem)
     assert outcome.same_ground
     again = Path(outcome.png_path).read_bytes()
     assert png_outlier_share(reference.read_bytes(), again) <= OUTLIERS

@@ -179,6 +179,31 @@ def leaves(nav: Any) -> Iterator[str]:
             yield from leaves(each)
 
 
+def test_every_picture_is_shown():
+    """A page without it leaves a file that every clone carries."""
+    pages = [page.read_text(encoding="utf-8") for page in [*PAGES, DOCS.parent / "mkdocs.yml"]]
+    pictures = [path for path in (DOCS / "pictures").rglob("*") if path.is_file()]
+    unused = [path.name for path in pictures if not any(path.name in text for text in pages)]
+    assert pictures and not unused, f"delete {', '.join(unused)}"
+
+
+def test_every_record_is_named():
+    """By a row of the results, a page, or code that reads it."""
+    folders = ("benchmarks", "scripts", "tests", "train")
+    code = [path.read_text(encoding="utf-8") for folder in folders for path in (TOP / folder).rglob("*.py")]
+    named = "\n".join([*(page.read_text(encoding="utf-8") for page in PAGES), *code])
+    rows = re.findall(r'^record = "([^"]+)"', (TOP / "results/headline.toml").read_text(encoding="utf-8"), re.MULTILINE)
+    records = [path for path in (TOP / "results").iterdir() if path.suffix != ".toml"]
+    unused = [path.name for path in records if path.stem not in rows and path.name not in named]
+    assert records and not unused, f"delete {', '.join(unused)}"
+
+
+def test_pictures_are_small():
+    """In kilobytes, of 1024 bytes: JPEGs of quality 70, PNGs with few colours."""
+    large = {path.name: path.stat().st_size // 1024 for path in (DOCS / "pictures").rglob("*.*")}
+    assert {name: size for name, size in large.items() if size > 320} == {}
+
+
 def test_every_page_is_in_the_navigation_once():
     nav = yaml.safe_load((TOP / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
     listed = sorted(leaves(on_config(SimpleNamespace(nav=nav)).nav))

@@ -15,7 +15,6 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from benchmarks.figures import write_figures
 from perilune_render.config.dataset import DatasetConfig, KindConfig, RenderConfig
 from perilune_render.config.terrain import BouldersConfig, TerrainConfig
-from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.exr import exr_bytes, read_radiance
 from perilune_render.imaging.radiance import Radiance
@@ -122,6 +121,9 @@ def rendered_frames() -> list[Frame]:
     config = DatasetConfig(detect=kind, nav=kind, terrain=terrain, render=RenderConfig(samples=2, exr=True))
     scene = grow_scene(config, view_envelope(CAMERA, config.detect.flight), 3)
     caster, found = Caster(scene), []
+    # Here, since tests of the other engine import this module where Blender is not installed.
+    from perilune_render.engines.blender.renderer import Renderer
+
     with (
         tempfile.TemporaryDirectory() as folder,
         Renderer(scene, config, CAMERA, sun_direction(60, 30)) as renderer,

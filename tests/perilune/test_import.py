@@ -71,5 +71,5 @@ def test_the_package_requires_its_parts_in_its_own_version():
     assert version == perilune_shared.__version__
     assert project["dependencies"] == [f"perilune-shared=={version}"]
     extras = project["optional-dependencies"]
-    assert set(extras) == {"render", "train", "all"}
+    assert set(extras) == {"render", "blender", "train", "all"}
     assert all(each.endswith(f"=={version}") for names in extras.values() for each in names)

@@ -20,6 +20,7 @@ from perilune_render.cli.options import (
     Unit,
     resolved_config,
     warn_of_size,
+    was_given,
     with_unit,
 )
 from perilune_render.cli.sun import warn_of_suns
@@ -139,7 +140,7 @@ def dataset(
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
     how = How.of(executor, address, workers, threads, shard, finish, dry_run)
     if manifest is not None:
-        given = [name for name in ("preset", "config", "setting", "height_unit", "kind") if _was_given(context, name)]
+        given = [name for name in ("preset", "config", "setting", "height_unit", "kind") if was_given(context, name)]
         _render_manifest(manifest, out, dem, catalogue, given, how)
         return
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
@@ -254,11 +255,6 @@ def _executor(how: How, early: "Worker | None") -> "MakeExecutor":
     from perilune_render.jobs.local import LocalWorkers
 
     return partial(LocalWorkers, n_workers=how.workers or 1, early=early)
-
-
-def _was_given(context: typer.Context, name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
 
 
 def _render_manifest(

@@ -23,6 +23,7 @@ from perilune_render.cli.options import (
     one_kind,
     resolved_config,
     warn_of_size,
+    was_given,
     with_unit,
 )
 from perilune_render.cli.serve import serve
@@ -87,6 +88,7 @@ def develop(
 
 @app.command()
 def plan(
+    context: typer.Context,
     out: Annotated[str, typer.Option(help="New folder or address of the manifest.")],
     preset: Preset = "small",
     config: Config = None,
@@ -95,16 +97,31 @@ def plan(
     height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
+    manifest: Annotated[
+        str | None,
+        typer.Option(
+            help="Manifest whose table `frames` was left out, as in `data_manifests`: write it with this table, drawn "
+            "again by its recipe."
+        ),
+    ] = None,
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
-    resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
-    if kind != "nav":
-        warn_of_size(resolved)
-    warn_of_suns(resolved, (one_kind(kind),))
-    from perilune_render.dataset.manifest_only import write_manifest_only
+    from perilune_render.dataset.manifest_only import write_left_out_frames, write_manifest_only
 
-    with progress_bar() as progress:
-        write_manifest_only(resolved, one_kind(kind), preset, out, progress)
+    if manifest is not None:
+        options = ("preset", "config", "setting", "dem", "height_unit", "catalogue", "kind")
+        given = [name.replace("_", "-").replace("setting", "set") for name in options if was_given(context, name)]
+        if given:
+            raise UserError("--manifest", "options", f"--{given[0]}", "--out alone: the rest comes from the manifest")
+        with progress_bar() as progress:
+            write_left_out_frames(ps.open_dataset(manifest), out, progress)
+    else:
+        resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
+        if kind != "nav":
+            warn_of_size(resolved)
+        warn_of_suns(resolved, (one_kind(kind),))
+        with progress_bar() as progress:
+            write_manifest_only(resolved, one_kind(kind), preset, out, progress)
     counts = ps.open_dataset(out).info.counts
     answer(f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned")
 

@@ -39,6 +39,12 @@ Catalogue = Annotated[
 ]
 
 
+def was_given(context: typer.Context, name: str) -> bool:
+    """Whether an option was given on the command line."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def first_kind(kind: KindChoice) -> Kind:
     """The kind itself; `detect` for `both`."""
     return "detect" if kind == "both" else kind

@@ -11,14 +11,12 @@ from perilune_render.flight.rig import MountedCamera
 from perilune_render.provenance.versions import all_versions
 from perilune_shared.dataset.info_file import INFO_NAME, info_bytes
 from perilune_shared.dataset.manifest import Dataset, open_dataset
-from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
+from perilune_shared.dataset.metadata import NOT_STATED, CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
 from perilune_shared.dataset.schema import SCHEMA_VERSION
 from perilune_shared.errors import UserError
 from perilune_shared.storage.claims import claimed
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE, locked
 from perilune_shared.storage.store import Store
-
-LICENCE = "CC-BY-4.0"
 
 
 def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
@@ -45,7 +43,7 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
         exr_cameras=named(1) if len(plan.rig) > 1 and config.render.exr else None,
         recipes=recipes_of(recipe),
         counts=Counts(),
-        licence=LICENCE,
+        licence=NOT_STATED,
     )
 
 

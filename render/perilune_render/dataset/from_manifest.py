@@ -127,6 +127,9 @@ class Recorded(Sequence[TrajectoryPlan]):
         names, of_frames = (
             pc.binary_join_element_wise(*(table[key] for key in keys), "/") for table in (trajectories, frames)
         )
+        if trajectories.num_rows and not frames.num_rows:
+            expected = "its frames: write the whole manifest with `perilune-render plan --manifest ... --out FOLDER`"
+            raise UserError(manifest.store.at("manifest/frames"), "frames", "none: they were left out", expected)
         place = pc.fill_null(pc.index_in(of_frames, names), -1).to_numpy()
         order = np.lexsort((frames["frame_index"].to_numpy(), place))[np.count_nonzero(place < 0) :]
         first = np.concatenate([[0], np.cumsum(np.bincount(place[order], minlength=len(names)))])

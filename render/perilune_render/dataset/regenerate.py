@@ -30,6 +30,7 @@ from perilune_render.imaging.exr import local_exr, read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.provenance.recipe import config_of, same_source, settings_of
+from perilune_render.provenance.versions import check_installed
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.interrupts import interrupts_held
@@ -140,6 +141,7 @@ def _of_scene(
         if rig[row["camera"]].camera != dataset.camera_of(row):
             found = dataset.camera_of(row)
             raise UserError(where, "camera", found, f"that of its recipe, {rig[row['camera']].camera}")
+    check_installed(ground_config.render.engine)
     with interrupts_held():
         ground = cached_scene(ground_config, view, scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):

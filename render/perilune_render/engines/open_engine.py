@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.engines.frame_source import Engine
+from perilune_render.provenance.versions import check_installed
 from perilune_render.terrain.scene import Scene
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.threads import usable_cores
@@ -21,14 +23,20 @@ def open_engine(
     """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L; use it as a context manager.
 
     The engine `heightfield` builds the surface of the scene unless it is given.
-    Raises UserError if the engine does not render what the configuration asks for.
+    Raises UserError if the engine cannot be loaded or does not render what the configuration asks for.
     """
     if config.render.engine == "heightfield":
         from perilune_render.engines.heightfield.engine import HeightfieldEngine
 
         return HeightfieldEngine(scene, config, camera, sun, config.render.threads or usable_cores(), surface)
-    # Importing Blender takes a second, and only this engine needs it.
-    from perilune_render.engines.blender.renderer import Renderer
+    check_installed(config.render.engine)
+    try:
+        # Importing Blender takes a second, and only this engine needs it.
+        from perilune_render.engines.blender.renderer import Renderer
+    except ImportError as error:
+        # The module is there, so one of the system's libraries is missing.
+        expected = "the X11 libraries that Blender needs; `scripts/system-libraries` lists them"
+        raise UserError("configuration", "dataset.render.engine", f"cycles ({error})", expected) from None
 
     return Renderer(scene, config, camera, sun)
 

@@ -19,6 +19,7 @@ from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.preview.map_picture import map_picture
 from perilune_render.preview.site_horizon import shadow_warnings, site_horizon_of
 from perilune_render.preview.site_map import LARGEST_WIDTH, site_map
+from perilune_render.provenance.versions import check_installed
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import ElevationModel
 from perilune_render.terrain.scene import Scene, check_ground, model_of
@@ -36,8 +37,9 @@ def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, 
 
     Beneath each camera's frames are the same frames with labels and, if there is one, the outline of the elevation
     model. The map shows the trajectories over this ground. Prints a warning for each Sun that leaves the site in
-    shadow. Raises UserError, at `where`, if poses do not fit the ground.
+    shadow. Raises UserError if the engine is not installed, and at `where` if poses do not fit the ground.
     """
+    check_installed(config.render.engine)
     scene_plan = plan.scenes[0]
     trajectories = [next(t for t in plan.of_scene(scene_plan.scene_id) if t.camera == name) for name in plan.rig]
     check_ground(config, plan.view)

@@ -1,12 +1,14 @@
 """Versions of the code behind ground, rendering and images: hashes of perilune's code, version numbers of libraries."""
 
 import functools
+import importlib.util
 from importlib import metadata
 
 import perilune_render
 import perilune_shared
 from perilune_render.provenance import processor
 from perilune_render.provenance.caches import kept_fingerprint
+from perilune_shared.errors import UserError
 
 _SETTINGS = "perilune_render.provenance.processor:SETTINGS"
 GROUND = (
@@ -58,9 +60,21 @@ def imaging_versions() -> dict[str, str]:
 
 
 def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = False) -> dict[str, str]:
-    """Versions of everything that determines a frame of an engine, its labels and the `outputs` beside it."""
+    """Versions of everything that determines a frame of an engine, its labels and the `outputs` beside it.
+
+    Raises UserError if the engine is not installed.
+    """
+    check_installed(engine)
     names = ("generator", "rays" if engine == "heightfield" else "renderer", "imaging")
     return _versions((*names, "outputs") if outputs else names, with_dem or outputs)
+
+
+def check_installed(engine: str) -> None:
+    """Raise UserError for the engine `cycles` without Blender's module, which no other engine needs."""
+    if engine == "cycles" and importlib.util.find_spec("bpy") is None:
+        found = "cycles, without Blender's module bpy"
+        expected = "heightfield, or on Python 3.11 `pip install 'perilune-render[blender]'`"
+        raise UserError("configuration", "dataset.render.engine", found, expected)
 
 
 @functools.cache

@@ -20,6 +20,7 @@ from perilune_render.flight.view import horizon_envelope, scene_view, view_envel
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.poses.plan import scene_seed
+from perilune_render.provenance.versions import check_installed
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.scene import Scene, check_ground
@@ -167,7 +168,11 @@ def open_world(config: DatasetConfig) -> World:
 
 
 def world_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> World:
-    """The world of a configuration over the ground of a seed, made for given views."""
+    """The world of a configuration over the ground of a seed, made for given views.
+
+    Raises UserError if the engine is not installed or the ground is too large.
+    """
+    check_installed(config.render.engine)
     if config.render.engine == "cycles":
         # No mesh in levels, which hold only the ground of one descent: a ground that is too large is refused.
         view = replace(view, seen=None)

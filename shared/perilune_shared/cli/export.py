@@ -102,12 +102,20 @@ def card(
         str | None,
         typer.Option(help="Path or address of the Markdown file; by default README.md in the dataset."),
     ] = None,
+    licence: Annotated[
+        str | None,
+        typer.Option(
+            help="Licence under which you publish the dataset, as an SPDX expression such as CC-BY-4.0. A card in the "
+            "dataset also writes it into dataset.json, for exports and merges. [default: the one in dataset.json, "
+            "which is not stated for datasets that you render]"
+        ),
+    ] = None,
 ) -> None:
     """Write a dataset card: counts, histograms, labelled frames, licence and the command to reproduce the data."""
     from perilune_shared.export.card import write_card
 
     with progress_bar() as progress:
-        page, picture = write_card(ps.open_dataset(dataset), out, progress)
+        page, picture = write_card(ps.open_dataset(dataset), out, progress, licence)
     _say(f"{page}, {picture}: written")
 
 

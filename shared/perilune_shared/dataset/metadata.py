@@ -21,6 +21,8 @@ from perilune_shared.dataset.names import CAMERA_PATTERN, ImageState, Kind, Spli
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array
 
+NOT_STATED = "LicenseRef-not-stated"
+"""Licence of a dataset whose maker has stated none. Joined with others it stays in the expression."""
 LARGEST_IMAGE_PX = 2**27
 """Largest image that is decompressed, pixels."""
 _LARGEST_INDEX_BYTES = 2**30
@@ -196,7 +198,7 @@ class DatasetInfo(_Info):
     counts: Counts
     """Number of rows of each table; set when the dataset is complete."""
     licence: Annotated[str, Field(pattern=r"^[A-Za-z0-9(][A-Za-z0-9 ._+:()-]{0,499}$")]
-    """Licence of the dataset, as an SPDX expression."""
+    """Licence of the dataset, as an SPDX expression; `NOT_STATED` until its maker states one."""
     index: tuple[IndexPart, ...] = ()
     """Parts of the index, which names all other files; none while the dataset is not complete."""
 

@@ -88,8 +88,12 @@ def check_index(dataset: Dataset, targets: Iterable[Target], progress: Progress 
     return info
 
 
-def add_files(dataset: Dataset, contents: Mapping[Target, bytes], info: DatasetInfo | None) -> None:
+def add_files(
+    dataset: Dataset, contents: Mapping[Target, bytes], info: DatasetInfo | None, licence: str | None = None
+) -> None:
     """Write files atomically, and the index unless `info`, the result of `check_index`, is None.
+
+    With the index, `licence` becomes that of the dataset.
 
     If the process is killed, `validate` finds the old dataset, the new one, or files that are not in the index; the
     next call adds or removes these. Two calls at the same time exclude each other in a local folder only. Raises
@@ -115,6 +119,7 @@ def add_files(dataset: Dataset, contents: Mapping[Target, bytes], info: DatasetI
         added = {target.name: content for target, content in contents.items() if target.name in own}
         added |= {name: store.read(name, most_bytes=_LARGEST_BYTES) for name in extra}
         written = index_rows(Written.of(name, content) for name, content in added.items())
+        info = info if licence is None else info.model_copy(update={"licence": licence})
         seal(store, info, pa.concat_tables([others, written]))
 
 

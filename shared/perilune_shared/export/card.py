@@ -16,7 +16,8 @@ from perilune_shared.console.progress import Progress
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo, Recipe
+from perilune_shared.dataset.metadata import NOT_STATED, CameraRecord, DatasetInfo, Recipe
+from perilune_shared.editing.licence import joined_licence
 from perilune_shared.errors import UserError
 from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.card_head import head_of, table_configs
@@ -39,12 +40,18 @@ _IMAGES = {
 }
 
 
-def write_card(dataset: Dataset, out: str | os.PathLike[str] | None, progress: Progress) -> tuple[str, str]:
+def write_card(
+    dataset: Dataset, out: str | os.PathLike[str] | None, progress: Progress, licence: str | None = None
+) -> tuple[str, str]:
     """Write the page and the picture beside it, and update the dataset's index; return their paths or addresses.
 
-    `out` is by default README.md in the dataset. Raises UserError if a file that is not a card would be overwritten,
-    the dataset has no frames or it differs from its index.
+    `out` is by default README.md in the dataset. `licence`, an SPDX expression, replaces the dataset's: on the page,
+    and in dataset.json if the page is in the dataset. Raises UserError if a file that is not a card would be
+    overwritten, the dataset has no frames or differs from its index, or the licence is not an SPDX expression.
     """
+    if licence is not None:
+        licence = joined_licence([("--licence", licence)])
+        dataset = Dataset(dataset.store, dataset.info.model_copy(update={"licence": licence}))
     page = Target.of(dataset, out, CARD_NAME)
     if not page.name.endswith(".md"):
         raise UserError(page.address, "--out", page.name, "a name that ends in .md")
@@ -60,7 +67,7 @@ def write_card(dataset: Dataset, out: str | os.PathLike[str] | None, progress: P
     # Build the page first: this checks the keys and is much faster than drawing.
     text = card_of(dataset, gathered, picture.name).encode()
     # The page first: it marks the picture as one that may be overwritten.
-    add_files(dataset, {page: text, picture: draw(dataset, gathered)}, info)
+    add_files(dataset, {page: text, picture: draw(dataset, gathered)}, info, licence)
     return page.address, picture.address
 
 
@@ -83,11 +90,18 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
         "## Files\n\n" + _files(dataset),
         "## Reproduction\n\n" + "\n\n".join(_remake(key, recipe) for key, recipe in info.recipes.items()),
         "## History\n\n" + (_history(info) or "Not edited since rendering."),
-        f"## Licence\n\n{code_span(info.licence)}",
+        "## Licence\n\n" + _licence(info.licence),
         "## Citation\n\nThe hash identifies the tables, which contain the hashes of the frames.\n\n"
         f"```bibtex\n{citation_of(dataset)}\n```",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _licence(licence: str) -> str:
+    how = "To state one: `perilune-manifest card DATASET --licence CC-BY-4.0`, or another SPDX expression."
+    if licence == NOT_STATED:
+        return f"Not stated. {how}"
+    return code_span(licence) + (f"\n\nThe licence of a part is not stated. {how}" if NOT_STATED in licence else "")
 
 
 def _history(info: DatasetInfo) -> str:

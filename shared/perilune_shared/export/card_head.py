@@ -9,6 +9,7 @@ from typing import Any
 
 from perilune_shared.config.yaml_text import to_yaml_text
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import NOT_STATED
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import FOLDER, shards_of
 from perilune_shared.dataset.schema import TABLES
@@ -30,10 +31,8 @@ _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000
 def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
     """Return the YAML head: licence, name, tags, and the files of each split of each configuration."""
     info = dataset.info
-    single = info.licence in _HUB_LICENCES
-    licence = {"license": info.licence.lower()} if single else {"license": "other", "license_name": info.licence}
     head = {
-        **licence,
+        **_licence(info.licence),
         "pretty_name": info.name,
         "task_categories": [_TASKS[info.kind]],
         "tags": ["moon", "craters", "lunar-landing", "synthetic", "perilune"],
@@ -41,6 +40,15 @@ def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
         "configs": configs,
     }
     return "---\n" + to_yaml_text(head) + "---"
+
+
+def _licence(licence: str) -> dict[str, str]:
+    """Return the entries of a licence: by the hub's own name if it has one."""
+    if licence == NOT_STATED:
+        return {"license": "unknown"}
+    if licence in _HUB_LICENCES:
+        return {"license": licence.lower()}
+    return {"license": "other", "license_name": licence}
 
 
 def table_configs(dataset: Dataset) -> list[dict[str, Any]]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import NOT_STATED
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import (
     LABEL_MEASURES,
@@ -157,6 +158,8 @@ class _SplitFile:
         info = dataset.info
         self.n_annotations = self.n_chosen = 0
         self._dataset = dataset
+        # Which licence of the list an image has; no entry if none is stated.
+        self._licence = {"license": 1} if info.licence != NOT_STATED else {}
         self._images: list[dict[str, Any]] = []
         head = {
             "info": {
@@ -164,7 +167,7 @@ class _SplitFile:
                 "version": info.schema_version,
                 "ellipse": "cx_px, cy_px, a_px, b_px, theta_rad; not clipped, unlike bbox and segmentation",
             },
-            "licenses": [{"id": 1, "name": info.licence, "url": ""}],
+            "licenses": [{"id": 1, "name": info.licence, "url": ""}] if self._licence else [],
             "categories": [CATEGORY],
         }
         self._stream = path.open("w", encoding="utf-8")
@@ -181,7 +184,7 @@ class _SplitFile:
                     "file_name": row["png_path"],
                     "width": row["width_px"],
                     "height": row["height_px"],
-                    "license": 1,
+                    **self._licence,
                     "frame_id": row["frame_id"],
                 }
             )

@@ -18,6 +18,7 @@ import pyarrow as pa
 from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import NOT_STATED
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, OPTIONAL_TABLES, TABLES
 from perilune_shared.errors import UserError
@@ -150,7 +151,7 @@ def metadata_of(dataset: Dataset) -> dict[str, Any]:
         "conformsTo": "http://mlcommons.org/croissant/1.1",
         "name": info.name,
         "description": _description(dataset),
-        "license": _licence(info.licence),
+        **_licence(info.licence),
         # Datasets have no version number: use the number of edits since rendering.
         "version": f"1.0.{len(info.history)}",
         "citeAs": citation_of(dataset),
@@ -169,9 +170,12 @@ def _description(dataset: Dataset) -> str:
     )
 
 
-def _licence(expression: str) -> str:
-    """Return the SPDX page of a single licence, or the expression itself for several."""
-    return f"https://spdx.org/licenses/{expression}.html" if " " not in expression else expression
+def _licence(expression: str) -> dict[str, str]:
+    """Return the entry of a licence: SPDX's page of a single one, otherwise the expression; none if not stated."""
+    if expression == NOT_STATED:
+        return {}
+    listed = " " not in expression and not expression.startswith("LicenseRef-")
+    return {"license": f"https://spdx.org/licenses/{expression}.html" if listed else expression}
 
 
 def _distribution(dataset: Dataset, table: str, hashes: Mapping[str, str]) -> dict[str, Any]:

@@ -49,9 +49,28 @@ def test_datasets_are_developed_without_blender(tiny, tmp_path):
     assert new.table("frames")["png_sha256"].equals(old.table("frames")["png_sha256"])
 
 
-def test_rendering_without_blender_says_what_is_missing(tmp_path):
-    done = run("preview", "--preset", "tiny", "--out", tmp_path / "a.png")
-    assert done.returncode != 0 and "bpy cannot be loaded" in done.stderr and not (tmp_path / "a.png").exists()
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("preview", "--preset", "tiny", "--out", "{out}/a.png"),
+        ("dataset", "--preset", "tiny", "--out", "{out}/a"),
+        ("serve", "--preset", "tiny", "--engine", "cycles"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_rendering_by_cycles_without_blender_says_what_is_missing(command, tmp_path):
+    done = run(*(word.format(out=tmp_path) for word in command))
+    assert done.returncode == 2 and list(tmp_path.iterdir()) == []
+    (line,) = [text for text in done.stderr.splitlines() if text.startswith("error: ")]
+    found = "got cycles, without Blender's module bpy, expected heightfield, or on Python 3.11"
+    assert line == f"error: configuration: dataset.render.engine: {found} `pip install 'perilune-render[blender]'`"
+
+
+def test_the_other_engine_renders_without_blender(tmp_path):
+    small = ("--set", "dataset.terrain.spacing_px=2.0", "--set", "dataset.render.engine=heightfield")
+    done = run("preview", "--preset", "tiny", *small, "--out", tmp_path / "a.png")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_a_preview_is_a_png(tmp_path):

@@ -22,8 +22,10 @@ from tests.helpers.drawn_dataset import build_dataset, seal
 from typer.testing import CliRunner
 
 from perilune_shared.cli.main import app
+from perilune_shared.console.progress import NO_PROGRESS
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import NOT_STATED
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
@@ -99,6 +101,43 @@ def test_writing_the_card_again_changes_nothing(card):
     before = {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()}
     card_files(card)
     assert {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()} == before
+
+
+@pytest.fixture
+def of_nobody(little, tmp_path):
+    """A dataset as the renderer leaves it: without a licence."""
+    root = Path(shutil.copytree(little, tmp_path / "mine"))
+    info = open_dataset(root).info
+    write_info(open_dataset(root).store, info.model_copy(update={"licence": NOT_STATED}))
+    assert validate(open_dataset(root)) == []
+    return root
+
+
+def test_a_licence_is_stated_by_whoever_publishes(of_nobody):
+    done = CliRunner().invoke(app, ["card", str(of_nobody)])
+    assert done.exit_code == 0, done.output
+    page = (of_nobody / "README.md").read_text()
+    assert "## Licence\n\nNot stated. To state one:" in page and NOT_STATED not in page
+    assert DatasetCard.load(of_nobody / "README.md").data.license == "unknown"
+    done = CliRunner().invoke(app, ["card", str(of_nobody), "--licence", "CC-BY-4.0"])
+    assert done.exit_code == 0, done.output
+    dataset = open_dataset(of_nobody)
+    assert dataset.info.licence == "CC-BY-4.0" and validate(dataset) == []
+    assert "## Licence\n\n`CC-BY-4.0`\n" in (of_nobody / "README.md").read_text()
+    CliRunner().invoke(app, ["card", str(of_nobody)])
+    assert open_dataset(of_nobody).info.licence == "CC-BY-4.0", "a card without the option keeps it"
+
+
+def test_a_card_elsewhere_leaves_the_dataset_as_it_is(of_nobody, tmp_path):
+    done = CliRunner().invoke(app, ["card", str(of_nobody), "--licence", "MIT", "--out", str(tmp_path / "card.md")])
+    assert done.exit_code == 0, done.output
+    assert "`MIT`" in (tmp_path / "card.md").read_text() and open_dataset(of_nobody).info.licence == NOT_STATED
+
+
+def test_a_licence_that_spdx_does_not_know_is_refused(of_nobody):
+    with pytest.raises(UserError, match=r"--licence: licence: got Mine, expected an SPDX licence expression"):
+        write_card(open_dataset(of_nobody), None, NO_PROGRESS, "Mine")
+    assert not (of_nobody / "README.md").exists()
 
 
 def test_the_page_warns_of_terrain_in_two_splits(tmp_path):

@@ -46,6 +46,20 @@ def test_vectors_and_buffers_keep_their_precision(network, tmp_path, write):
     assert all(again[key].dtype == value.dtype for key, value in network.state_dict().items())
 
 
+@pytest.mark.parametrize("write, bytes_per_weight", [(write_half, 2), (write_bytewise, 1)])
+def test_matrices_of_an_lstm_are_rounded_too(tmp_path, write, bytes_per_weight):
+    lstm = torch.nn.Module()
+    lstm.recurrent = torch.nn.LSTM(32, 64, num_layers=2)
+    state = lstm.state_dict()
+    write(tmp_path / "weights.safetensors", {"architecture": ARCHITECTURE, "state_dict": state})
+    stored = load_file(tmp_path / "weights.safetensors")
+    matrices = [key for key, value in state.items() if value.ndim == 2]
+    assert len(matrices) == 4 and all(stored[key].element_size() == bytes_per_weight for key in matrices)
+    assert all(torch.equal(stored[key], state[key]) for key in state if key not in matrices)
+    again = load_weights(tmp_path / "weights.safetensors")["state_dict"]
+    assert all(torch.allclose(again[key], state[key], atol=0.001) for key in state)
+
+
 def test_a_folder_with_weights_is_a_run(tmp_path):
     assert RunFolder(tmp_path).best.name == "best.ckpt"
     (tmp_path / "weights.safetensors").write_bytes(b"")

@@ -59,7 +59,8 @@ def write_bytewise(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _is_rounded(name: str, tensor: torch.Tensor) -> bool:
-    return name.endswith(".weight") and tensor.ndim >= 2
+    # torch names the matrices of an LSTM weight_ih_l0, weight_hh_l0 and so on.
+    return tensor.ndim >= 2 and name.rpartition(".")[2].startswith("weight")
 
 
 def _write(path: Path, tensors: dict[str, torch.Tensor], content: Mapping[str, Any]) -> None:

@@ -29,11 +29,5 @@ def _one_core() -> Iterator[None]:
                 os.sched_setaffinity(int(thread.name), cores)
 
 
-try:
-    with _one_core():
-        import bpy  # noqa: F401
-except ImportError as error:
-    raise ImportError(
-        f"bpy cannot be loaded ({error}). It needs Python 3.11 (`pip install bpy==4.5.15`) and the system's X11 "
-        "libraries; `make setup` checks for both and says which are missing."
-    ) from error
+with _one_core():
+    import bpy  # noqa: F401

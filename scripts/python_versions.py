@@ -1,0 +1,70 @@
+"""Write what a Python version needs, and check what pip resolved for it. Used by scripts/test-resolves.
+
+    python scripts/python_versions.py write 3.13 FOLDER    # requirements.txt of all packages, constraints.txt of pins
+    python scripts/python_versions.py check 3.13 FOLDER    # report.json of pip
+
+pip compares markers such as `python_version < "3.12"`, and the Python that a package requires, with the Python that
+runs it, also where it resolves for another one. So both are compared here.
+"""
+
+import json
+import sys
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("shared", "render", "train", "perilune")
+ONLY_ON = {"bpy": "3.11"}
+"""Dependencies of extras that exist for one Python version."""
+
+
+def requirements_of(version: str) -> list[str]:
+    """Requirements of all packages with all their extras, without those on each other, for a Python version."""
+    found = set()
+    for package in PACKAGES:
+        project = tomllib.loads((ROOT / package / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        groups = {"": project["dependencies"], **project.get("optional-dependencies", {})}
+        for group in groups.values():
+            if any(ONLY_ON.get(Requirement(each).name, version) != version for each in group):
+                continue
+            found |= {each for each in group if not each.startswith("perilune-")}
+    return sorted(found)
+
+
+def constraints_of(version: str) -> list[str]:
+    """Lines of constraints.txt that hold for a Python version, without their markers."""
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = [Requirement(line.partition("#")[0].strip()) for line in lines if line.partition("#")[0].strip()]
+    environment = {"python_version": version, "python_full_version": f"{version}.0"}
+    return [f"{pin.name}{pin.specifier}" for pin in pins if pin.marker is None or pin.marker.evaluate(environment)]
+
+
+def write(version: str, folder: Path) -> None:
+    """Write both files."""
+    for name, lines in (("requirements", requirements_of(version)), ("constraints", constraints_of(version))):
+        (folder / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+
+
+def check(version: str, folder: Path) -> None:
+    """Print how many packages pip resolved; end with an error if one is not for this Python."""
+    packages = json.loads((folder / "report.json").read_text(encoding="utf-8"))["install"]
+    refused = unfit([package["metadata"] for package in packages], version)
+    if refused:
+        sys.exit(f"Python {version}: {', '.join(refused)}")
+    print(f"Python {version}: {len(packages)} packages resolved")
+
+
+def unfit(packages: list[dict[str, str]], version: str) -> list[str]:
+    """Packages, by their metadata, that require another Python than a version."""
+    return [
+        f"{each['name']} {each['version']} requires Python {each['requires_python']}"
+        for each in packages
+        if not SpecifierSet(each.get("requires_python") or "").contains(f"{version}.0")
+    ]
+
+
+if __name__ == "__main__":
+    {"write": write, "check": check}[sys.argv[1]](sys.argv[2], Path(sys.argv[3]))
