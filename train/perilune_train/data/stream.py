@@ -6,7 +6,7 @@ Use:
     for epoch in range(10):
         stream.set_epoch(epoch)
         for batch in stream_loader(stream, workers=2):
-            ...  # a list of StreamedFrame, or what `make` returns
+            ...  # a list of StreamedFrame, or what `stream.make` returns
             state = stream.state_dict()  # load_state_dict(state) continues after this batch
 
 Everything is a function of seed, epoch, and the numbers of processes and workers: the row groups of all shards are
@@ -35,6 +35,7 @@ from perilune_shared.dataset.packed import SHARDS, open_shard, shard_name
 from perilune_shared.dataset.parts import Part
 from perilune_shared.errors import UserError
 from perilune_train.data.epochs import one_thread
+from perilune_train.data.shares import ALONE, Share
 
 _GROUPS_PER_WINDOW = 8
 _MAX_OPEN_SHARDS = 16
@@ -57,6 +58,20 @@ class StreamedFrame:
     """Content of the PNG file."""
     labels: pa.StructArray
     """The frame's rows of the table labels, without the columns that `row` has."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameContent:
+    """What a stream reads of each frame."""
+
+    columns: tuple[str, ...] = COLUMNS
+    """Columns of the table frames."""
+    images: bool = True
+    """Whether to read the images; otherwise `StreamedFrame.png` is empty."""
+
+
+EVERYTHING = FrameContent()
+"""All columns and the images."""
 
 
 @dataclass(frozen=True)
@@ -93,32 +108,32 @@ class FrameStream(torch_data.IterableDataset):
         split: str,
         batch_size: int,
         seed: int,
-        process: int = 0,
-        processes: int = 1,
-        make: Callable[[list[StreamedFrame], int], Any] = _unchanged,
-        columns: tuple[str, ...] = COLUMNS,
-        images: bool = True,
+        share: Share = ALONE,
+        content: FrameContent = EVERYTHING,
     ):
         """Read the footers of the split's shards.
 
-        `make` converts a batch of an epoch in the worker that reads it. `columns` of the table frames are read; without
-        `images` the PNGs are empty. Raises UserError if a shard is missing or damaged, or if
-        there are fewer frames than processes.
+        `share` selects the frames of this process. Raises UserError if a shard is missing or damaged, or if there are
+        fewer frames than processes.
         """
         self.dataset, self.split, self.batch_size, self.seed = dataset, split, batch_size, seed
-        self.process, self.processes, self.make, self.columns = process, processes, make, columns
-        self._nested = _NESTED if images else _NESTED[1:]
+        self.share, self.columns = share, content.columns
+        self.make = _unchanged
+        self._nested = _NESTED if content.images else _NESTED[1:]
         self.epoch = self.batches = self.workers = 0
         # Epoch and first batch of the current iteration, for workers, which live longer than an epoch.
         self._begun = torch.zeros(2, dtype=torch.int64).share_memory_()
         self._groups = _groups_of(dataset, split)
         self.n_frames = int(self._groups.n_frames.sum())
-        if self.n_frames < processes:
-            expected = f"at least {processes}, one for each process"
+        if self.n_frames < share.processes:
+            expected = f"at least {share.processes}, one for each process"
             raise UserError(dataset.store, f"{split} frames", self.n_frames, expected)
 
+    make: Callable[[list[StreamedFrame], int], Any]
+    """Converts the frames of a batch, given the epoch, in the worker that reads them."""
+
     def __len__(self) -> int:
-        return -(-(self.n_frames // self.processes) // self.batch_size)
+        return -(-(self.n_frames // self.share.processes) // self.batch_size)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch of the next iteration. If it is another one, iteration starts at its first batch."""
@@ -138,7 +153,7 @@ class FrameStream(torch_data.IterableDataset):
         self.epoch, self.batches = state["epoch"], state["batches"]
 
     def _settings(self) -> dict[str, int]:
-        values = (self.batch_size, self.seed, self.processes, self.workers, self.n_frames)
+        values = (self.batch_size, self.seed, self.share.processes, self.workers, self.n_frames)
         return dict(zip(_STATE, values, strict=True))
 
     def __iter__(self) -> Iterator[Any]:
@@ -160,7 +175,8 @@ class FrameStream(torch_data.IterableDataset):
 
     def _batches(self, lane: int, lanes: int) -> Iterator[Any]:
         """Yield batches lane, lane + lanes, ... of this process, without those before `batches`."""
-        start, stop = (self.n_frames * place // self.processes for place in (self.process, self.process + 1))
+        share = self.share
+        start, stop = (self.n_frames * rank // share.processes for rank in (share.process, share.process + 1))
         sizes = np.full(len(self), self.batch_size)
         sizes[-1] = stop - start - sizes[:-1].sum()
         start += sum(int(sizes[before::lanes].sum()) for before in range(lane))

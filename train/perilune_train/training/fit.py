@@ -5,6 +5,7 @@ import math
 import os
 import time
 import warnings
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import lightning
@@ -227,45 +228,78 @@ def own_share(devices: int, num_nodes: int) -> Share:
     return Share(int(rank_zero_only.rank), math.prod(machines(devices, num_nodes)))
 
 
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Length of a training, its steps, and when it validates and saves."""
+
+    epochs: int
+    """Number of epochs."""
+    monitor: str
+    """Validation metric that selects the best weights."""
+    mode: Literal["min", "max"]
+    """Whether a smaller or a larger value of this metric is better."""
+    validate_every: int = 1
+    """Epochs from one validation to the next."""
+    checkpoint_minutes: float | None = None
+    """Minutes between saved states within an epoch; None to save after validations only."""
+    accumulate: int = 1
+    """Batches whose gradients are summed for one step."""
+    gradient_clip: float = 10.0
+    """Largest norm of the gradient of a step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hardware:
+    """Devices and processes of a training."""
+
+    device: str = "auto"
+    """auto, cuda or cpu."""
+    devices: int = 1
+    """Processes on each machine; torchrun's environment overrides it."""
+    num_nodes: int = 1
+    """Machines; torchrun's environment overrides it."""
+    strategy: str = "auto"
+    """Lightning's strategy for several processes."""
+    precision: Precision = "auto"
+    """Floating-point format of the computation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wording:
+    """Names in the messages of a training."""
+
+    progress: str
+    """Label of the progress bar."""
+    learning_rate: str = "the learning rate"
+    """The setting to lower if the loss diverges."""
+
+
 def fit(
     run: RunFolder,
     task: lightning.LightningModule,
-    *,
-    label: str,
-    epochs: int,
-    monitor: str,
-    mode: Literal["min", "max"],
+    schedule: Schedule,
+    hardware: Hardware,
+    wording: Wording,
     resume: bool = False,
-    gradient_clip: float = 10.0,
-    precision: Precision = "auto",
-    device: str = "auto",
-    devices: int = 1,
-    num_nodes: int = 1,
-    strategy: str = "auto",
-    checkpoint_minutes: float | None = None,
-    accumulate: int = 1,
-    validate_every: int = 1,
-    learning_rate: str = "the learning rate",
 ) -> float:
     """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
     Returns the training time in seconds, including the time before a resume.
 
-    A step sums the gradients of `accumulate` batches. Validation follows every `validate_every` epochs.
-
-    The task provides its own loaders, once; a batch sampler with an attribute `sampler` is told each epoch by
-    `set_epoch` (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several
-    processes, each loader provides the batches of its own process. The task logs `monitor` in validation, and has
+    The task provides its own loaders, once. Each epoch calls `set_epoch` of the attribute `sampler` of a batch sampler
+    (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several processes, each
+    loader provides the batches of its own process. The task logs `schedule.monitor` in validation, and has
     `architecture` and `evaluated` (see KeepBest).
 
     With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
-    uninterrupted run. The state is saved after every epoch, and with `checkpoint_minutes` within epochs too; then the
-    task's training batches must continue at the position of the checkpoint. Raises UserError if last.ckpt is damaged,
-    of another network or of another number of processes, if the rank of this process was unknown before, or if the loss
-    diverges; `learning_rate` names the setting to lower then.
+    uninterrupted run. The state is saved after every validation. With `schedule.checkpoint_minutes` it is also saved
+    within epochs; the task's training batches must then continue at the position of the checkpoint.
+
+    Raises UserError if last.ckpt is damaged, of another network or of another number of processes, if Lightning gives
+    this process another rank than the environment states, or if the loss diverges.
     """
-    share = own_share(devices, num_nodes)
-    devices, num_nodes = machines(devices, num_nodes)
+    share = own_share(hardware.devices, hardware.num_nodes)
+    devices, num_nodes = machines(hardware.devices, hardware.num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
     if resume_from is not None:
         expected = "the state of an interrupted run; --overwrite replaces it"
@@ -275,8 +309,8 @@ def fit(
         if began != devices * num_nodes:
             expected = f"{began}, as in the existing run; --overwrite replaces the run"
             raise UserError(resume_from, "processes", devices * num_nodes, expected)
-    keep_last = KeepLast(run, checkpoint_minutes)
-    device = choose_device(device)
+    keep_last = KeepLast(run, schedule.checkpoint_minutes)
+    device = choose_device(hardware.device)
     # Several processes share the cores: Lightning gives each its part.
     threads = FewerThreadsIfCrowded(device == "cpu" and devices * num_nodes == 1)
     warn_if_crowded()
@@ -288,28 +322,28 @@ def fit(
         warnings.simplefilter("ignore")
         trainer = lightning.Trainer(
             default_root_dir=run.root,
-            max_epochs=epochs,
+            max_epochs=schedule.epochs,
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=devices,
             num_nodes=num_nodes,
-            strategy=strategy if devices * num_nodes > 1 else "auto",
+            strategy=hardware.strategy if devices * num_nodes > 1 else "auto",
             use_distributed_sampler=False,
-            precision="bf16-mixed" if choose_bf16(precision, device) else "32-true",
+            precision="bf16-mixed" if choose_bf16(hardware.precision, device) else "32-true",
             deterministic="warn",
-            gradient_clip_val=gradient_clip,
-            accumulate_grad_batches=accumulate,
+            gradient_clip_val=schedule.gradient_clip,
+            accumulate_grad_batches=schedule.accumulate,
             num_sanity_val_steps=0,
-            check_val_every_n_epoch=validate_every,
+            check_val_every_n_epoch=schedule.validate_every,
             logger=TensorBoardLogger(run.root, name="", version=""),
             log_every_n_steps=10,
             enable_progress_bar=False,
             enable_model_summary=False,
             enable_checkpointing=False,
             callbacks=[
-                *([Bar(label)] if is_first_process() else []),
+                *([Bar(wording.progress)] if is_first_process() else []),
                 LearningRateMonitor("step"),
-                StopDiverged(run, learning_rate),
-                KeepBest(run, monitor, mode),
+                StopDiverged(run, wording.learning_rate),
+                KeepBest(run, schedule.monitor, schedule.mode),
                 keep_last,
                 threads,
             ],

@@ -46,6 +46,18 @@ class FrameLabels:
     """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if none is."""
 
 
+@dataclass(frozen=True, slots=True)
+class LabelLimits:
+    """Which craters are labels, which of them are selected, and which craters are ignored."""
+
+    selection: Selection
+    """Thresholds of the selected labels."""
+    radius_px: tuple[float, float]
+    """Range of radii that are labelled and evaluated, pixels."""
+    zoom: tuple[float, float]
+    """Smallest and largest factor by which frames will be resized; it widens the range of ignored craters."""
+
+
 @dataclass(frozen=True)
 class SplitLabels(Sequence[FrameLabels]):
     """Labels of N frames; an item is a view of the arrays. Worker processes share the few arrays without copies."""
@@ -83,9 +95,7 @@ def read_split_labels(
     dataset: Dataset,
     table: pd.DataFrame,
     share: Share,
-    selection: Selection,
-    radius_px: tuple[float, float],
-    scale: tuple[float, float],
+    limits: LabelLimits,
 ) -> tuple[SplitLabels, Array]:
     """Labels and ignored craters of the share's frames, and sizes (S, 2) of the selected labels of all frames.
 
@@ -114,13 +124,13 @@ def read_split_labels(
             # Labels of another split have the place -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
             labels, bounds = labels.take(order), np.searchsorted(frame[order], [*places, places[-1] + 1])
-            own = _SceneLabels.of(labels, craters, selection)
+            own = _SceneLabels.of(labels, craters, limits.selection)
             sizes.append((own.shape[:, 2:4] - own.shape[:, :2])[own.selected])
             for place, start, stop in zip(places, bounds, bounds[1:], strict=False):
                 if place in own_places:
                     part, row = slice(start, stop), table.iloc[place].to_dict()
                     ids = own.crater_id[part]
-                    ignored = unlabelled_craters(craters, dataset.camera, row, radius_px, scale, ids)
+                    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, ids)
                     frames.add(own.shape[part], own.selected[part], own.depth_ratio[part], ignored)
     check.finish()
     return frames.joined(), np.concatenate(sizes)
@@ -131,9 +141,7 @@ def frame_labels(
     row: dict[str, Any],
     labels: pa.Table,
     craters: Craters,
-    selection: Selection,
-    radius_px: tuple[float, float],
-    scale: tuple[float, float],
+    limits: LabelLimits,
 ) -> FrameLabels:
     """Labels and ignored craters of one frame, given its row, its rows of the table labels and its scene's craters.
 
@@ -144,8 +152,8 @@ def frame_labels(
     if not known.all():
         found = f"{ids[known.argmin()]} in {row['frame_id']}"
         raise UserError(dataset.store, "labels: crater_id", found, "craters; see `perilune-manifest validate`")
-    own = _SceneLabels.of(labels, craters, selection)
-    ignored = unlabelled_craters(craters, dataset.camera, row, radius_px, scale, own.crater_id)
+    own = _SceneLabels.of(labels, craters, limits.selection)
+    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, own.crater_id)
     frames = _Joined()
     frames.add(own.shape, own.selected, own.depth_ratio, ignored)
     return frames.joined()[0]

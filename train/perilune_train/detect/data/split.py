@@ -13,7 +13,7 @@ from perilune_shared.labels.selection import label_bound_px
 from perilune_train.data.frames import FrameStore, frame_table, load_frames
 from perilune_train.data.shares import ALONE, Share
 from perilune_train.detect.config import COARSEST_STRIDE, LabelSettings
-from perilune_train.detect.data.labels import FrameLabels, read_split_labels
+from perilune_train.detect.data.labels import FrameLabels, LabelLimits, read_split_labels
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def load_split(
         raise UserError(dataset.store, f"{split} frames", len(table), expected)
     frames = load_frames(dataset, split, share, table)
     radius_px = evaluated_range(dataset, settings)
-    labels, sizes_px = read_split_labels(dataset, table, share, settings, radius_px, scale)
+    labels, sizes_px = read_split_labels(dataset, table, share, LabelLimits(settings, radius_px, scale))
     return DetectSplit(frames, labels, radius_px, sizes_px, len(table), share)
 
 

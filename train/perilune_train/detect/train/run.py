@@ -42,7 +42,7 @@ from perilune_train.records.provenance import check_terrain, protocol_of, traini
 from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
-from perilune_train.training.fit import fit, own_share
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit, own_share
 
 
 def run_detect(
@@ -105,24 +105,19 @@ def _run(
         say_page(anchor_report(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
     task.terrain = terrain.plain()
-    seconds = fit(
-        run,
-        task,
-        label="train detector",
+    schedule = Schedule(
         epochs=config.epochs,
         monitor="val/ap50_paper",
         mode="max",
-        resume=resume,
-        gradient_clip=config.gradient_clip,
-        precision=config.precision,
-        device=device,
-        devices=config.devices,
-        num_nodes=config.num_nodes,
-        strategy="ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy,
-        checkpoint_minutes=config.checkpoint_minutes,
         validate_every=config.validate_every,
-        learning_rate=f"detect.learning_rate, which is {config.learning_rate:g}",
+        checkpoint_minutes=config.checkpoint_minutes,
+        gradient_clip=config.gradient_clip,
     )
+    # Frozen weights have no gradient.
+    strategy = "ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy
+    hardware = Hardware(device, config.devices, config.num_nodes, strategy, config.precision)
+    wording = Wording("train detector", f"detect.learning_rate, which is {config.learning_rate:g}")
+    seconds = fit(run, task, schedule, hardware, wording, resume)
     if not runs.is_first_process():
         return run
     if share != ALONE:

@@ -33,7 +33,7 @@ from perilune_train.records.provenance import (
 )
 from perilune_train.shipped.models import weights_file
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
-from perilune_train.training.fit import fit, own_share
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit, own_share
 from perilune_train.training.runs import (
     RunFolder,
     check_architecture,
@@ -204,23 +204,22 @@ def _warp_task(
 def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
     """Train one network; returns the training time in seconds."""
     settings, own = task.settings, task.own
+    schedule = Schedule(
+        epochs=own.coarse_epochs + own.fine_epochs,
+        monitor="val/position_rmse_vector_m",
+        mode="min",
+        checkpoint_minutes=settings.checkpoint_minutes,
+        accumulate=own.accumulate,
+    )
+    hardware = Hardware(
+        device=choose_device(settings.device),
+        # In coarse epochs some weights have no gradient.
+        strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
+        precision=settings.precision,
+    )
+    rate = f"navigate.{task.fusion}.learning_rate, which is {own.learning_rate:g}"
     with closing(task):
-        return fit(
-            run,
-            task,
-            label=f"train {task.fusion}",
-            epochs=own.coarse_epochs + own.fine_epochs,
-            monitor="val/position_rmse_vector_m",
-            mode="min",
-            resume=resume,
-            precision=settings.precision,
-            device=choose_device(settings.device),
-            # In coarse epochs some weights have no gradient.
-            strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
-            checkpoint_minutes=settings.checkpoint_minutes,
-            accumulate=own.accumulate,
-            learning_rate=f"navigate.{task.fusion}.learning_rate, which is {own.learning_rate:g}",
-        )
+        return fit(run, task, schedule, hardware, Wording(f"train {task.fusion}", rate), resume)
 
 
 def _detector_backbone(
