@@ -15,7 +15,7 @@ from perilune_train.detect.data.frame_facts import facts_of, joined_facts
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.figures import draw_frames
-from perilune_train.detect.evaluate.matching import EDGE, Detections
+from perilune_train.detect.evaluate.matching import EDGE, Criteria, Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_split
@@ -99,10 +99,8 @@ def _evaluate(splits: dict[str, DetectSplit], found: dict[str, list[Detections]]
         [each for name in splits for each in found[name]],
         [each for split in splits.values() for each in split.labels],
         joined_facts({name: facts_of(split.frames) for name, split in splits.items()}),
-        threshold,
-        radius_px=next(iter(splits.values())).radius_px,
-        match_iou=MATCH_IOU,
-        seed=SEED,
+        Criteria(threshold, next(iter(splits.values())).radius_px, MATCH_IOU),
+        SEED,
     )
 
 

@@ -21,10 +21,10 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.run import explain_run
+from perilune_train.explain.run import NetworkOnData, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
-from perilune_train.training.runs import save_weights
+from perilune_train.training.runs import NamedRun, save_weights
 
 _STACK = {
     "fusion": "stack",
@@ -105,7 +105,8 @@ def test_masks_are_explained_on_datasets_at_an_address(networks, bucket, few, da
     checkpoint = networks[0] / "checkpoints"
     found = []
     for name, data in (("local", (few, dataset_nav)), ("remote", (f"{bucket}/detect", f"{bucket}/nav"))):
-        run = explain_run(settings, *data, checkpoint / "best.ckpt", networks[1], tmp_path, name)
+        given = (checkpoint / "best.ckpt", data[0]), (networks[1], data[1])
+        run = explain_run(settings, NamedRun(tmp_path, name), *(NetworkOnData(*network) for network in given))
         found.append(pd.read_parquet(run.root / "summary.parquet"))
     assert len(found[0]) > 0 and found[0].equals(found[1])
 

@@ -23,11 +23,11 @@ from perilune_train.explain.evidence.tables import TABLES
 from perilune_train.explain.inputs import labelled_frames
 from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.page.pictures import CAPTIONS
-from perilune_train.explain.run import explain_run
+from perilune_train.explain.run import NetworkOnData, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
 from perilune_train.shipped.models import shipped_run
-from perilune_train.training.runs import RunFolder, save_weights
+from perilune_train.training.runs import NamedRun, RunFolder, save_weights
 
 _BLOCKS = [f"B_{i + 1}{j + 1}" for i, count in enumerate((1, 2, 8, 8, 4)) for j in range(count)]
 _STACK = {
@@ -71,7 +71,12 @@ def _explain(checkpoints, dataset_detect, dataset_nav, folder, n_drawn=2, **opti
         occlusion_px=48,
         device="cpu",
     )
-    return explain_run(settings, dataset_detect, dataset_nav, *checkpoints, folder, "t", **options)
+    overwrite = options.pop("overwrite", False)
+    networks = [
+        None if checkpoint is None else NetworkOnData(checkpoint, dataset)
+        for checkpoint, dataset in zip(checkpoints, (dataset_detect, dataset_nav), strict=True)
+    ]
+    return explain_run(settings, NamedRun(folder, "t", overwrite), *networks, **options)
 
 
 def _banded(path):

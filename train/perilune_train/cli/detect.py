@@ -1,7 +1,7 @@
 """`perilune-train detect`: train, evaluate, find craters in images, export for flight."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -213,9 +213,13 @@ def evaluate(
         config = resolve_over(DetectConfig, "detect", "--scale", own)
     # Importing torch takes seconds; check the settings first.
     from perilune_train.detect.evaluate_run import evaluate_again
+    from perilune_train.records.provenance import EvaluatedSplit
 
     address = dataset or Path("data", run.resolve().name, "detect")
-    folder = evaluate_again(run, config, address, split, threshold, out, choose_threshold, allow_overlap)
+    score: float | Literal["run", "validation"] = (
+        "validation" if choose_threshold else "run" if threshold is None else threshold
+    )
+    folder = evaluate_again(run, config, EvaluatedSplit(address, split, allow_overlap), score, out)
     say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
 
 
@@ -357,9 +361,9 @@ def export(
     if int8 and dataset is None:
         raise UserError("options", "--int8", "no --dataset", "a dataset to calibrate and to evaluate on")
     # Importing torch takes seconds; check the options first.
-    from perilune_train.detect.deploy.export import export_run
+    from perilune_train.detect.deploy.export import ExportedFiles, export_run
 
-    export_run(run or shipped_run("detect"), out, asked, size_px, dataset, int8, allow_overlap)
+    export_run(run or shipped_run("detect"), out, ExportedFiles(asked, size_px, int8), dataset, allow_overlap)
     say(f"{out}: README.md explains how to use the files")
 
 

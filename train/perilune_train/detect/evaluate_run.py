@@ -1,9 +1,9 @@
 """Evaluate a finished run on a split of any dataset."""
 
 from pathlib import Path
+from typing import Literal
 
 from perilune_shared.dataset.manifest import open_single
-from perilune_shared.storage.store import Address
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import EDGE
@@ -22,38 +22,43 @@ from perilune_train.detect.inference.scales import detect_split
 from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import read_metrics, write_metrics
-from perilune_train.records.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
+from perilune_train.records.provenance import (
+    EvaluatedSplit,
+    Provenance,
+    check_terrain,
+    protocol_of,
+    read_provenance,
+    split_terrain,
+)
 from perilune_train.training import runs
 
 
 def evaluate_again(
     run: Path,
     config: DetectConfig,
-    dataset_address: Address,
-    split: str,
-    threshold: float | None,
-    out: Path | None,
-    choose_threshold: bool = False,
-    allow_overlap: bool = False,
+    evaluated: EvaluatedSplit,
+    threshold: float | Literal["run", "validation"] = "run",
+    out: Path | None = None,
 ) -> Path:
     """Evaluate a run's best weights on a split of a dataset; all output is in the returned folder.
 
-    The threshold is the given one, else the run's own; `choose_threshold` chooses one on the dataset's validation
-    split.
+    `threshold` is a score; "run" takes the threshold that the run chose, and "validation" chooses a new one on the
+    validation split of the dataset. Without `out`, the folder is `evaluation` in the run's folder.
     """
     folder = out or run / "evaluation"
     check_output(folder, run)
-    chosen = chosen_threshold(run) if threshold is None else threshold
-    threshold_source = (
-        "of the run, chosen on its validation split" if threshold is None else "given on the command line"
-    )
+    choose_threshold, split = threshold == "validation", evaluated.split
+    if isinstance(threshold, str):
+        chosen, threshold_source = chosen_threshold(run), "of the run, chosen on its validation split"
+    else:
+        chosen, threshold_source = threshold, "given on the command line"
     known = read_metrics(run).get("dataset/name")
-    dataset = open_single(dataset_address)
+    dataset = open_single(evaluated.dataset)
     best = runs.RunFolder(run).best
     terrain = read_provenance(runs.load_weights(best), best)
     if choose_threshold:
         terrain = Provenance(split_terrain(dataset, "val", "calibrated")).joined([terrain])
-    terrain_check = check_terrain(terrain, dataset, split, allow_overlap)
+    terrain_check = check_terrain(terrain, dataset, split, evaluated.allow_overlap)
     protocol = protocol_of(dataset.info)
     if known is not None and known != dataset.info.name:
         protocol = f"not the run's dataset ({known}); split by {dataset.info.split_by}"

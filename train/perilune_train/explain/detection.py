@@ -13,7 +13,7 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.correlation.measures import detector_values
+from perilune_train.explain.correlation.measures import FrameTargets, detector_values
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
 from perilune_train.explain.evidence.localisation import MEASURES, localisation
 from perilune_train.explain.evidence.nulls import detector_nulls, of_other_rows, renamed
@@ -55,8 +55,7 @@ def explain_detector(
     plain = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
     strongest = strongest_gate(before, plain)
     values = _values(frames, masks, blank, rng)
-    maps = frames.truth, brightness_map(frames.images), gradient_map(frames.images)
-    permutations = detector_permutations(masks, *maps, frames.scene_ids, signs, rng)
+    permutations = detector_permutations(masks, _targets(frames), signs, rng)
     differences = pd.concat([null_differences(values, signs, rng), permutations], ignore_index=True)
 
     some = evenly_spaced(len(frames.images), settings.n_attributed)
@@ -139,15 +138,18 @@ def attributions(settings: ExplainConfig, network: YOLOv3, images: NDArray[np.ui
 
 
 def _values(frames: LabelledFrames, masks: Masks, untrained: Masks, rng: np.random.Generator) -> pd.DataFrame:
+    targets = _targets(frames)
+    nulls = detector_nulls(frames.images, masks, untrained, targets, rng)
+    return pd.concat([detector_values(masks, targets), nulls], ignore_index=True)
+
+
+def _targets(frames: LabelledFrames) -> FrameTargets:
     brightness, gradient = brightness_map(frames.images), gradient_map(frames.images)
-    own = frames.truth, brightness, gradient, frames.frame_ids, frames.scene_ids
-    return pd.concat(
-        [detector_values(masks, *own), detector_nulls(frames.images, masks, untrained, *own, rng)], ignore_index=True
-    )
+    return FrameTargets(frames.truth, brightness, gradient, frames.frame_ids, frames.scene_ids)
 
 
 def _attribution_values(frames: LabelledFrames, some: list[int], maps: Masks) -> pd.DataFrame:
     images = frames.images[some]
     ids, scenes = ([own[i] for i in some] for own in (frames.frame_ids, frames.scene_ids))
-    maps_of = brightness_map(images), gradient_map(images)
-    return detector_values(maps, frames.truth[some], *maps_of, ids, scenes, "attribution")
+    targets = FrameTargets(frames.truth[some], brightness_map(images), gradient_map(images), ids, scenes)
+    return detector_values(maps, targets, "attribution")

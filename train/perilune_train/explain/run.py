@@ -27,62 +27,66 @@ from perilune_train.explain.networks import (
 )
 from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.claim import Claim
-from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
+from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, Masked, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
-from perilune_train.training.runs import RunFolder
+from perilune_train.training.runs import NamedRun, RunFolder
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkOnData:
+    """A network to explain, and the dataset whose test split it is explained on."""
+
+    checkpoint: Path
+    """checkpoints/best.ckpt of a run, or the weights of an installed network."""
+    dataset: Address
+    """Folder or address of the dataset."""
 
 
 def explain_run(
     settings: ExplainConfig,
-    detect_data: Address,
-    nav_data: Address,
-    detector: Path | None,
-    navigator: Path | None,
-    runs: Path,
-    name: str,
-    overwrite: bool = False,
+    named: NamedRun,
+    detector: NetworkOnData | None,
+    navigator: NetworkOnData | None,
     allow_overlap: bool = False,
 ) -> RunFolder:
     """Compute the evidence on the attention gates of one or two networks on test data; writes runs/explain/<name>.
 
-    `detector` is checkpoints/best.ckpt of a run, or the weights of an installed network: the config.yaml of its folder
-    defines the selected craters. A network that is None is not explained, and its dataset is not opened. Leaves a
-    finished run of the same settings, datasets and checkpoints unchanged; `overwrite` replaces any existing run.
-    Signs and the gates whose pixels are removed are chosen on the validation splits.
+    The config.yaml in the folder of the detector's checkpoint defines the selected craters. A network that is None is
+    not explained. A finished run of the same settings, datasets and checkpoints stays unchanged. Signs and the gates
+    whose pixels are removed are chosen on the validation splits.
 
     Raises UserError if the existing run has other settings, datasets or checkpoints; if a dataset, a checkpoint or
     config.yaml is missing or invalid; if a network has no attention; or if it was fitted to terrain of its test frames
     (unless `allow_overlap`).
     """
-    run = RunFolder(runs / "explain" / name)
-    with held(run):
-        return _run(run, settings, detect_data, nav_data, (detector, navigator), overwrite, allow_overlap)
+    with held(named.folder("explain")):
+        return _run(settings, named, detector, navigator, allow_overlap)
 
 
 def _run(
-    run: RunFolder,
     settings: ExplainConfig,
-    detect_data: Address,
-    nav_data: Address,
-    checkpoints: tuple[Path | None, Path | None],
-    overwrite: bool,
+    named: NamedRun,
+    detector: NetworkOnData | None,
+    navigator: NetworkOnData | None,
     allow_overlap: bool,
 ) -> RunFolder:
-    detector, navigator = checkpoints
-    detecting = {} if detector is None else {"detection dataset": detect_data, "detector": detector}
-    navigating = {} if navigator is None else {"navigation dataset": nav_data, "navigator": navigator}
-    inputs = hashes_of(detecting | navigating)
-    state = state_of(run, "explain", settings, inputs, overwrite)
+    run = named.folder("explain")
+    read: dict[str, Address | None] = {}
+    networks: dict[str, tuple[Path, Address]] = {}
+    for name, task, network in (("detector", "detection", detector), ("navigator", "navigation", navigator)):
+        if network is not None:
+            read |= {f"{task} dataset": network.dataset, name: network.checkpoint}
+            networks[name] = network.checkpoint, network.dataset
+    inputs = hashes_of(read)
+    state = state_of(run, "explain", settings, inputs, named.overwrite)
     if state == "finished":
         return run
-    given = {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}
-    networks = {part: (path, data) for part, (path, data) in given.items() if path is not None}
-    flown = None if navigator is None else open_navigation(navigator, nav_data, settings)
+    flown = None if navigator is None else open_navigation(navigator.checkpoint, navigator.dataset, settings)
     marks, metrics = terrain_marks(networks, allow_overlap)
-    seen = None if detector is None else open_detection(detector, detect_data, settings)
+    seen = None if detector is None else open_detection(detector.checkpoint, detector.dataset, settings)
     start_run(run, "explain", settings, inputs, state)
 
     parts = [] if seen is None else [_explain_detector(run, settings, seen)]
@@ -122,7 +126,7 @@ def _explain_detector(run: RunFolder, settings: ExplainConfig, seen: ExplainedDe
     where = seen.checkpoint
     found, masks = detection.explain_detector(settings, seen.detector, seen.frames, seen.known_frames, where)
     along = detector_masks(seen.detector.network, seen.descent.images, where)
-    draw_detector(run.root, settings, seen.frames, masks, found, seen.descent, along)
+    draw_detector(run.root, settings, found, Masked(seen.frames, masks), Masked(seen.descent, along))
     save_masks(run.root / "masks_detect.npz", seen.descent.frame_ids, along)
     deviations, guided = _deviations(masks), GUIDED if seen.config.loss.lambda_guide > 0 else ()
     metrics = figures_of(found, detection.TASK, higher_is_better=True) | selection_entries(seen.config, seen.split)
@@ -136,7 +140,7 @@ def _explain_navigator(run: RunFolder, settings: ExplainConfig, flown: Explained
     where, network, pairs = flown.checkpoint, flown.network, flown.pairs
     found, masks = navigation.explain_navigator(settings, network, flown.architecture, pairs, flown.known_pairs, where)
     along = navigator_masks(network, flown.flight.images, flown.architecture["size_px"], where)
-    draw_navigator(run.root, settings, pairs, masks, found, flown.flight, along)
+    draw_navigator(run.root, settings, found, Masked(pairs, masks), Masked(flown.flight, along))
     deviations = _deviations(masks)
     metrics = figures_of(found, navigation.TASK, higher_is_better=False) | {"navigator": where.as_posix()}
     metrics |= {f"mask_deviation_stack/{block}": value for block, value in deviations.items()}

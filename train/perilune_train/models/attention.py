@@ -91,9 +91,5 @@ class CBAM(nn.Module):
         mask = self.spatial_gate(x)
         return mask, mask.to(x.dtype) * x
 
-    def spatial_mask(self, x: Tensor) -> Tensor:
-        """The spatial mask M_s (N, 1, H, W) by which `forward` multiplies the features."""
-        return self.gated(x)[0]
-
     def forward(self, x: Tensor) -> Tensor:
         return self.gated(x)[1]

@@ -1,6 +1,7 @@
 """Two networks over pairs of consecutive frames of a trajectory: their motion, or the pose at the later frame."""
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -51,12 +52,28 @@ class Recurrent(nn.Module):
             return self.output(self.dropout(hidden)).float(), state
 
 
+@dataclass(frozen=True, slots=True)
+class StackOptions:
+    """Deviations of a stack network from the paper's."""
+
+    pool: int = 1
+    """Cells along each side of a grid over each frame: features are averaged over each cell, and a linear layer to at
+    most `StackNavigator.SUMMARY` values follows. 1 averages over both frames, without a linear layer."""
+    stages: int = 5
+    """Stages of the backbone."""
+    dropout: float = 0.0
+    """Share of the LSTM's inputs and outputs that a training step sets to 0."""
+    standardised: bool = False
+    """Whether to subtract the mean of each feature over the training pairs and divide by its spread; `measure` sets
+    both."""
+
+
+AS_PAPER = StackOptions()
+"""The paper's network."""
+
+
 class StackNavigator(nn.Module):
     """The paper's network: the pair stacked in height, attention-Darknet53, global average pool, LSTM.
-
-    Deviations on request: `pool` > 1 averages over a grid of pool x pool cells of each frame and adds a linear layer to
-    at most 512 values; `stages` 4 leaves out the last stage; `standardised` subtracts the mean of each feature over the
-    training pairs and divides by its spread, which `measure` sets.
 
     Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9) and the state of
     the LSTM.
@@ -73,18 +90,15 @@ class StackNavigator(nn.Module):
         width: float,
         attention: Attention,
         hidden: int,
-        *,
-        pool: int = 1,
-        stages: int = 5,
-        dropout: float = 0.0,
-        standardised: bool = False,
+        options: StackOptions = AS_PAPER,
     ):
         super().__init__()
+        pool, standardised = options.pool, options.standardised
         self.in_channels, self.pool, self.standardised = in_channels, pool, standardised
-        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=stages)
+        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=options.stages)
         inputs = self.backbone.channels[-1] * (1 if pool == 1 else 2 * pool**2)
         summary = None if pool == 1 else min(inputs, self.SUMMARY)
-        self.recurrent = Recurrent(inputs, hidden, summary, dropout, exact=standardised)
+        self.recurrent = Recurrent(inputs, hidden, summary, options.dropout, exact=standardised)
         if standardised:
             self.register_buffer("feature_mean", torch.zeros(inputs))
             self.register_buffer("feature_spread", torch.ones(inputs))

@@ -13,7 +13,7 @@ from perilune_shared.storage.store import Address
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
 from perilune_train.motion.finished_run import fusion_of
-from perilune_train.motion.metrics.baselines import baselines
+from perilune_train.motion.metrics.baselines import MethodMotions, baselines
 from perilune_train.motion.metrics.metrics import motion_errors, summary, summary_spreads
 from perilune_train.motion.metrics.report import write_evaluation
 from perilune_train.motion.network import check_motion, load_navigator, predict, predict_by_pairs
@@ -73,7 +73,7 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}
     ms = round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2)
     details: Metrics = {"test/ms_per_single_pair": ms, "terrain/mark": mark, "dataset/name": "locked benchmark"}
-    write_evaluation(out, fusion, "test", trajectories, motions, covariances, details)
+    write_evaluation(out, fusion, "test", trajectories, MethodMotions(motions, covariances), details)
     figures = _figures(errors, regions, suns) | {"headline/method": fusion, f"headline/{HEADLINE}": None}
     figures[f"headline/{HEADLINE}"] = figures[f"{fusion}/{HEADLINE}"]
     for name, (n_frames, n_locked) in counts.items():

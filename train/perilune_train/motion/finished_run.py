@@ -10,24 +10,30 @@ import numpy as np
 from perilune_shared.console.terminal import progress_bar, say_page
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
-from perilune_shared.storage.store import Address
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Pose, Trajectory, load_split
-from perilune_train.motion.metrics.baselines import baselines
+from perilune_train.motion.metrics.baselines import MethodMotions, baselines
 from perilune_train.motion.metrics.floors import constant_pose
 from perilune_train.motion.metrics.report import write_evaluation, write_pose_evaluation
 from perilune_train.motion.network import Fusion, Scales, load_navigator, predict, predict_by_pairs, target_of
 from perilune_train.motion.pose import predict_pose, predict_pose_by_pairs
 from perilune_train.records.metrics_file import Metrics
-from perilune_train.records.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
+from perilune_train.records.provenance import (
+    EvaluatedSplit,
+    Provenance,
+    check_terrain,
+    protocol_of,
+    read_provenance,
+    split_terrain,
+)
 from perilune_train.training.runs import RunFolder, load_weights
 
 
-def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Path, allow_overlap: bool = False) -> Path:
+def evaluate_navigator(run: Path, evaluated: EvaluatedSplit, out: Path) -> Path:
     """Evaluate a run's best weights, the classical methods and the nominal motion on a split; returns `out`.
 
     Raises UserError if `run` is no navigation run, if `out` is the run's own folder, or on test terrain that the
-    network was fitted to (unless `allow_overlap`).
+    network was fitted to, unless that is accepted.
     """
     if out.resolve() == run.resolve():
         expected = "another folder; a run keeps the metrics of its training"
@@ -35,8 +41,8 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
     best = RunFolder(run).best
     content = load_weights(best)
     fusion = fusion_of(best, content["architecture"])
-    dataset = open_single(dataset_address)
-    terrain_check = check_terrain(read_provenance(content, best), dataset, split, allow_overlap)
+    dataset, split = open_single(evaluated.dataset), evaluated.split
+    terrain_check = check_terrain(read_provenance(content, best), dataset, split, evaluated.allow_overlap)
     trajectories = load_split(dataset, split)
     network, architecture = load_navigator(best, fusion)
     if target_of(architecture) == "pose":
@@ -61,7 +67,7 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
     stated = stated_covariances(run, network, architecture, trajectories)
     if stated is not None:
         covariances = {fusion: stated, **covariances}
-    write_evaluation(out, fusion, split, trajectories, motions, covariances, details)
+    write_evaluation(out, fusion, split, trajectories, MethodMotions(motions, covariances), details)
     return out
 
 

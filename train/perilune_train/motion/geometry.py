@@ -91,11 +91,6 @@ def rotation_from_sixd(sixd: Tensor) -> Tensor:
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
 
-def sixd_from_rotation(rotation: Tensor) -> Tensor:
-    """The continuous representation (..., 6) of rotation matrices (..., 3, 3): the first two columns."""
-    return torch.cat([rotation[..., :, 0], rotation[..., :, 1]], dim=-1)
-
-
 def euler_from_rotation(rotation: Tensor) -> Tensor:
     """Angles (..., 3) in radians about x, y, z of rotation = Rz Ry Rx (..., 3, 3); |y| below 90 degrees."""
     cos_y = torch.hypot(rotation[..., 0, 0], rotation[..., 1, 0])

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.models.architecture import NavigatorArchitecture, check_architecture_of, without_memory
-from perilune_train.models.navigator import StackNavigator, State, WarpNavigator
+from perilune_train.models.navigator import StackNavigator, StackOptions, State, WarpNavigator
 from perilune_train.motion.config import Target
 from perilune_train.motion.data.sequences import Sequence, pair_sequence
 from perilune_train.motion.data.trajectories import Motion, Trajectory
@@ -74,10 +74,7 @@ def build(architecture: dict[str, Any]) -> StackNavigator | WarpNavigator:
             a["attention"],
             a["hidden"],
             # Checkpoints of older versions have none of these.
-            pool=a.get("pool", 1),
-            stages=a.get("stages", 5),
-            dropout=a.get("dropout", 0.0),
-            standardised=target_of(a) == "pose",
+            StackOptions(a.get("pool", 1), a.get("stages", 5), a.get("dropout", 0.0), target_of(a) == "pose"),
         )
     scales = a["scales"]
     return WarpNavigator(
@@ -173,7 +170,7 @@ def predict(
     `features` (pairs, channels) are those of the backbone of a stack network, if they are known.
     """
     shrunk = trajectory.shrunk(architecture["size_px"])
-    motion, _ = _predicted(network, architecture, shrunk, 0, shrunk.n_pairs, None, features)
+    motion, _ = _predicted(network, architecture, shrunk, range(shrunk.n_pairs), None, features)
     return motion
 
 
@@ -186,7 +183,7 @@ def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajector
     translations, rotations = [], []
     started = time.perf_counter()
     for pair in range(shrunk.n_pairs):
-        (translation, rotation), state = _predicted(network, architecture, shrunk, pair, 1, state)
+        (translation, rotation), state = _predicted(network, architecture, shrunk, range(pair, pair + 1), state)
         translations.append(translation)
         rotations.append(rotation)
     seconds = (time.perf_counter() - started) / shrunk.n_pairs
@@ -197,13 +194,12 @@ def _predicted(
     network: Any,
     architecture: dict[str, Any],
     shrunk: Trajectory,
-    start: int,
-    n_pairs: int,
+    pairs: range,
     state: State | None,
     features: Tensor | None = None,
 ) -> tuple[Motion, State]:
-    """Motions of some pairs of a shrunk trajectory, and the LSTM's state after them."""
-    sequence = pair_sequence(shrunk, start, n_pairs, warp=architecture["fusion"] == "warp")
+    """Motions of consecutive pairs of a shrunk trajectory, and the LSTM's state after them."""
+    sequence = pair_sequence(shrunk, pairs.start, len(pairs), warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
     if architecture["fusion"] == "warp":
         # The fit of the motion is for the camera of these frames, which may differ from that of the training.

@@ -73,6 +73,22 @@ class RunFolder:
         return None
 
 
+@dataclass(frozen=True, slots=True)
+class NamedRun:
+    """A run to start, resume or replace."""
+
+    runs: Path
+    """Folder of all runs."""
+    name: str
+    """Name of the run."""
+    overwrite: bool = False
+    """Whether to replace an existing run."""
+
+    def folder(self, task: str, ending: str = "") -> RunFolder:
+        """The folder <runs>/<task>/<name><ending>."""
+        return RunFolder(self.runs / task / f"{self.name}{ending}")
+
+
 def is_first_process() -> bool:
     """Whether this process writes files and messages: the only process, or the first of several that train together.
 

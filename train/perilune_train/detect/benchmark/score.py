@@ -13,7 +13,7 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import EDGE, Detections, Matches
+from perilune_train.detect.evaluate.matching import EDGE, Criteria, Detections, Matches
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.records.benchmark_parts import Part
 from perilune_train.records.metrics_file import Metrics
@@ -117,9 +117,7 @@ def score(
     for rule, by_part in loaded.items():
         labels: list[FrameLabels] = [each for part in parts for each in by_part[part.name].labels]
         radius_px = next(iter(by_part.values())).radius_px
-        evaluation = evaluate_detections(
-            detections, labels, facts, threshold, radius_px=radius_px, match_iou=MATCH_IOU, seed=SEED
-        )
+        evaluation = evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px, MATCH_IOU), SEED)
         evaluations[rule] = evaluation
         regions[rule] = [_region(evaluation, name, of_frame) for name in dict.fromkeys(of_frame)]
     images = [image for part in parts for image in splits[part.name].frames.images]

@@ -103,16 +103,26 @@ def _terrain(
     return Provenance(provenance.uses | own, provenance.known), check
 
 
+@dataclass(frozen=True, slots=True)
+class ExportedFiles:
+    """Files to export."""
+
+    formats: tuple[str, ...] = FORMATS
+    """Formats, of `FORMATS`."""
+    size_px: int = 256
+    """Width and height of the network's input, pixels."""
+    int8: bool = False
+    """Whether to try quantisation to 8-bit integers."""
+
+
 def export_run(
     root: Path,
     out: Path,
-    formats: tuple[str, ...] = FORMATS,
-    size_px: int = 256,
+    files: ExportedFiles,
     dataset: Address | None = None,
-    int8: bool = False,
     allow_overlap: bool = False,
 ) -> Int8Verdict | None:
-    """Export a run's detector to the new folder `out`, and check the files; with `int8` also try quantisation.
+    """Export a run's detector to the new folder `out`, and check the files.
 
     Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (metadata)
     and README.md. Compares on frames of the dataset's validation split, or on noise without a dataset.
@@ -121,6 +131,7 @@ def export_run(
     int8 would be calibrated on terrain of a test split, the run's or the dataset's. With `allow_overlap` such terrain
     is allowed, and detector.json and README.md are marked.
     """
+    formats, size_px, int8 = files.formats, files.size_px, files.int8
     for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
         package(name)
     trained = load_trained(root)

@@ -2,7 +2,7 @@
 
 Use it for rendered datasets and real images alike:
 
-    evaluation = evaluate_detections(found, labels, facts, threshold, radius_px=(2.0, 50.0))
+    evaluation = evaluate_detections(found, labels, facts, Criteria(threshold, radius_px=(2.0, 50.0)))
     figures = evaluation.figures()                       # flat keys, for metrics.json
     write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
 
@@ -26,6 +26,7 @@ from perilune_train.detect.evaluate.matching import (
     COCO_IOUS,
     FALSE,
     FOUND,
+    Criteria,
     Detections,
     Matches,
     Overlaps,
@@ -122,17 +123,15 @@ def evaluate_detections(
     found: list[Detections],
     labels: Sequence[FrameLabels],
     facts: FrameFacts,
-    threshold: float,
-    *,
-    radius_px: tuple[float, float],
-    match_iou: float = 0.5,
+    criteria: Criteria,
     seed: int = 0,
 ) -> Evaluation:
-    """Evaluate the detections of all frames; `radius_px` is the range of labelled radii.
+    """Evaluate the detections of all frames.
 
-    The edge account is valid only if `labels` include craters, as ignored ones, well below that range. `threshold` must
-    be chosen on other frames (validation). `seed` is the random seed of the bootstrap only.
+    The edge account is valid only if `labels` include craters, as ignored ones, well below the range of radii. `seed`
+    is the random seed of the bootstrap only.
     """
+    match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
     overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
     matches = overlaps.match(match_iou, radius_px)
     at_edge = overlaps.match(match_iou, edge_range(radius_px))
@@ -158,7 +157,7 @@ def evaluate_detections(
         matches,
         at_edge,
         by_iou,
-        figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
+        figures_by_bin(overlaps, matches, facts, criteria, resamples),
         spreads(statistics, matches.selected_frame, resamples),
         resamples,
     )

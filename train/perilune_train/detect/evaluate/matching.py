@@ -52,6 +52,18 @@ def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
     return radius_px[0] * EDGE, radius_px[1]
 
 
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """Which detections and labels an evaluation counts."""
+
+    threshold: float
+    """Minimum score of the detections that count in precision, recall and F1; choose it on other frames."""
+    radius_px: tuple[float, float]
+    """Range of the evaluated radii, pixels."""
+    match_iou: float = 0.5
+    """Minimum IoU of a match."""
+
+
 @dataclass(frozen=True)
 class Detections:
     """Detections of one frame, best first."""

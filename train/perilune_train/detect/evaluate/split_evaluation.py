@@ -13,7 +13,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import Detections, Matches, match_split
+from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, match_split
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import protocol_of
 
@@ -36,15 +36,8 @@ def match_detections(split: DetectSplit, found: list[Detections], config: Detect
 
 def evaluate_split(split: DetectSplit, found: list[Detections], config: DetectConfig, threshold: float) -> Evaluation:
     """Compute all metrics of a split's detections."""
-    return evaluate_detections(
-        found,
-        split.labels,
-        facts_of(split.frames),
-        threshold,
-        radius_px=split.radius_px,
-        match_iou=config.evaluation.match_iou,
-        seed=config.seed,
-    )
+    criteria = Criteria(threshold, split.radius_px, config.evaluation.match_iou)
+    return evaluate_detections(found, split.labels, facts_of(split.frames), criteria, config.seed)
 
 
 def selection_entries(config: DetectConfig, split: DetectSplit) -> Metrics:

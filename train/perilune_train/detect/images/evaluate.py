@@ -24,7 +24,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import unknown_facts
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections
+from perilune_train.detect.evaluate.matching import FALSE, FOUND, Criteria, Detections
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import check_output, chosen_threshold
@@ -161,9 +161,7 @@ def evaluate_detections_in_images(
         found,
         [frame_labels(image, min_size_px) for image in given.images],
         unknown_facts([image.name for image in given.images], sizes),
-        threshold,
-        radius_px=(min_size_px / 2, np.inf),
-        match_iou=match_iou,
+        Criteria(threshold, (min_size_px / 2, np.inf), match_iou),
     )
 
 

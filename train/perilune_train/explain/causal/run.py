@@ -1,6 +1,7 @@
 """One causal run: what single craters do to masks, detections and poses, from frames rendered without them."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from perilune_train.motion.network import load_navigator
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.runs import RunFolder, choose_device
+from perilune_train.training.runs import NamedRun, RunFolder, choose_device
 
 CAPTIONS = {
     "gates_causal.png": "Change of each gate's mask around single craters: crater removed from the ground and rendered"
@@ -45,64 +46,92 @@ CAPTIONS = {
 _BATCH = 8
 
 
-def causal_folder(runs: Path, name: str) -> RunFolder:
+@dataclass(frozen=True, slots=True)
+class PoseInputs:
+    """Descents with and without some craters, and the network that estimates their poses."""
+
+    dataset: Address
+    """Navigation dataset with all craters."""
+    counterfactual: Address
+    """The same descents without some craters."""
+    checkpoint: Path
+    """best.ckpt of a stack navigator."""
+
+
+@dataclass(frozen=True, slots=True)
+class CausalInputs:
+    """Frames with and without some craters."""
+
+    dataset: Address
+    """Detection dataset with all craters."""
+    counterfactual: Address
+    """The same frames without some craters, from `perilune-render counterfactual`."""
+    split: str = "test"
+    """Split of the frames."""
+    turned: Address | None = None
+    """The same frames under another Sun, with all craters."""
+    pose: PoseInputs | None = None
+    """Inputs for poses."""
+
+
+def causal_folder(named: NamedRun) -> RunFolder:
     """The folder that `causal_run` writes; a command holds it (`training.begin.held`)."""
-    return RunFolder(runs / "explain" / f"{name}-causal")
+    return named.folder("explain", "-causal")
 
 
 def causal_run(
     settings: ExplainConfig,
-    dataset: Address,
-    counterfactual: Address,
+    named: NamedRun,
     checkpoint: Path,
     gate: str,
-    runs: Path,
-    name: str,
-    split: str = "test",
-    turned: Address | None = None,
-    pose: tuple[Address, Address, Path] | None = None,
-    overwrite: bool = False,
+    inputs: CausalInputs,
     allow_overlap: bool = False,
 ) -> RunFolder:
     """Measure what removed craters change in masks, detections and poses; writes runs/explain/<name>-causal.
 
-    `gate` is the gate of the headline, chosen elsewhere. `counterfactual` is a dataset of
-    `perilune-render counterfactual`, rendered from `dataset`; `turned` another one, with all craters and another Sun;
-    `pose` a navigation dataset, its counterfactual and a stack navigator's best.ckpt. Leaves a finished run of the same
-    inputs unchanged; `overwrite` replaces any.
+    `checkpoint` has the weights of the detector. `gate` is the gate of the headline, chosen on other frames. A finished
+    run of the same inputs stays unchanged.
 
     Raises UserError if the existing run has other settings or inputs; if an input is missing or invalid; or if the
     network was fitted to terrain of the frames (unless `allow_overlap`).
     """
-    run = causal_folder(runs, name)
-    inputs = hashes_of(
-        {
-            "detection dataset": dataset,
-            "counterfactual": counterfactual,
-            "turned Sun": turned,
-            "detector": checkpoint,
-            **dict(zip(("navigation dataset", "navigation counterfactual", "navigator"), pose or (), strict=False)),
+    run = causal_folder(named)
+    dataset, split, turned, pose = inputs.dataset, inputs.split, inputs.turned, inputs.pose
+    read: dict[str, Address | None] = {
+        "detection dataset": dataset,
+        "counterfactual": inputs.counterfactual,
+        "turned Sun": turned,
+        "detector": checkpoint,
+    }
+    if pose is not None:
+        read |= {
+            "navigation dataset": pose.dataset,
+            "navigation counterfactual": pose.counterfactual,
+            "navigator": pose.checkpoint,
         }
-    )
-    state = state_of(run, "explain", settings, inputs, overwrite)
+    hashes = hashes_of(read)
+    state = state_of(run, "explain", settings, hashes, named.overwrite)
     if state == "finished":
         return run
     folder = folder_of(checkpoint)
     config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
-    removed, opened = read_removed(counterfactual), open_single(dataset)
-    fitted = {"detector": (checkpoint, dataset)} | ({} if pose is None else {"navigator": (pose[2], pose[0])})
+    removed, opened = read_removed(inputs.counterfactual), open_single(dataset)
+    fitted = {"detector": (checkpoint, dataset)} | (
+        {} if pose is None else {"navigator": (pose.checkpoint, pose.dataset)}
+    )
     marks, terrain = terrain_marks(fitted, allow_overlap, split)
     detector = open_single_scale(checkpoint, config, settings)
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
-    pairs = crater_pairs(opened, open_single(counterfactual), removed, split, config.labels)
+    pairs = crater_pairs(opened, open_single(inputs.counterfactual), removed, split, config.labels)
     # Report faults of the other inputs before anything is written.
     if turned is not None:
         same_frames(opened, open_single(turned), split)
     if pose is not None:
-        check_descents(open_single(pose[0]), open_single(pose[1]), split)
-        navigator, architecture = load_navigator(pose[2], "stack")
-    start_run(run, "explain", settings, inputs, state)
+        descents = open_single(pose.dataset), open_single(pose.counterfactual)
+        check_descents(*descents, split)
+        navigator, architecture = load_navigator(pose.checkpoint, "stack")
+    start_run(run, "explain", settings, hashes, state)
     rng = np.random.default_rng([settings.seed, 3])
     versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
     say(f"{len(pairs.craters)} views of {len(removed)} removed craters in {len(pairs.factual)} frames")
@@ -117,9 +146,7 @@ def causal_run(
         tables["turned_sun"] = _turned(detector, opened, open_single(turned), split, checkpoint)
     if pose is not None:
         navigator = navigator.to(choose_device(settings.device))
-        tables["pose_effects"] = pose_effects(
-            navigator, architecture, open_single(pose[0]), open_single(pose[1]), split
-        )
+        tables["pose_effects"] = pose_effects(navigator, architecture, *descents, split)
     for title, table in tables.items():
         with written_aside(run.root / f"{title}.parquet") as aside:
             table.to_parquet(aside, index=False)

@@ -60,11 +60,3 @@ def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography
         borderMode=cv2.BORDER_REPLICATE,
     )
     return np.asarray(moved, np.float64)
-
-
-def warped_to_first(
-    image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """An image of frame 2 moved to frame 1 (height, width), and which pixels of frame 1 are inside frame 2."""
-    height, width = image_2.shape
-    return moved_to_first(image_2, homography), seen_in_second((height, width), homography)

@@ -29,15 +29,6 @@ def pearson_rows(maps: Maps, targets: Maps, seen: NDArray[np.bool_] | None = Non
     return dot_rows(standardised_rows(maps, seen), standardised_rows(targets, seen))
 
 
-def pearson_between(maps: Maps, targets: Maps | None = None) -> Array:
-    """Correlations (N, M) of all maps (N, ...) with all targets (M, ...); with each other if there are none.
-
-    NaN in the rows and columns of constant ones.
-    """
-    rows = standardised_rows(maps)
-    return rows @ (rows if targets is None else standardised_rows(targets)).T
-
-
 def partial_rows(maps: Maps, targets: Maps, givens: Sequence[Maps]) -> Array:
     """Partial correlation (N,) of each map (N, ...) with its target (N, ...), given the other maps (N, ...).
 

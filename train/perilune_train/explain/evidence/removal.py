@@ -9,10 +9,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 Which = Literal["most", "least"]
-How = Literal["inpaint", "mean"]
+Filling = Literal["inpaint", "mean"]
 Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
 """One value (N,) for each image (N, height, width), NaN if undefined."""
 CONTROLS = ("random", "shifted")
+_FILLINGS: tuple[Filling, ...] = ("inpaint", "mean")
 BLOCK_PX = 8
 """Side of the blocks that are removed, so that inpainting cannot restore single pixels."""
 _BINS = 10
@@ -69,7 +70,7 @@ def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: 
     return _pixels(np.flatnonzero(moved), chosen.shape, block_px)
 
 
-def removed(image: NDArray[np.uint8], chosen: NDArray[np.bool_], how: How) -> NDArray[np.uint8]:
+def removed(image: NDArray[np.uint8], chosen: NDArray[np.bool_], how: Filling) -> NDArray[np.uint8]:
     """The image (height, width) with the chosen pixels replaced.
 
     "inpaint": by Telea's method (2004, doi 10.1080/10867651.2004.10487596), radius 3 px. "mean": by the mean of the
@@ -95,8 +96,6 @@ def removal_effect(
     measure: Measure,
     rng: np.random.Generator,
     share: float = 0.2,
-    hows: tuple[How, ...] = ("inpaint", "mean"),
-    block_px: int = BLOCK_PX,
 ) -> pd.DataFrame:
     """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
 
@@ -110,18 +109,17 @@ def removal_effect(
     tables = []
     for name, found in maps.items():
         most, least = (
-            [chosen_pixels(one, share, which, sign[name], rng, block_px) for one in found]
-            for which in ("most", "least")
+            [chosen_pixels(one, share, which, sign[name], rng) for one in found] for which in ("most", "least")
         )
         choices = {
             "most": most,
             "least": least,
-            "random": [random_like(*pair, rng, block_px) for pair in zip(images, most, strict=True)],
-            "shifted": [shifted_like(one, rng, block_px) for one in most],
+            "random": [random_like(*pair, rng) for pair in zip(images, most, strict=True)],
+            "shifted": [shifted_like(one, rng) for one in most],
         }
         for which, chosen in choices.items():
             overlap = [(one & first).sum() / one.sum() for one, first in zip(chosen, most, strict=True)]
-            for how in hows:
+            for how in _FILLINGS:
                 changed = np.stack([removed(*pair, how) for pair in zip(images, chosen, strict=True)])
                 values = {"overlap": overlap, "before": before, "after": measure(changed)}
                 index = np.arange(len(images))

@@ -1,6 +1,7 @@
 """Similarity of masks under noise, shifts, another lens, and between two renderings of the same poses."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,12 +11,21 @@ from numpy.typing import NDArray
 from perilune_train.explain.correlation.pearson import pearson_rows
 from perilune_train.explain.maps.masks import Masks
 
-SIGMAS_DN = (2.0, 5.0)
-"""Standard deviations of the added noise, grey values of 255."""
-SHIFTS_PX = ((1, 0), (0, 1), (3, -2))
-"""Shifts to the right and down, pixels."""
-LENSES = (-0.05, 0.05)
-"""Radial distortions: relative change of the distance from the middle at half the image's width. Below 0: barrel."""
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """Changes of images under which masks are compared."""
+
+    noise_dn: tuple[float, ...] = (2.0, 5.0)
+    """Standard deviations of added noise, grey values of 255."""
+    shifts_px: tuple[tuple[int, int], ...] = ((1, 0), (0, 1), (3, -2))
+    """Shifts to the right and down, pixels."""
+    lenses: tuple[float, ...] = (-0.05, 0.05)
+    """Radial distortions: relative change of the distance from the centre at half the image width. Below 0: barrel."""
+
+
+DEFAULT_CHANGES = Changes()
+"""Noise, shifts and lenses of an explain run."""
 
 
 def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -47,9 +57,7 @@ def stability(
     masks_of: Callable[[NDArray[np.uint8]], Masks],
     images: NDArray[np.uint8],
     rng: np.random.Generator,
-    sigmas_dn: tuple[float, ...] = SIGMAS_DN,
-    shifts_px: tuple[tuple[int, int], ...] = SHIFTS_PX,
-    lenses: tuple[float, ...] = LENSES,
+    changes: Changes = DEFAULT_CHANGES,
     stacked: int = 1,
 ) -> pd.DataFrame:
     """Pearson correlation of the masks of images (N, height, width) with those of the changed images.
@@ -61,9 +69,9 @@ def stability(
     """
     before = masks_of(images)
     tables = []
-    for sigma_dn in sigmas_dn:
+    for sigma_dn in changes.noise_dn:
         tables.append(between(before, masks_of(noisy(images, sigma_dn, rng)), f"noise {sigma_dn:g} DN"))
-    for dx, dy in shifts_px:
+    for dx, dy in changes.shifts_px:
 
         def moved(values: NDArray, dx: int = dx, dy: int = dy) -> NDArray:
             frames = values.reshape(-1, values.shape[1] // stacked, values.shape[2])
@@ -76,7 +84,7 @@ def stability(
         inside[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)] = True
         seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
         tables.append(_compared(before, after, f"shift {dx} {dy} px", seen))
-    for distortion in lenses:
+    for distortion in changes.lenses:
         maps = lens_map(images.shape[1] // stacked, images.shape[2], distortion)
 
         def bent(values: NDArray, maps: tuple = maps) -> NDArray:

@@ -27,9 +27,9 @@ _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
 distance of two pairs that may be the same, in standard deviations."""
 _TEST_PX, _TEST_SIZE = 4.0, 0.35
 """A sighting agrees with a crater within this distance and difference of the logarithms of the sizes."""
-_MOST_PAIRED, _MOST_HITS, _MOST_TESTED = 800, 150, 1000
+_MOST_PAIRED, _MOST_HITS, _MOST_TESTED, _MOST_RETURNED = 800, 150, 1000, 5
 """Limits on the time: craters that form pairs, the largest first; hypotheses for a pair of sightings; hypotheses that
-are tested on more sightings."""
+are tested on more sightings; hypotheses that are returned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,27 +72,27 @@ def search(
     paired = paired.part(np.argsort(-paired.radius_m, kind="stable")[:_MOST_PAIRED])
     if len(paired) < 3:
         return []
-    scale, turn, shift = _hypotheses(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
-    if not len(scale):
+    placements = _placements(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
+    if not len(placements.altitude_m):
         return []
-    # All hypotheses are tested on some sightings, the best on more.
-    agreed = _agreed(scale, turn, shift, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
-    best = np.argsort(-agreed, kind="stable")[:_MOST_TESTED]
-    scale, turn, shift = scale[best], turn[best], shift[best]
-    agreed = _agreed(scale, turn, shift, offset[:N_TESTED], size[:N_TESTED], local, camera)
+    # All placements are tested on some sightings, the best on more.
+    agreed = _agreed(placements, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
+    placements = placements.part(np.argsort(-agreed, kind="stable")[:_MOST_TESTED])
+    agreed = _agreed(placements, offset[:N_TESTED], size[:N_TESTED], local, camera)
     ground_m = float(np.median(local.centre_m[:, 2]))
-    found: list[Hypothesis] = []
+    best: list[Hypothesis] = []
     for k in np.argsort(-agreed, kind="stable"):
-        position = np.array([*shift[k], ground_m + scale[k]])
-        apart = 10 * scale[k] / camera.fx_px
-        if any(np.linalg.norm(one.pose.position_m - position) < apart for one in found):
+        altitude_m, turn = placements.altitude_m[k], placements.heading_rad[k]
+        position = np.array([*placements.position_m[k], ground_m + altitude_m])
+        apart_m = 10 * altitude_m / camera.fx_px
+        if any(np.linalg.norm(better.pose.position_m - position) < apart_m for better in best):
             continue
         heading = np.eye(3)
-        heading[:2, :2] = [[np.cos(turn[k]), np.sin(turn[k])], [-np.sin(turn[k]), np.cos(turn[k])]]
-        found.append(Hypothesis(Pose(position, rotation_camera_from_site @ heading), int(agreed[k])))
-        if len(found) == 5:
+        heading[:2, :2] = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        best.append(Hypothesis(Pose(position, rotation_camera_from_site @ heading), int(agreed[k])))
+        if len(best) == _MOST_RETURNED:
             break
-    return found
+    return best
 
 
 def _in_reach(catalogue: Catalogue, camera: Camera, radius_px: Array, area: Area) -> Catalogue:
@@ -143,9 +143,30 @@ class _Pairs:
         return np.concatenate([self.sizes / _SIZE_SIGMA, ranged, on_circle * _SIGMAS / across], axis=1)
 
 
-def _hypotheses(offset: Array, size: Array, local: Catalogue, camera: Camera, area: Area) -> tuple[Array, Array, Array]:
-    """Altitudes (n,), turns of the heading (n,) and positions (n, 2) of all pairs that fit a pair of the catalogue."""
-    none = np.zeros(0), np.zeros(0), np.zeros((0, 2))
+@dataclass(frozen=True, slots=True)
+class _Placements:
+    """Possible places of a level camera."""
+
+    altitude_m: Array
+    """Altitudes above the ground (n,), metres."""
+    heading_rad: Array
+    """Turns of the heading from that of the assumed attitude (n,), radians."""
+    position_m: Array
+    """Positions over ground (n, 2), metres, O_L."""
+
+    def part(self, chosen: Chosen | slice) -> "_Placements":
+        """Some of the placements."""
+        return _Placements(self.altitude_m[chosen], self.heading_rad[chosen], self.position_m[chosen])
+
+    def on_ground(self, offset: Array) -> Array:
+        """Points (n, M, 2), O_L, at which sightings with offsets (M, 2) on the plane at depth 1 lie."""
+        turned = _turned(offset[None], self.heading_rad[:, None])
+        return self.position_m[:, None] + self.altitude_m[:, None, None] * turned
+
+
+def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, area: Area) -> _Placements:
+    """The placements by which a pair of sightings fits a pair of the catalogue."""
+    none = _Placements(np.zeros(0), np.zeros(0), np.zeros((0, 2)))
     low, high = area.altitude_m
     width = camera.width_px / camera.fx_px
     seen = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
@@ -167,32 +188,30 @@ def _hypotheses(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     second = second[first, hit]
     if not len(first):
         return none
-    turn = (known.direction[second] - seen.direction[first] + np.pi) % (2 * np.pi) - np.pi
-    scale = np.exp(known.separation[second] - seen.separation[first])
+    heading = (known.direction[second] - seen.direction[first] + np.pi) % (2 * np.pi) - np.pi
+    altitude = np.exp(known.separation[second] - seen.separation[first])
     middle_seen = offset[seen.index[first]].mean(axis=1)
     middle_known = local.centre_m[known.index[second], :2].mean(axis=1)
-    shift = middle_known - scale[:, None] * _turned(middle_seen, turn)
-    near = np.linalg.norm(shift - area.centre_m, axis=1) <= area.reach_m
-    return scale[near], turn[near], shift[near]
+    position = middle_known - altitude[:, None] * _turned(middle_seen, heading)
+    near = np.linalg.norm(position - area.centre_m, axis=1) <= area.reach_m
+    return _Placements(altitude, heading, position).part(near)
 
 
-def _agreed(
-    scale: Array, turn: Array, shift: Array, offset: Array, size: Array, local: Catalogue, camera: Camera
-) -> Array:
-    """Number of sightings (n,) that agree with a crater, by hypothesis."""
+def _agreed(placements: _Placements, offset: Array, size: Array, local: Catalogue, camera: Camera) -> Array:
+    """Number of sightings (n,) that agree with a crater, by placement."""
+    scale = placements.altitude_m
     altitude = float(np.exp(np.log(scale).mean()))
     per_log = _TEST_PX / _TEST_SIZE * altitude / camera.fx_px
     tree = KDTree(np.column_stack([local.centre_m[:, :2], per_log * np.log(local.radius_m)]))
     count = np.zeros(len(scale), int)
     for start in range(0, len(scale), 2000):
         own = slice(start, start + 2000)
-        turned = _turned(offset[None], turn[own, None])
-        ground = shift[own, None] + scale[own, None, None] * turned
+        ground = placements.part(own).on_ground(offset)
         sizes = per_log * np.log(scale[own, None] * size[None])
         points = np.concatenate([ground, sizes[..., None]], axis=2).reshape(-1, 3)
         limit = _TEST_PX * altitude / camera.fx_px
         distance, _ = tree.query(points, distance_upper_bound=limit)
-        count[own] = np.isfinite(distance).reshape(len(turned), -1).sum(axis=1)
+        count[own] = np.isfinite(distance).reshape(len(ground), -1).sum(axis=1)
     return count
 
 

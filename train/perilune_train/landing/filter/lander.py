@@ -149,7 +149,7 @@ class Lander:
             self._restart(found)
         else:
             around = self._around
-            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
+            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting)
         self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
         return found
 

@@ -1,4 +1,4 @@
-"""Poses from craters, craters, and relative motions as measurements of the state."""
+"""Craters, and poses from craters, as measurements of the state."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,12 @@ from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.landing.filter.state import (
     ATTITUDE,
     COMMON,
-    LAST_ATTITUDE,
-    LAST_POSITION,
     N_ERRORS,
     POSITION,
     State,
     common_pattern,
 )
-from perilune_train.landing.filter.update import Update, passes_gate, updated, updated_by
+from perilune_train.landing.filter.update import passes_gate, updated
 
 _LEAST_WEIGHT = 0.1
 """Matches with a smaller weight in a fix are not used."""
@@ -38,13 +36,8 @@ def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_
     return passes_gate(innovation, spread)
 
 
-def pose_update(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> Update:
-    """Update by a pose of the camera, with a covariance as of `pose_fits`."""
-    return updated(state, *_pose_innovation(state, pose, rotation_camera_from_body), covariance)
-
-
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Shift and turn (6,) from the expected pose, and their derivative (6, 27)."""
+    """Shift and turn (6,) from the expected pose, and their derivative (6, 21)."""
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
     by_error = np.zeros((6, N_ERRORS))
@@ -54,34 +47,6 @@ def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array)
     return np.concatenate([pose.position_m - state.position_m, turn]), by_error
 
 
-def motion_update(
-    state: State,
-    translation_m: Array,
-    rotation_c2_from_c1: Array,
-    covariance: Array,
-    rotation_camera_from_body: Array,
-) -> Update:
-    """Update by the motion of the camera since the last frame.
-
-    `covariance` (6, 6) is that of an alignment: of the turn from the left, radians, and the shift, metres, O_C of the
-    later frame.
-    """
-    mounting = rotation_camera_from_body
-    first, second = (
-        mounting @ rotation.T for rotation in (state.last_rotation_site_from_body, state.rotation_site_from_body)
-    )
-    turned = second @ first.T
-    moved = first @ (state.position_m - state.last_position_m)
-    turn = rotation_vectors(rotation_c2_from_c1 @ turned.T)
-    innovation = np.concatenate([turn, turned @ (moved - translation_m)])
-    by_error = np.zeros((6, N_ERRORS))
-    by_error[:3, ATTITUDE], by_error[:3, LAST_ATTITUDE] = -mounting, turned @ mounting
-    by_error[3:, POSITION], by_error[3:, LAST_POSITION] = -second, second
-    x, y, z = moved
-    by_error[3:, LAST_ATTITUDE] = -turned @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ mounting
-    return updated(state, innovation, by_error, covariance)
-
-
 def craters_update(
     state: State,
     fix: Fix,
@@ -89,8 +54,8 @@ def craters_update(
     catalogue: Catalogue,
     camera: Camera,
     rotation_camera_from_body: Array,
-) -> Update:
-    """Update by the craters that a fix has matched, with their offsets as part of the state.
+) -> State:
+    """The state after the craters that a fix has matched, with their offsets as part of the state.
 
     Craters that are in view but not matched stay in the state: a crater that is missed in one frame must not bring its
     error of the catalogue as new information in the next.
@@ -127,7 +92,7 @@ def craters_update(
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
     number = np.arange(len(noise))
     spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
-    return updated_by(state, innovation, crossed, spread, gated=False)
+    return updated(state, innovation, crossed, spread)
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:

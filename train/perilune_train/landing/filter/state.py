@@ -1,13 +1,21 @@
 """State of the lander, and small errors of it.
 
-The error state begins with 21 parts: shift and change of velocity in O_L (metres, metres per second), turn of the body
-from the right (radians, O_B), errors of the gyroscope's and the accelerometer's bias, and shift and turn of the pose at
-the last frame, which measurements of relative motion refer to (Roumeliotis & Burdick 2002, doi
-10.1109/ROBOT.2002.1014801). Behind them come five numbers of an error that all sightings of craters share, the height
-of the ground below, and an offset over ground of every crater in view. Errors of the catalogue, of the detector and of
-the ground's height repeat from frame to frame; taken for noise, they would make the filter sure of what it does not
-know. Last come the poses of earlier frames, if they are kept: later measurements correct them, which makes a smoother
-(stochastic cloning of all poses).
+Parts of the error state, in this order:
+
+    POSITION     shift, metres, O_L                                              3
+    VELOCITY     change of velocity, metres per second, O_L                      3
+    ATTITUDE     turn of the body from the right, radians, O_B                   3
+    GYRO_BIAS    error of the gyroscope's bias, radians per second, O_B          3
+    FORCE_BIAS   error of the accelerometer's bias, metres per second^2, O_B     3
+    COMMON       image error that all sightings of craters share, pixels         5
+    GROUND       height of the ground below, metres                              1
+    (craters)    offset of each crater in view over ground, metres, O_L          2 each
+    (poses)      shift and turn of each kept pose, as POSITION and ATTITUDE      6 each
+
+Errors of the catalogue, of the detector and of the ground's height repeat from frame to frame. A filter that treats
+them as noise averages them over frames and states too small a covariance, so they are parts of the state. Poses of
+earlier frames are kept on request: later measurements correct them, which makes the filter a smoother (stochastic
+cloning, Roumeliotis & Burdick 2002, doi 10.1109/ROBOT.2002.1014801).
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,10 +28,9 @@ from perilune_train.compiled import compiled
 
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
-LAST_POSITION, LAST_ATTITUDE = slice(15, 18), slice(18, 21)
-COMMON, GROUND = slice(21, 26), slice(26, 27)
-N_ERRORS = 27
-"""Parts of the error state without the craters."""
+COMMON, GROUND = slice(15, 20), slice(20, 21)
+N_ERRORS = 21
+"""Parts of the error state without craters and kept poses."""
 
 _COMMON_SIGMAS_PX = np.array([0.08, 0.08, 0.15, 0.2, 0.2])
 """Deviations of what sightings share, from the validation scenes of `shipped-nav`."""
@@ -45,20 +52,16 @@ class State:
     """Bias of the gyroscope (3,), O_B."""
     force_bias_mps2: Array
     """Bias of the accelerometer (3,), O_B."""
-    last_position_m: Array
-    """Position (3,) at the last frame."""
-    last_rotation_site_from_body: Array
-    """Attitude (3, 3) at the last frame."""
     common_px: Array
-    """What all sightings share (5,), pixels: as `common_pattern` has it."""
+    """Coefficients (5,), pixels, of the error that all sightings share, see `common_pattern`."""
     ground_m: float
-    """Height of the ground below, by that of the nearest craters of the catalogue."""
+    """Height of the ground below, relative to the median height of the nearest craters of the catalogue."""
     craters: NDArray[np.integer]
-    """Craters in view (n,): places in the catalogue."""
+    """Craters in view (n,): rows of the catalogue."""
     offsets_m: Array
-    """How far they appear from their place in the catalogue (n, 2), O_L, x and y."""
+    """Offsets (n, 2), x and y in O_L, of their detected centres from those of the catalogue."""
     covariance: Array
-    """Covariance of the error state (27 + 2 n + 6 m, 27 + 2 n + 6 m)."""
+    """Covariance of the error state (21 + 2 n + 6 m, 21 + 2 n + 6 m)."""
     past_position_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """Positions at earlier frames (m, 3), O_L."""
     past_rotation_site_from_body: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
@@ -70,19 +73,17 @@ class State:
     ) -> "State":
         """The state at the first frame.
 
-        `sigmas` (15,) are the deviations of the first 15 errors; `relief_m` is that of the ground's height.
+        `sigmas` (15,) are the standard deviations of the first 15 errors, `relief_m` that of the ground's height.
         """
         none = np.zeros(3)
-        pose = position_m, rotation_site_from_body
-        covariance = np.diag(np.square(np.concatenate([sigmas, np.zeros(6), _COMMON_SIGMAS_PX, [relief_m]])))
-        state = cls(
-            0.0, position_m, velocity_mps, rotation_site_from_body, none, none, *pose,
+        covariance = np.diag(np.square(np.concatenate([sigmas, _COMMON_SIGMAS_PX, [relief_m]])))
+        return cls(
+            0.0, position_m, velocity_mps, rotation_site_from_body, none, none,
             np.zeros(5), 0.0, np.zeros(0, int), np.zeros((0, 2)), covariance,
         )  # fmt: skip
-        return state.with_frame()
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """The state with an estimated error (27 + 2 n + 6 m,) removed, and its new covariance, which is symmetric."""
+        """The state with an estimated error (21 + 2 n + 6 m,) removed, and its new covariance, which is symmetric."""
         end = N_ERRORS + 2 * len(self.craters)
         past = error[end:].reshape(-1, 6)
         return State(
@@ -92,8 +93,6 @@ class State:
             self.rotation_site_from_body @ matrix_from_rotation_vector(error[ATTITUDE]),
             self.gyro_bias_radps + error[GYRO_BIAS],
             self.force_bias_mps2 + error[FORCE_BIAS],
-            self.last_position_m + error[LAST_POSITION],
-            self.last_rotation_site_from_body @ matrix_from_rotation_vector(error[LAST_ATTITUDE]),
             self.common_px + error[COMMON],
             self.ground_m + float(error[GROUND][0]),
             self.craters,
@@ -101,17 +100,6 @@ class State:
             covariance,
             self.past_position_m + past[:, :3],
             self.past_rotation_site_from_body @ rotation_matrices(past[:, 3:]),
-        )
-
-    def with_frame(self) -> "State":
-        """The state with its present pose as that of the last frame."""
-        copy = np.eye(len(self.covariance))
-        copy[LAST_POSITION], copy[LAST_ATTITUDE] = copy[POSITION].copy(), copy[ATTITUDE].copy()
-        return replace(
-            self,
-            last_position_m=self.position_m,
-            last_rotation_site_from_body=self.rotation_site_from_body,
-            covariance=copy @ self.covariance @ copy.T,
         )
 
     def keeping_pose(self) -> "State":

@@ -10,7 +10,6 @@ from perilune_shared.dataset.manifest import open_single
 from perilune_shared.geometry.frames import Array
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import new_folder, write_text
-from perilune_shared.storage.store import Address
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import PosePrior
 from perilune_train.landing.craters.locate import locate
@@ -28,7 +27,7 @@ from perilune_train.motion.network import check_motion, load_navigator, predict
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import write_metrics
-from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.records.provenance import EvaluatedSplit, check_terrain, read_provenance
 from perilune_train.training.begin import hashes_of
 from perilune_train.training.runs import RunFolder, load_weights
 
@@ -37,21 +36,17 @@ PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png"
 
 
 def fly_methods(
-    address: Address,
-    split: str,
-    navigator: Path,
-    detector: Path,
-    out: Path,
-    allow_overlap: bool = False,
-    maps: Path | None = None,
+    evaluated: EvaluatedSplit, navigator: Path, detector: Path, out: Path, maps: Path | None = None
 ) -> pd.DataFrame:
-    """Fly all methods over a split; returns one row per method. `maps` is the folder of a map by our own detector.
+    """Fly all methods over a split, with two networks; returns one row per method.
 
-    Writes methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
+    `navigator` and `detector` are folders of runs, `maps` is the folder of a map from `navigate map`. Writes
+    methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
     pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`, or nothing. Raises
-    UserError if a network was fitted to the terrain of the split, unless `allow_overlap`, or if the dataset lacks
+    UserError if a network was fitted to the terrain of the split and that is not accepted, or if the dataset lacks
     frames.
     """
+    address, split = evaluated.dataset, evaluated.split
     # Record the commit at the start: the checkout may change meanwhile.
     run_record()
     dataset = open_single(address)
@@ -60,7 +55,7 @@ def fly_methods(
     fusion = fusion_of(best["navigator"], contents["navigator"]["architecture"])
     check_motion(best["navigator"], contents["navigator"]["architecture"])
     checks = [
-        check_terrain(read_provenance(contents[name], path), dataset, split, allow_overlap)
+        check_terrain(read_provenance(contents[name], path), dataset, split, evaluated.allow_overlap)
         for name, path in best.items()
     ]
     mapped = {} if maps is None else read_maps(maps, dataset)

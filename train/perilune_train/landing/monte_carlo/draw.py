@@ -21,8 +21,8 @@ class Draw:
     """The descent, with the detections of the scenario."""
     instruments: Instruments
     """Measurements with the drawn inertial errors."""
-    off: Array
-    """True errors of the start (9,): position, m, velocity, m/s, attitude, rad."""
+    start_error: Array
+    """Error of the start (9,), as in `Start.error`."""
 
 
 def drawn(
@@ -38,11 +38,11 @@ def drawn(
     `reference` has inertial measurements whose own errors are small beside those of `grade`; they are taken as the true
     motion. Ranges are as recorded. `sigmas` are the stated errors of the start, position, velocity and attitude first.
     """
-    off = sigmas[:9] * rng.normal(size=9)
+    start_error = sigmas[:9] * rng.normal(size=9)
     instruments = _measured(reference, grade, rng)
     if scenario == "wrong-prior":
         heading = rng.uniform(0, 2 * np.pi)
-        off[:2] = WRONG_PRIOR_M * np.array([np.cos(heading), np.sin(heading)])
+        start_error[:2] = WRONG_PRIOR_M * np.array([np.cos(heading), np.sin(heading)])
     elif scenario == "outage":
         duration_s = descent.time_s[-1]
         start_s = rng.uniform(0.0, max(duration_s - OUTAGE_S, 0.0))
@@ -52,7 +52,7 @@ def drawn(
     elif scenario == "false-detections":
         size_px = np.array([descent.camera.width_px, descent.camera.height_px])
         descent = replace(descent, sightings=[_with_false(own, size_px, rng) for own in descent.sightings])
-    return Draw(descent, instruments, off)
+    return Draw(descent, instruments, start_error)
 
 
 def _measured(reference: Instruments, grade: InertialGrade, rng: np.random.Generator) -> Instruments:

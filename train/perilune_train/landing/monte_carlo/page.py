@@ -1,13 +1,12 @@
 """The page of a Monte Carlo run."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from perilune_shared.export.foreign_text import code_span, for_markdown
-from perilune_train.landing.monte_carlo.scenario import SCENARIOS
+from perilune_train.landing.monte_carlo.scenario import SCENARIOS, Draws
 from perilune_train.landing.monte_carlo.summary import by_trajectory, run_summary
 from perilune_train.records.markdown import number, table
 
@@ -29,10 +28,8 @@ _CAPTIONS = {
 }
 
 
-def page_of(
-    dataset: str, split: str, about: Mapping[str, Any], rows: pd.DataFrame, seconds: float, pictures: Sequence[str]
-) -> str:
-    """The page as Markdown; `about` has scenario, draws, seed and attitude_deg."""
+def page_of(dataset: str, split: str, draws: Draws, rows: pd.DataFrame, seconds: float, pictures: Sequence[str]) -> str:
+    """The page as Markdown."""
     overall, own = run_summary(rows), by_trajectory(rows)
     n_flights = len(rows.groupby(["scene_id", "trajectory_id", "draw"]))
     cells = [["all", *_cells(overall)]]
@@ -41,11 +38,11 @@ def page_of(
         "# Monte Carlo of the navigation filter",
         "",
         f"Dataset {code_span(dataset)}, split {for_markdown(split)}, "
-        f"scenario `{about['scenario']}`: {SCENARIOS[about['scenario']]}.",
-        f"Descents: {len(own)}, with {about['draws']} draws of each, {n_flights} flights, {len(rows)} frames, seed "
-        f"{about['seed']}; {seconds / 60:.1f} minutes.",
+        f"scenario `{draws.scenario}`: {SCENARIOS[draws.scenario]}.",
+        f"Descents: {len(own)}, with {draws.count} draws of each, {n_flights} flights, {len(rows)} frames, seed "
+        f"{draws.seed}; {seconds / 60:.1f} minutes.",
         "",
-        f"Drawn: errors of the start (60 m, 1 m/s and {about['attitude_deg']:g} degrees on each axis), of the tactical "
+        f"Drawn: errors of the start (60 m, 1 m/s and {draws.attitude_deg:g} degrees on each axis), of the tactical "
         "inertial unit, and of the catalogue (1 m, 3 % of the diameter, 10 % missing, 5 % false). Not drawn: "
         "detections and ranges, which are those of the recorded descent. Draws of a descent share their errors, so "
         "they say how much a result depends on what is drawn, and not how it would be on other ground.",

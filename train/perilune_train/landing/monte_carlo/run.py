@@ -29,16 +29,16 @@ from perilune_train.landing.craters.catalogue import (
     with_errors,
 )
 from perilune_train.landing.filter.flight import Instruments, fly_together, together
-from perilune_train.landing.methods.flights import default_sigmas, lander_of, mounting_of, row_of, table_of
+from perilune_train.landing.methods.flights import Start, default_sigmas, lander_of, mounting_of, row_of, table_of
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
 from perilune_train.landing.monte_carlo.draw import drawn
 from perilune_train.landing.monte_carlo.figures import draw_bands, draw_consistency
 from perilune_train.landing.monte_carlo.page import page_of
-from perilune_train.landing.monte_carlo.scenario import Scenario
+from perilune_train.landing.monte_carlo.scenario import Draws, Scenario
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.marks import mark_files
-from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.records.provenance import EvaluatedSplit, check_terrain, read_provenance
 from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, TABLE = "monte_carlo.md", "draws.parquet"
@@ -70,8 +70,8 @@ class Job:
 
     sites: list[Site]
     """All descents."""
-    mounting: Array
-    """rotation_camera_from_body (3, 3)."""
+    rotation_camera_from_body: Array
+    """Mounting of the camera (3, 3)."""
     sigmas: Array
     """Stated errors of the start."""
     scenario: Scenario
@@ -81,43 +81,34 @@ class Job:
 
 
 def fly_draws(
-    address: Address,
-    split: str,
-    detector: Path,
-    out: Path,
-    scenario: Scenario = "nominal",
-    draws: int = 200,
-    attitude_deg: float = 0.5,
-    seed: int = 0,
-    workers: int | None = None,
-    allow_overlap: bool = False,
+    evaluated: EvaluatedSplit, detector: Path, out: Path, draws: Draws, workers: int | None = None
 ) -> pd.DataFrame:
-    """Fly the filter over `draws` random draws of every descent; returns a row per draw and frame.
+    """Fly the filter over random draws of every descent of a split; returns a row per draw and frame.
 
-    The detector runs once over every frame. Writes monte_carlo.md, draws.parquet and pictures to the new folder `out`,
-    or nothing. The result does not depend on the number of workers. Raises UserError if the detector was fitted to the
-    terrain of the split, unless `allow_overlap`, or if the dataset lacks frames or inertial measurements.
+    The detector of the run `detector` runs once over every frame. Writes monte_carlo.md, draws.parquet and pictures to
+    the new folder `out`, or nothing. The result does not depend on the number of workers, by default one per core.
+    Raises UserError if the detector was fitted to the terrain of the split and that is not accepted, or if the dataset
+    lacks frames or inertial measurements.
     """
-    dataset = open_single(address)
+    dataset, split = open_single(evaluated.dataset), evaluated.split
     best = RunFolder(detector).best
-    check = check_terrain(read_provenance(load_weights(best), best), dataset, split, allow_overlap)
+    check = check_terrain(read_provenance(load_weights(best), best), dataset, split, evaluated.allow_overlap)
     with new_folder(out) as folder:
         job = Job(
-            sites_of(dataset, split, detector, address),
+            sites_of(dataset, split, detector, evaluated.dataset),
             mounting_of(dataset),
-            default_sigmas(GRADE, attitude_deg),
-            scenario,
-            seed,
+            default_sigmas(GRADE, draws.attitude_deg),
+            draws.scenario,
+            draws.seed,
         )
         begun = time.perf_counter()
-        rows = pd.concat(all_draws(job, draws, workers or usable_cores()), ignore_index=True)
+        rows = pd.concat(all_draws(job, draws.count, workers or usable_cores()), ignore_index=True)
         rows = rows.sort_values(["scene_id", "trajectory_id", "draw", "time_s"], ignore_index=True)
         rows.to_parquet(folder / TABLE, index=False)
         draw_bands(folder / PICTURES[0], rows)
         draw_consistency(folder / PICTURES[1], rows)
-        about = {"scenario": scenario, "draws": draws, "seed": seed, "attitude_deg": attitude_deg}
         seconds = time.perf_counter() - begun
-        write_markdown(folder / PAGE, page_of(dataset.info.name, split, about, rows, seconds, PICTURES))
+        write_markdown(folder / PAGE, page_of(dataset.info.name, split, draws, rows, seconds, PICTURES))
         mark_files(folder, (PAGE, TABLE, *PICTURES), str(check.metrics()["terrain/mark"]))
     return rows
 
@@ -151,14 +142,16 @@ def flown_draws(job: Job, place: int, draws: Sequence[int]) -> list[pd.DataFrame
         rng = np.random.default_rng([job.seed, place, draw])
         catalogue = with_errors(site.catalogue, CatalogueErrors(), rng)
         one = drawn(site.descent, site.reference, GRADE, sigmas, job.scenario, rng)
-        landers.append(lander_of(one.descent, job.mounting, catalogue, GRADE, sigmas, one.off))
+        landers.append(
+            lander_of(one.descent, job.rotation_camera_from_body, catalogue, Start(GRADE, sigmas, one.start_error))
+        )
         drawn_ones.append(one)
     instruments = together([one.instruments for one in drawn_ones])
     seen = zip(*(one.descent.sightings for one in drawn_ones), strict=True)
     rows: list[list[dict[str, object]]] = [[] for _ in draws]
     for estimates in fly_together(landers, instruments, site.descent.time_s, seen):
         for own, estimate in zip(rows, estimates, strict=True):
-            own.append(row_of(site.descent, estimate, job.mounting))
+            own.append(row_of(site.descent, estimate, job.rotation_camera_from_body))
     return [table_of(site.descent, own).assign(draw=draw) for own, draw in zip(rows, draws, strict=True)]
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.motion.classical.contrast import Level, sampled
+from perilune_train.motion.classical.estimate import ExpectedMotion, GroundPlane
 from perilune_train.motion.classical.ground import N_NODES, Heights, node_weights
 from perilune_train.motion.classical.klt import SHIFT_SHARE
 
@@ -35,16 +36,10 @@ _N_UNKNOWN = _N_POSE + N_NODES
 class Prior:
     """What is known of a pair of frames before they are aligned."""
 
-    translation_m: Array
-    """Expected motion (3,), O_C of frame 1."""
-    rotation_c2_from_c1: Array
-    """Expected rotation (3, 3)."""
-    turn_sigma_rad: float
-    """Standard deviation of the rotation on each axis."""
-    down_c: Array
-    """Unit vector (3,) towards the ground in O_C of a level camera."""
-    altitude_m: float
-    """Altitude of frame 1 above the ground plane."""
+    motion: ExpectedMotion
+    """Expected motion."""
+    plane: GroundPlane
+    """The ground plane below frame 1, if the camera is level."""
     heights: Heights
     """Heights of the ground in view of frame 1."""
 
@@ -71,13 +66,14 @@ class State:
 
     def offset(self, prior: Prior) -> Array:
         """Difference of all unknowns (n_unknown,) to the prior."""
-        turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.rotation_c2_from_c1.T)
-        shift = self.rotation_c2_from_c1 @ (prior.translation_m - self.translation_m)
+        turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.motion.rotation_c2_from_c1.T)
+        shift = self.rotation_c2_from_c1 @ (prior.motion.translation_m - self.translation_m)
         return np.concatenate([turn, shift, self.tilt_rad, self.height_m - prior.heights.mean_m])
 
     def down_c(self, prior: Prior) -> Array:
         """Unit vector (3,) towards the ground in O_C of frame 1."""
-        down = prior.down_c + self.tilt_rad @ _across(prior.down_c)
+        level = prior.plane.down_c
+        down = level + self.tilt_rad @ _across(level)
         return down / np.linalg.norm(down)
 
 
@@ -87,8 +83,8 @@ def align(first: list[Level], second: list[Level], prior: Prior, start: State) -
     Turns are from the left, radians; shifts are metres, O_C of frame 2.
     """
     precision = np.zeros((_N_UNKNOWN, _N_UNKNOWN))
-    shift_sigma_m = SHIFT_SHARE * prior.altitude_m
-    sigmas = [prior.turn_sigma_rad] * 3 + [shift_sigma_m] * 3 + [_TILT_SIGMA_RAD] * 2
+    shift_sigma_m = SHIFT_SHARE * prior.plane.altitude_m
+    sigmas = [prior.motion.turn_sigma_rad] * 3 + [shift_sigma_m] * 3 + [_TILT_SIGMA_RAD] * 2
     precision[range(_N_POSE), range(_N_POSE)] = 1 / np.square(sigmas)
     precision[_N_POSE:, _N_POSE:] = np.linalg.inv(prior.heights.covariance_m2)
     state = start
@@ -103,7 +99,7 @@ def align(first: list[Level], second: list[Level], prior: Prior, start: State) -
             covariance = scale * np.linalg.inv(scale * normal)
             step = -covariance @ gradient
             state = state.changed(step)
-            if np.abs(step[:6] / np.repeat([1, prior.altitude_m], 3)).max() < _SMALL_STEP:
+            if np.abs(step[:6] / np.repeat([1, prior.plane.altitude_m], 3)).max() < _SMALL_STEP:
                 break
     return state, covariance
 
@@ -125,7 +121,7 @@ class _Residuals:
         """Weighted normal matrix (n_unknown, n_unknown) and gradient (n_unknown,) of the squared differences."""
         down = state.down_c(self._prior).astype(np.float32)
         along = self._rays @ down
-        drop_m = self._prior.altitude_m - self._nodes @ state.height_m.astype(np.float32)
+        drop_m = self._prior.plane.altitude_m - self._nodes @ state.height_m.astype(np.float32)
         points = self._rays * (drop_m / along)[:, None]
         rotation = state.rotation_c2_from_c1.astype(np.float32)
         moved = (points - state.translation_m.astype(np.float32)) @ rotation.T
@@ -145,7 +141,7 @@ class _Residuals:
         found: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
         # By a turn w from the left a point X moves by w x X, and the value by w . (X x derivative).
         found[:, :3], found[:, 3:6] = np.cross(moved, by_moved), by_moved
-        tilted = self._rays @ _across(self._prior.down_c).T.astype(np.float32)
+        tilted = self._rays @ _across(self._prior.plane.down_c).T.astype(np.float32)
         found[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
         found[:, _N_POSE:] = self._nodes * (-np.einsum("ni,ni->n", by_first, self._rays) / along)[:, None]
         return found

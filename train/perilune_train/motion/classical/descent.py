@@ -4,7 +4,7 @@ import numpy as np
 
 from perilune_train.motion.classical.alignment import Prior, State, align
 from perilune_train.motion.classical.contrast import pyramid
-from perilune_train.motion.classical.estimate import EstimatedMotion
+from perilune_train.motion.classical.estimate import EstimatedMotion, ExpectedMotion, GroundPlane
 from perilune_train.motion.classical.ground import N_NODES, Heights, carried, unknown_heights
 from perilune_train.motion.classical.klt import NOMINAL_TURN_SIGMA_RAD, klt_motion, stretched
 from perilune_train.motion.data.gyroscope import GyroscopeTurns
@@ -30,10 +30,13 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
     motions, covariances = [], []
     for i in range(trajectory.n_pairs):
         second = pyramid(trajectory.images[i + 1], camera, _LEVELS)
-        expected = nominal_translation[i], rotation[i]
+        expected, plane = (
+            ExpectedMotion(nominal_translation[i], rotation[i], turn_sigma[i]),
+            GroundPlane(down, altitude_m),
+        )
         # KLT must know the gyroscope's rotation too: its shift balances an error of its own rotation.
-        tracked = klt_motion(camera, grey[i], grey[i + 1], *expected, down, altitude_m, turn_sigma[i])
-        prior = Prior(*expected, turn_sigma[i], down, altitude_m, heights)
+        tracked = klt_motion(camera, grey[i], grey[i + 1], expected, plane)
+        prior = Prior(expected, plane, heights)
         start = State(tracked.translation_m, tracked.rotation_c2_from_c1, np.zeros(2), heights.mean_m)
         found, covariance = align(first, second, prior, start)
         motion = found.translation_m, found.rotation_c2_from_c1

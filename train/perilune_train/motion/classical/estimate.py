@@ -1,9 +1,31 @@
-"""What a method of relative motion returns for a trajectory."""
+"""What the classical methods know of a pair of frames, and what they return for a trajectory."""
 
 from dataclasses import dataclass
 
 from perilune_shared.geometry.frames import Array
 from perilune_train.motion.data.trajectories import Motion
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedMotion:
+    """What is known of the motion between two frames before the images are compared."""
+
+    translation_m: Array
+    """Motion (3,), metres, O_C of frame 1."""
+    rotation_c2_from_c1: Array
+    """Rotation (3, 3)."""
+    turn_sigma_rad: float
+    """Standard deviation of the rotation about each axis, radians."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroundPlane:
+    """The plane below a camera."""
+
+    down_c: Array
+    """Unit vector (3,) towards the ground, O_C."""
+    altitude_m: float
+    """Distance of the camera from the plane, metres."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import numpy as np
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.data.frames import normalised
-from perilune_train.motion.classical.estimate import EstimatedMotion
+from perilune_train.motion.classical.estimate import EstimatedMotion, ExpectedMotion, GroundPlane
 from perilune_train.motion.data.gyroscope import GyroscopeTurns
 from perilune_train.motion.data.trajectories import Trajectory
 from perilune_train.motion.geometry import (
@@ -68,22 +68,15 @@ def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) 
         rotation, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
     images = stretched(trajectory.images)
     altitude_m = float(trajectory.position_m[0, 2])
-    found = []
+    pairs = []
     for i in range(trajectory.n_pairs):
-        one = klt_motion(
-            trajectory.camera,
-            images[i],
-            images[i + 1],
-            nominal_translation[i],
-            rotation[i],
-            trajectory.down_c,
-            altitude_m,
-            turn_sigma[i],
-        )
-        altitude_m -= float(trajectory.down_c @ one.translation_m)
-        found.append(one)
-    motion = np.stack([one.translation_m for one in found]), np.stack([one.rotation_c2_from_c1 for one in found])
-    return EstimatedMotion(motion, np.stack([one.covariance for one in found]))
+        expected = ExpectedMotion(nominal_translation[i], rotation[i], turn_sigma[i])
+        plane = GroundPlane(trajectory.down_c, altitude_m)
+        tracked = klt_motion(trajectory.camera, images[i], images[i + 1], expected, plane)
+        altitude_m -= float(trajectory.down_c @ tracked.translation_m)
+        pairs.append(tracked)
+    motion = np.stack([pair.translation_m for pair in pairs]), np.stack([pair.rotation_c2_from_c1 for pair in pairs])
+    return EstimatedMotion(motion, np.stack([pair.covariance for pair in pairs]))
 
 
 def stretched(images: np.ndarray) -> np.ndarray:
@@ -95,27 +88,23 @@ def klt_motion(
     camera: Camera,
     image_1: np.ndarray,
     image_2: np.ndarray,
-    nominal_translation_m: Array,
-    nominal_rotation_c2_from_c1: Array,
-    plane_normal_c1: Array,
-    altitude_m: float,
-    turn_sigma_rad: float = NOMINAL_TURN_SIGMA_RAD,
+    expected: ExpectedMotion,
+    plane: GroundPlane,
 ) -> Tracked:
-    """Motion between two 8-bit images.
+    """Motion between two 8-bit images (height, width), over the ground plane below the first.
 
-    `turn_sigma_rad` is the standard deviation of the nominal rotation; that of a gyroscope if it gave the rotation.
-    If fewer than 8 corners can be tracked, returns the nominal motion with the prior's covariance and 0 tracks.
+    If fewer than 8 corners can be tracked, returns the expected motion with the prior's covariance and 0 tracks.
     """
-    nominal = plane_homography(
-        camera.matrix, nominal_translation_m, nominal_rotation_c2_from_c1, plane_normal_c1, altitude_m
+    homography = plane_homography(
+        camera.matrix, expected.translation_m, expected.rotation_c2_from_c1, plane.down_c, plane.altitude_m
     )
-    pixels_1, pixels_2 = _tracks(image_1, image_2, nominal)
+    pixels_1, pixels_2 = _tracks(image_1, image_2, homography)
     if len(pixels_1) < _MIN_TRACKS:
-        variance = np.square([turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
-        return Tracked(nominal_translation_m, nominal_rotation_c2_from_c1, np.diag(variance), 0)
+        variance = np.square([expected.turn_sigma_rad] * 3 + [SHIFT_SHARE * plane.altitude_m] * 3)
+        return Tracked(expected.translation_m, expected.rotation_c2_from_c1, np.diag(variance), 0)
     rays = camera.rays(pixels_1)
-    points_c1 = rays * (altitude_m / (rays @ plane_normal_c1))[:, None]
-    return _fit(camera, points_c1, pixels_2, nominal_translation_m, nominal_rotation_c2_from_c1, turn_sigma_rad)
+    points_c1 = rays * (plane.altitude_m / (rays @ plane.down_c))[:, None]
+    return _fit(camera, points_c1, pixels_2, expected)
 
 
 def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tuple[Array, Array]:
@@ -142,15 +131,13 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
     return pixels_1, apply_homography(homography, found.reshape(-1, 2)[kept].astype(np.float64) + 0.5)
 
 
-def _fit(
-    camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array, turn_sigma_rad: float
-) -> Tracked:
+def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMotion) -> Tracked:
     """Fit the motion that maps points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
-    nominal_translation_m, nominal_rotation = translation_m, rotation
+    translation_m, rotation = expected.translation_m, expected.rotation_c2_from_c1
     altitude_m = float(np.median(points_c1[:, 2]))
-    prior = 1 / np.square([turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
+    prior = 1 / np.square([expected.turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
     for _ in range(_ITERATIONS):
         points = (points_c1 - translation_m) @ rotation.T
         error = camera.project(points) - pixels_2
@@ -169,7 +156,10 @@ def _fit(
         information = normal / (float(np.median(distance)) / _MEDIAN_OF_SIGMA) ** 2 + np.diag(prior)
         normal += np.diag(prior) * spread**2
         offset = np.concatenate(
-            [rotation_vectors(rotation @ nominal_rotation.T), rotation @ (nominal_translation_m - translation_m)]
+            [
+                rotation_vectors(rotation @ expected.rotation_c2_from_c1.T),
+                rotation @ (expected.translation_m - translation_m),
+            ]
         )
         # Metres and radians have very different scales; a unit diagonal keeps the system well conditioned.
         scale = 1 / np.sqrt(np.diag(normal))

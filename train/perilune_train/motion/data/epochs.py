@@ -17,8 +17,8 @@ class TrainingSequences(torch_data.Dataset):
     """The training sequences of a share; they depend on trajectories, seed and epoch only.
 
     A trajectory gives about as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into
-    it, each with its own random start. A sequence belongs to the process of its trajectory. `augmented` sequences are
-    mirrored and, with `jitter`, moved (see `pair_sequence`).
+    it, each with its own random start. A sequence belongs to the process of its trajectory. Sequences
+    of `warp` are mirrored and, with `jitter`, moved (see `pair_sequence`).
     """
 
     def __init__(
@@ -27,12 +27,11 @@ class TrainingSequences(torch_data.Dataset):
         n_pairs: int,
         *,
         warp: bool,
-        augmented: bool,
         jitter: Jitter | None,
         seed: int,
         share: Share,
     ):
-        self.trajectories, self.warp, self.augmented = trajectories, warp, augmented
+        self.trajectories, self.warp = trajectories, warp
         self.jitter, self.seed, self.share = jitter, seed, share
         self.n_pairs = min(n_pairs, *(trajectory.n_pairs for trajectory in trajectories))
         self.counts = [round(trajectory.n_pairs / self.n_pairs) for trajectory in trajectories]
@@ -62,6 +61,6 @@ class TrainingSequences(torch_data.Dataset):
     def augmented_sequence(self, key: Key, trajectory: Trajectory, start: int) -> Sequence:
         """The pairs of a trajectory from `start` on, with the augmentation of a key."""
         epoch, place, number, first = key
-        rng = np.random.default_rng([self.seed, epoch, place]) if self.augmented else None
+        rng = np.random.default_rng([self.seed, epoch, place]) if self.warp else None
         sequence = pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)
         return replace(sequence, place=(number, first))

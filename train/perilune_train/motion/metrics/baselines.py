@@ -21,8 +21,8 @@ CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
 
 
 @dataclass(frozen=True, slots=True)
-class Baselines:
-    """Motions of the test trajectories by each method, and their covariances by those methods that state them."""
+class MethodMotions:
+    """Motions of trajectories by each method, and their covariances by those methods that state them."""
 
     motions: dict[str, list[Motion]]
     """Motions of each trajectory, by method."""
@@ -30,7 +30,7 @@ class Baselines:
     """Covariances (n - 1, 6, 6) of each trajectory, as in `EstimatedMotion`, by method."""
 
 
-def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
+def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotions:
     """Estimate by all methods. Without training trajectories there are no mean motions, without gyroscope no method
     that uses one.
     """
@@ -51,7 +51,7 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
     if training:
         found["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
         found["mean"] = [mean_motion(training, trajectory) for trajectory in test]
-    return Baselines(found, covariances)
+    return MethodMotions(found, covariances)
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:

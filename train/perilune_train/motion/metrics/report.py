@@ -6,9 +6,9 @@ from pathlib import Path
 import pandas as pd
 
 from perilune_shared.export.foreign_text import for_markdown
-from perilune_shared.geometry.frames import Array
 from perilune_shared.storage.files import written_aside
-from perilune_train.motion.data.trajectories import Motion, Pose, Trajectory
+from perilune_train.motion.data.trajectories import Pose, Trajectory
+from perilune_train.motion.metrics.baselines import MethodMotions
 from perilune_train.motion.metrics.figures import draw_errors, draw_pose_errors, draw_trajectory
 from perilune_train.motion.metrics.floors import FLOORS
 from perilune_train.motion.metrics.metrics import motion_errors, pose_errors, pose_summary, summary, summary_spreads
@@ -34,8 +34,7 @@ def write_evaluation(
     own: str,
     split: str,
     trajectories: list[Trajectory],
-    motions: Mapping[str, list[Motion]],
-    covariances: Mapping[str, list[Array]],
+    estimates: MethodMotions,
     details: Mapping[str, float | int | str | None],
 ) -> None:
     """Write the errors of all methods on the trajectories of a split.
@@ -44,10 +43,13 @@ def write_evaluation(
     metrics.json: <split>/<figure> for the method `own`, <method>/<figure> for another network, baseline/<method>/...
     for the others, and `details`, which have the mark of the terrain check.
     """
-    errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
+    errors = {
+        method: motion_errors(trajectories, motions, estimates.covariances.get(method))
+        for method, motions in estimates.motions.items()
+    }
     rows = {method: summary(table) for method, table in errors.items()}
     _write_tables(folder, errors, rows)
-    drawn = {method: found[0] for method, found in motions.items() if method != "mean"}
+    drawn = {method: motions[0] for method, motions in estimates.motions.items() if method != "mean"}
     draw_trajectory(folder / "descent.png", trajectories[0], drawn, errors)
     draw_errors(folder / "errors.png", errors)
     mark_files(folder, _WRITTEN, str(details["terrain/mark"]))

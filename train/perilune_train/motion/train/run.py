@@ -18,11 +18,11 @@ from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.covariance import calibrate, stated_covariances
 from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import Trajectory, load_trajectories
-from perilune_train.motion.metrics.baselines import baselines
+from perilune_train.motion.metrics.baselines import MethodMotions, baselines
 from perilune_train.motion.metrics.report import write_evaluation
 from perilune_train.motion.network import Fusion, Scales, load_navigator, predict, predict_by_pairs
 from perilune_train.motion.train.pose_results import check_one_area, evaluate_pose_run
-from perilune_train.motion.train.task import NavigationTask
+from perilune_train.motion.train.task import Initial, NavigationTask
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import (
     Provenance,
@@ -35,6 +35,7 @@ from perilune_train.shipped.models import weights_file
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.fit import Hardware, Schedule, Wording, fit, own_share
 from perilune_train.training.runs import (
+    NamedRun,
     RunFolder,
     check_architecture,
     choose_device,
@@ -49,16 +50,13 @@ _PREFIX = "backbone."
 def navigate_run(
     settings: NavigateConfig,
     dataset_address: Address,
-    runs: Path,
-    name: str,
+    named: NamedRun,
     detector: Path | None,
-    overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> list[RunFolder]:
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
 
-    Resumes interrupted runs of the same settings, dataset and detector, and leaves finished ones unchanged; `overwrite`
-    replaces both.
+    Resumes interrupted runs of the same settings, dataset and detector, and leaves finished ones unchanged.
 
     `detector` is the default checkpoint for the stack network's backbone, used if it exists and has the same
     architecture; `settings.detector` must have it. Raises UserError on bad data, a checkpoint of another architecture,
@@ -68,10 +66,10 @@ def navigate_run(
     """
     console.quiet = not is_first_process()
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
-    names = {"warp": name, "stack": f"{name}-stack"}
-    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in fusions}
+    endings = {"warp": "", "stack": "-stack"}
+    folders = {fusion: named.folder("navigate", endings[fusion]) for fusion in fusions}
     with held(*folders.values()):
-        return _run(folders, settings, dataset_address, detector, overwrite, allow_overlap)
+        return _run(folders, settings, dataset_address, detector, named.overwrite, allow_overlap)
 
 
 def _run(
@@ -111,7 +109,7 @@ def _run(
             resume = states[fusion] == "resume"
             if fusion == "stack":
                 lightning.seed_everything(settings.seed, verbose=False)
-                task = NavigationTask(settings, fusion, trajectories, backbone, share)
+                task = NavigationTask(settings, fusion, trajectories, share, initial=Initial(backbone))
             else:
                 task = _warp_task(settings, trajectories, share, stream, start)
             task.provenance = terrain[fusion]
@@ -148,7 +146,7 @@ def _evaluate_motions(
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     motions, covariances = classical.motions, classical.covariances
-    # stack comes first, so that the table of the warp run, which finishes last, has both.
+    # The network stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
@@ -169,7 +167,7 @@ def _evaluate_motions(
             "network/parameters": sum(p.numel() for p in network.parameters()),
             **common[fusion],
         }
-        write_evaluation(run.root, fusion, "test", test, motions, covariances, details)
+        write_evaluation(run.root, fusion, "test", test, MethodMotions(motions, covariances), details)
 
 
 def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
@@ -194,9 +192,9 @@ def _warp_task(
     """Training of warp from random weights, or from the content of a checkpoint."""
     lightning.seed_everything(settings.seed, verbose=False)
     if start is None:
-        return NavigationTask(settings, "warp", trajectories, None, share, stream)
+        return NavigationTask(settings, "warp", trajectories, share, stream)
     scales = Scales(**start["architecture"]["scales"])
-    task = NavigationTask(settings, "warp", trajectories, None, share, stream, scales)
+    task = NavigationTask(settings, "warp", trajectories, share, stream, Initial(scales=scales))
     load_state(task.network, start["state_dict"], weights_file(str(settings.init_from)))
     return task
 

@@ -1,7 +1,7 @@
 """Training of the navigation networks."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import lightning
@@ -34,7 +34,7 @@ from perilune_train.motion.network import (
 from perilune_train.motion.pose import predict_pose
 from perilune_train.motion.train.stored import stored_features
 from perilune_train.motion.train.views import other_views
-from perilune_train.motion.train.windows import WindowPlaces, Windows, collated
+from perilune_train.motion.train.windows import OutputUnits, WindowPlaces, Windows, collated
 from perilune_train.records.provenance import Provenance
 from perilune_train.training.runs import choose_bf16, choose_device
 
@@ -78,6 +78,20 @@ def axis_weights(scales: Scales, target: Target) -> Tensor:
     return (spread_m / spread_m.square().mean().sqrt()).sqrt()
 
 
+@dataclass(frozen=True, slots=True)
+class Initial:
+    """What a training starts from in place of random weights and measured scales."""
+
+    backbone: dict[str, Tensor] | None = None
+    """Weights of a detector's backbone, by name."""
+    scales: Scales | None = None
+    """Scales of a network whose weights are loaded later."""
+
+
+RANDOM = Initial()
+"""Random weights; scales measured on the training trajectories."""
+
+
 class NavigationTask(lightning.LightningModule):
     """Training of one network: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
 
@@ -97,17 +111,16 @@ class NavigationTask(lightning.LightningModule):
         settings: NavigateConfig,
         fusion: Fusion,
         trajectories: list[Trajectory],
-        pretrained: dict[str, Tensor] | None = None,
         share: Share = ALONE,
         stream: Stream | None = None,
-        scales: Scales | None = None,
+        initial: Initial = RANDOM,
     ):
         super().__init__()
         self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
         # Initial weights predict motions on the scales of their own training.
         training = [one for one in trajectories if one.split == "train"]
-        self.scales = scales or Scales.measured(training, fusion, self.own.target)
+        self.scales = initial.scales or Scales.measured(training, fusion, self.own.target)
         self.architecture = {
             "fusion": fusion,
             "size_px": self.own.size_px,
@@ -124,9 +137,9 @@ class NavigationTask(lightning.LightningModule):
         self.network = network.to(memory_format=torch.channels_last)
         self.axis_weights: Tensor
         self.register_buffer("axis_weights", axis_weights(self.scales, self.own.target), persistent=False)
-        self.pretrained = frozenset(pretrained or ())
-        if pretrained:
-            self.network.backbone.load_state_dict(pretrained, strict=False)
+        self.pretrained = frozenset(initial.backbone or ())
+        if initial.backbone:
+            self.network.backbone.load_state_dict(initial.backbone, strict=False)
         self.provenance: Provenance | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.share = share
@@ -169,7 +182,6 @@ class NavigationTask(lightning.LightningModule):
     def _sequences(self) -> TrainingSequences:
         own: dict[str, Any] = {
             "warp": self.fusion == "warp",
-            "augmented": self.fusion == "warp",
             "jitter": self.jitter,
             "seed": self.settings.seed,
             "share": self.share,
@@ -230,7 +242,8 @@ class NavigationTask(lightning.LightningModule):
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
-            self.windows = Windows(*place, self.scales, self.own.target, self.device, self.views)
+            units = OutputUnits(self.own.target, self.scales)
+            self.windows = Windows(*place, units, self.device, self.views)
         stores, last = self.coarse and self.stores, self.current_epoch + 1 == self.own.coarse_epochs
         if stores and not self.stored:
             self._store()

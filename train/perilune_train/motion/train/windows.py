@@ -5,6 +5,7 @@ Nothing is prepared for a step but the places of its sequences, so that a GPU wa
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,6 +21,16 @@ from perilune_train.motion.train.views import view_homographies
 
 _LARGEST_SHARE = 0.25
 """Share of the free memory of a GPU that frames may take; more stay in the memory of the machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputUnits:
+    """What a stack network outputs, and in which units."""
+
+    target: Target
+    """Motion of the camera, or pose at the later frame."""
+    scales: Scales
+    """Scales between standardised outputs and metres or radians."""
 
 
 class WindowPlaces(TrainingSequences):
@@ -56,8 +67,7 @@ class Windows:
         trajectories: Sequence[Trajectory],
         numbers: Sequence[int],
         n_pairs: int,
-        scales: Scales,
-        target: Target,
+        units: OutputUnits,
         device: torch.device,
         views: Sequence[Trajectory] = (),
     ):
@@ -67,7 +77,7 @@ class Windows:
         self.frames: Tensor | None = None
         every = [*trajectories, *views]
         numbers = [version * count + number for version in range(versions) for number in numbers]
-        truths = [truth(every[number], scales, target) for number in numbers]
+        truths = [truth(every[number], units) for number in numbers]
         self.position, self.angles = (torch.cat(parts).to(device) for parts in zip(*truths, strict=True))
         """Standardised truths (pairs of all versions of all trajectories, 3)."""
         self.steps = torch.arange(n_pairs + 1, device=device)
@@ -108,12 +118,13 @@ class Windows:
         return frames.to(self.device)
 
 
-def truth(trajectory: Trajectory, scales: Scales, target: Target) -> tuple[Tensor, Tensor]:
+def truth(trajectory: Trajectory, units: OutputUnits) -> tuple[Tensor, Tensor]:
     """What a stack network should output for the pairs of a trajectory: positions and Euler angles (pairs, 3).
 
-    Both are standardised: translations or positions by mean and spread, angles by `rotation_rad` of `scales`.
+    Both are standardised: translations or positions by mean and spread, angles by `rotation_rad` of the scales.
     """
-    position_m, rotation = trajectory.pose if target == "pose" else trajectory.motion
+    scales = units.scales
+    position_m, rotation = trajectory.pose if units.target == "pose" else trajectory.motion
     if scales.mean_rotation is not None:
         rotation = rotation @ np.array(scales.mean_rotation).T
     position = (torch.from_numpy(position_m) - torch.tensor(scales.mean_m)) / torch.tensor(scales.spread_m)

@@ -5,7 +5,7 @@ import time
 import torch
 
 from perilune_train.detect.config import DetectConfig
-from perilune_train.models.navigator import StackNavigator
+from perilune_train.models.navigator import StackNavigator, StackOptions
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.training.runs import choose_bf16, choose_device
@@ -34,7 +34,7 @@ def navigate_seconds(config: NavigateConfig) -> float:
     """Seconds of a training pair of the paper's navigator, forward and backward, for square frames."""
     own = config.stack
     form = config.in_channels, own.width, own.attention, own.hidden
-    network = StackNavigator(*form, pool=own.pool, stages=own.stages)
+    network = StackNavigator(*form, StackOptions(own.pool, own.stages))
     device = choose_device(config.device)
     trained = network.to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     pairs = [torch.randn(1, _IMAGES, own.size_px, own.size_px, device=device) for _ in range(2)]
