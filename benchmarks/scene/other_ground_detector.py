@@ -14,8 +14,8 @@ from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.frame_facts import facts_of, joined_facts
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.figures import draw_frames
 from perilune_train.detect.evaluate.matching import EDGE, Criteria, Detections
+from perilune_train.detect.evaluate.pictures import draw_frames
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_split

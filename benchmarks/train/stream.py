@@ -27,7 +27,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import load_trajectories
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 from perilune_train.motion.network import load_navigator, predict
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.training.fit import Hardware, Schedule, Wording, fit

@@ -10,7 +10,7 @@ from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_train.cli.main import main
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.training.runs import NamedRun
 
 DRAWING = {

@@ -18,10 +18,10 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import main
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.run import NetworkOnData, explain_run
+from perilune_train.explain.explain_run import NetworkOnData, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
 from perilune_train.training.runs import NamedRun, save_weights

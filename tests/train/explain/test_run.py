@@ -17,13 +17,13 @@ from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_train.cli.detect import config_of_run
 from perilune_train.cli.main import main
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.explain import run as explained
+from perilune_train.explain import explain_run as explained
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.tables import TABLES
+from perilune_train.explain.explain_run import NetworkOnData, explain_run
 from perilune_train.explain.inputs import labelled_frames
 from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.page.pictures import CAPTIONS
-from perilune_train.explain.run import NetworkOnData, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
 from perilune_train.shipped.models import shipped_run

@@ -9,7 +9,7 @@ from tests.train.motion import forked
 
 from perilune_shared.errors import UserError
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.training.runs import NamedRun
 
 pytestmark = pytest.mark.slow

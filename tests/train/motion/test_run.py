@@ -13,7 +13,7 @@ from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.sequences import pair_sequence
 from perilune_train.motion.data.trajectories import load_trajectories
 from perilune_train.motion.network import Collate, Scales, load_navigator, predict, translation_units
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.motion.train.windows import OutputUnits, Windows
 from perilune_train.training.runs import NamedRun

@@ -9,7 +9,7 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.trajectories import load_trajectories
 from perilune_train.motion.train import task as tasks
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import Initial, NavigationTask, learning_rate_factor
 from perilune_train.training.runs import NamedRun, load_weights, save_weights
 

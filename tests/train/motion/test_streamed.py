@@ -11,15 +11,15 @@ from tests.train.motion.served import Served
 from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
+from perilune_train.data.epochs import DataLost
 from perilune_train.data.frames import normalised
-from perilune_train.data.lost import DataLost
 from perilune_train.data.shares import ALONE
 from perilune_train.motion.config import NavigateConfig, StreamConfig
 from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.streamed import StreamedSequences
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.motion.geometry import pixel_index_homography, plane_homography
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.records.provenance import TerrainUse, check_terrain, read_provenance
 from perilune_train.training.runs import NamedRun

@@ -7,7 +7,7 @@ import torch
 
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.epochs import TrainingSequences
-from perilune_train.motion.train import run
+from perilune_train.motion.train import navigate_run as run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.motion.train.windows import WindowPlaces
 from perilune_train.training import runs

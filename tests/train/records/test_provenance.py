@@ -15,14 +15,14 @@ from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import recipes_of
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import app
-from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.deploy.export import ExportedFiles, export_run
 from perilune_train.detect.evaluate.split_evaluation import WRITTEN
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.evaluate_runs import compare_folders
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.detect.train.transfer import inherited_terrain
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.records.provenance import (
     UNKNOWN,
     Provenance,

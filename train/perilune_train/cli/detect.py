@@ -89,7 +89,7 @@ def train(
     """
     settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.detect.train.run import run_detect
+    from perilune_train.detect.train.detect_run import run_detect
 
     run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)
 
@@ -212,7 +212,7 @@ def evaluate(
         own["evaluation"]["scales"] = scale
         config = resolve_over(DetectConfig, "detect", "--scale", own)
     # Importing torch takes seconds; check the settings first.
-    from perilune_train.detect.evaluate_run import evaluate_again
+    from perilune_train.detect.evaluate_runs import evaluate_again
     from perilune_train.records.provenance import EvaluatedSplit
 
     address = dataset or Path("data", run.resolve().name, "detect")
@@ -249,7 +249,7 @@ def benchmark(
         raise UserError("--threshold", "score", threshold, expected)
     if threshold is not None and not 0 <= threshold <= 1:
         raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
-    from perilune_train.detect.benchmark.run import FIGURES, PAGE, score_run, score_submission
+    from perilune_train.detect.benchmark.score_run import FIGURES, PAGE, score_run, score_submission
 
     if detections is not None and threshold is not None:
         folder = out or Path("runs/benchmark", detections.stem)
@@ -271,7 +271,7 @@ def compare(
 ) -> None:
     """Compare runs or evaluations: writes compare.md (a table) and precision_recall.png."""
     # matplotlib and torch take seconds to load.
-    from perilune_train.detect.compare_runs import compare_folders
+    from perilune_train.detect.evaluate_runs import compare_folders
 
     say_page(compare_folders(folders, out, allow_overlap))
     say(f"{out}: compare.md, precision_recall.png")

@@ -60,7 +60,7 @@ def explain(
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.explain.run import NetworkOnData, explain_run
+    from perilune_train.explain.explain_run import NetworkOnData, explain_run
     from perilune_train.training.runs import NamedRun, RunFolder
 
     name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
@@ -131,7 +131,7 @@ def causal(
     if (nav_dataset is None) != (nav_counterfactual is None):
         raise UserError("--nav-dataset", "datasets", "one of two", "--nav-dataset and --nav-counterfactual together")
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.explain.causal.run import CausalInputs, PoseInputs, causal_folder, causal_run
+    from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_folder, causal_run
     from perilune_train.training.begin import held
     from perilune_train.training.runs import NamedRun, RunFolder
 

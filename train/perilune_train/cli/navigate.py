@@ -47,7 +47,7 @@ def train(
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.motion.train.run import navigate_run
+    from perilune_train.motion.train.navigate_run import navigate_run
     from perilune_train.training.runs import NamedRun
 
     name = name or preset
@@ -79,7 +79,7 @@ def evaluate(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.motion.finished_run import evaluate_navigator
+    from perilune_train.motion.evaluate_runs import evaluate_navigator
     from perilune_train.records.provenance import EvaluatedSplit
 
     default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
@@ -156,7 +156,7 @@ def calibrate(
     from perilune_train.motion.covariance import FILE
     from perilune_train.motion.covariance import calibrate as fit
     from perilune_train.motion.data.trajectories import load_split
-    from perilune_train.motion.finished_run import fusion_of
+    from perilune_train.motion.evaluate_runs import fusion_of
     from perilune_train.motion.network import load_navigator
     from perilune_train.records.provenance import check_calibration, read_provenance, split_terrain
     from perilune_train.training.runs import RunFolder, load_weights
@@ -180,7 +180,7 @@ def compare(
 ) -> None:
     """Compare runs or evaluations: writes compare.md (a table) and errors.png."""
     # matplotlib takes seconds to load.
-    from perilune_train.motion.compare_runs import compare_folders
+    from perilune_train.motion.evaluate_runs import compare_folders
 
     say_page(compare_folders(folders, out, allow_overlap))
     say(f"{out}: compare.md, errors.png")
@@ -238,7 +238,7 @@ def methods(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.landing.methods.run import PAGE, fly_methods
+    from perilune_train.landing.methods.fly_methods import PAGE, fly_methods
     from perilune_train.records.provenance import EvaluatedSplit
 
     networks = run or shipped_run("navigate"), detector or shipped_run("detect")
@@ -275,7 +275,7 @@ def monte_carlo(
     if scenario not in SCENARIOS:
         raise UserError("--scenario", "scenario", scenario, "one of " + ", ".join(SCENARIOS))
     # torch takes seconds to load.
-    from perilune_train.landing.monte_carlo.run import PAGE, fly_draws
+    from perilune_train.landing.monte_carlo.fly_draws import PAGE, fly_draws
     from perilune_train.records.provenance import EvaluatedSplit
 
     own = detector or shipped_run("detect")
@@ -299,7 +299,7 @@ def make_map(
     map.json (stated errors), map.md and errors.parquet (compared with the craters of the terrain), and map.png.
     """
     # torch takes seconds to load.
-    from perilune_train.landing.map.run import PAGE, map_scenes
+    from perilune_train.landing.map.map_scenes import PAGE, map_scenes
 
     map_scenes(dataset, detector or shipped_run("detect"), out, allow_overlap)
     say(f"{out / PAGE}: errors and picture; one catalogue per scene beside it")

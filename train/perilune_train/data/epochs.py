@@ -1,10 +1,16 @@
-"""Batches of one process in every epoch, from one loader for the whole training."""
+"""Batches of one process in every epoch, from one loader for the whole training, and the error of a lost source."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import cv2
 from torch.utils import data as torch_data
+
+from perilune_shared.errors import UserError
+
+
+class DataLost(UserError):
+    """Training data has stopped coming, between two steps; the training loop saves its state and ends."""
 
 
 class EpochBatches(torch_data.Sampler[list[Any]]):

@@ -16,7 +16,7 @@ from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import FrameTargets, detector_values
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
 from perilune_train.explain.evidence.localisation import MEASURES, localisation
-from perilune_train.explain.evidence.nulls import detector_nulls, of_other_rows, renamed
+from perilune_train.explain.evidence.nulls import detector_nulls, measure_statistics, of_other_rows, renamed
 from perilune_train.explain.evidence.performance import DetectionPerformance
 from perilune_train.explain.evidence.permutation import detector_permutations
 from perilune_train.explain.evidence.randomisation import randomised
@@ -24,7 +24,6 @@ from perilune_train.explain.evidence.removal import removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary, validation_signs
 from perilune_train.explain.evidence.stability import stability
 from perilune_train.explain.evidence.tables import Evidence
-from perilune_train.explain.evidence.untrained import measure_statistics
 from perilune_train.explain.inputs import LabelledFrames, evenly_spaced
 from perilune_train.explain.maps.attributions import DetectorTarget, grad_cam, integrated_gradients, occlusion
 from perilune_train.explain.maps.baselines import baseline_maps, brightness_map, gradient_map

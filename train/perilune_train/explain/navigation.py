@@ -13,7 +13,7 @@ from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import PairTargets, pair_values
 from perilune_train.explain.detection import SHALLOW_STAGES
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
-from perilune_train.explain.evidence.nulls import pair_nulls
+from perilune_train.explain.evidence.nulls import measure_statistics, pair_nulls
 from perilune_train.explain.evidence.performance import MotionPerformance
 from perilune_train.explain.evidence.permutation import pair_permutations
 from perilune_train.explain.evidence.randomisation import randomised
@@ -21,7 +21,6 @@ from perilune_train.explain.evidence.removal import removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary
 from perilune_train.explain.evidence.stability import stability
 from perilune_train.explain.evidence.tables import Evidence
-from perilune_train.explain.evidence.untrained import measure_statistics
 from perilune_train.explain.inputs import Pairs, evenly_spaced
 from perilune_train.explain.maps.baselines import baseline_maps
 from perilune_train.explain.maps.masks import Masks, navigator_masks, stacked_input

@@ -12,9 +12,9 @@ from perilune_shared.export.foreign_text import code_span
 from perilune_shared.storage.store import Address
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.finished_run import fusion_of
+from perilune_train.motion.evaluate_runs import fusion_of
 from perilune_train.motion.metrics.baselines import MethodMotions, baselines
-from perilune_train.motion.metrics.metrics import motion_errors, summary, summary_spreads
+from perilune_train.motion.metrics.errors import motion_errors, summary, summary_spreads
 from perilune_train.motion.metrics.report import write_evaluation
 from perilune_train.motion.network import check_motion, load_navigator, predict, predict_by_pairs
 from perilune_train.records.benchmark_parts import Part, open_parts, part_names

@@ -21,7 +21,7 @@ from perilune_shared.storage.files import write_text
 from perilune_train.models.navigator import WarpNavigator
 from perilune_train.motion.data.sequences import pair_sequence
 from perilune_train.motion.data.trajectories import Motion, Trajectory
-from perilune_train.motion.metrics.metrics import signed_errors
+from perilune_train.motion.metrics.errors import signed_errors
 from perilune_train.motion.network import Collate, Scales, predict
 
 FILE = "covariance.json"

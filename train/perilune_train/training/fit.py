@@ -18,7 +18,7 @@ from perilune_shared.console.terminal import progress_bar
 from perilune_shared.errors import UserError
 from perilune_shared.threads import warn_if_crowded
 from perilune_train.config import Precision
-from perilune_train.data.lost import DataLost
+from perilune_train.data.epochs import DataLost
 from perilune_train.data.shares import Share
 from perilune_train.training.fair_threads import FairThreads
 from perilune_train.training.runs import (

@@ -18,7 +18,7 @@ from perilune_train.cli.main import app
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
-from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.files import FlightDetector
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.records.metrics_file import write_metrics

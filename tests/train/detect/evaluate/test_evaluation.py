@@ -11,9 +11,9 @@ from perilune_train.detect.data.frame_facts import FrameFacts, unknown_facts
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import evaluate_detections
-from perilune_train.detect.evaluate.figures import choose_frames
 from perilune_train.detect.evaluate.matching import FALSE, FOUND, Criteria, Detections, Matches
 from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.evaluate.pictures import choose_frames
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.records.spread import Spread, draw_resamples, read_spread
 

@@ -8,7 +8,7 @@ from tests.helpers.terrain_record import store_record, uses_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.explain.causal.run import CausalInputs, PoseInputs, causal_run
+from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_run
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from perilune_train.explain.correlation.ground_truth import ground_truth_mask
 from perilune_train.explain.correlation.homography import seen_in_second
 from perilune_train.explain.correlation.measures import COLUMNS, FrameTargets, PairTargets, detector_values, pair_values
 from perilune_train.explain.correlation.pearson import pearson
+from perilune_train.explain.inputs import ground_truth_mask
 
 _RINGS = (1.1, 1.2, 1.3, 1.4)
 

@@ -13,7 +13,7 @@ from perilune_train.motion.classical.klt import (
     klt_trajectory,
 )
 from perilune_train.motion.data.trajectories import load_trajectories
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from perilune_train.data.frames import normalised
 from perilune_train.models.navigator import Recurrent, StackNavigator, StackOptions, cell_means
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.trajectories import load_trajectories
+from perilune_train.motion.metrics.errors import pose_errors, pose_summary
 from perilune_train.motion.metrics.floors import Known, mean_poses, ridge_poses
-from perilune_train.motion.metrics.metrics import pose_errors, pose_summary
 from perilune_train.motion.metrics.report import worse_than_floor
 from perilune_train.motion.network import Scales
 from perilune_train.motion.pose import (

@@ -24,7 +24,7 @@ from perilune_train.motion.pose import (
     predict_pose,
     predict_pose_by_pairs,
 )
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.report.navigation import navigation_section
 from perilune_train.report.sources import read_run

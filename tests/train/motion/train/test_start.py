@@ -6,7 +6,7 @@ import torch
 from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.shipped.models import weights_file
 from perilune_train.training.runs import NamedRun, load_weights
 
@@ -21,8 +21,8 @@ def settings(preset: str, *changes: str) -> NavigateConfig:
 @pytest.fixture(autouse=True)
 def no_tables(monkeypatch):
     """Train without evaluation, which takes most of the time of a small run."""
-    monkeypatch.setattr("perilune_train.motion.train.run.write_evaluation", lambda *_: None)
-    monkeypatch.setattr("perilune_train.motion.train.run.calibrate", lambda *_: None)
+    monkeypatch.setattr("perilune_train.motion.train.navigate_run.write_evaluation", lambda *_: None)
+    monkeypatch.setattr("perilune_train.motion.train.navigate_run.calibrate", lambda *_: None)
 
 
 def test_a_run_starts_from_the_installed_navigator(dataset_nav, tmp_path):

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from perilune_shared.storage.files import written_aside
 from perilune_train.detect.evaluate.bins import BinFigures
 from perilune_train.detect.evaluate.evaluation import Evaluation
-from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
+from perilune_train.detect.evaluate.pictures import draw_bins, draw_curves, draw_frames
 from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from perilune_train.explain.causal.figures import scene_interval
+from perilune_train.explain.causal.pictures import scene_interval
 from perilune_train.explain.evidence.significance import LEVEL, unit_sign_flip_p
 from perilune_train.records.spread import MIN_UNITS
 

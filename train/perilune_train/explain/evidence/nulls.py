@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+import torch
+from torch import nn
 
 from perilune_train.explain.correlation.measures import FrameTargets, PairTargets, detector_values, pair_values
 from perilune_train.explain.maps.baselines import Images, baseline_maps
@@ -78,3 +80,18 @@ def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray
     rows = np.arange(len(scenes))
     alone = len(np.unique(scenes)) == 1
     return np.array([rng.choice(rows[rows != n] if alone else rows[scenes != scenes[n]]) for n in rows])
+
+
+@torch.no_grad()
+def measure_statistics(network: nn.Module, *given: torch.Tensor) -> None:
+    """Set the batch statistics of an untrained network to those of one batch, then switch it to evaluation mode.
+
+    Without measured statistics the features of an untrained network shrink from layer to layer.
+    """
+    for norm in network.modules():
+        if isinstance(norm, nn.BatchNorm2d):
+            norm.reset_running_stats()
+            norm.momentum = None
+    network.train()
+    network(*given)
+    network.eval()

@@ -11,9 +11,9 @@ from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_train.landing.map.files import read_maps
 from perilune_train.landing.methods.absolute import absolute_errors, absolute_summary, catalogues_of
-from perilune_train.landing.methods.figures import draw_by_altitude
 from perilune_train.landing.methods.fixes import WRONG_PX
 from perilune_train.landing.methods.page import COLUMNS_ABSOLUTE, cell
+from perilune_train.landing.methods.pictures import draw_by_altitude
 from perilune_train.landing.methods.seen import seen_descents
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.records.benchmark_parts import Part, open_parts, part_names

@@ -1,15 +1,21 @@
-"""The page of a Monte Carlo run."""
+"""The page of a Monte Carlo run, with its figures and pictures."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import chi2
 
 from perilune_shared.export.foreign_text import code_span, for_markdown
+from perilune_train.landing.methods.flights import flight_summary
 from perilune_train.landing.monte_carlo.scenario import SCENARIOS, Draws
-from perilune_train.landing.monte_carlo.summary import by_trajectory, run_summary
 from perilune_train.records.markdown import number, table
+from perilune_train.records.pictures import save_figure
 
+WRONG_SQUARED = 60.0
+"""Normalised error squared of six parts that a right covariance exceeds in 5e-11 of all cases."""
 _COLUMNS = {
     "position_rmse_m": "position RMSE (m)",
     "position_end_rmse_m": "at the end (m)",
@@ -26,6 +32,29 @@ _CAPTIONS = {
     "errors.png": "Errors of position over all draws: 50, 95 and 100 %, and the median of three stated sigmas",
     "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is right",
 }
+_MOST_COLUMNS = 3
+_QUANTILES = (0.5, 0.95, 1.0)
+
+
+def run_summary(rows: pd.DataFrame) -> dict[str, float]:
+    """Figures over all frames of all draws, none left out. Columns as of draws.parquet."""
+    flight = rows[["trajectory_id", "draw"]].astype(str).agg("/".join, axis=1)
+    flights = rows.assign(seconds=np.nan, flight=flight)
+    figures = flight_summary(flights.assign(trajectory_id=flights["flight"]))
+    ends = flights.groupby(["scene_id", "flight"]).last()
+    silent = (rows["squared"] > WRONG_SQUARED) & (rows["status"] != "lost")
+    return figures | {
+        "position_end_95_m": float(ends["error_m"].quantile(0.95)),
+        "lost_share": float((rows["status"] == "lost").mean()),
+        "silently_wrong_share": float(silent.mean()),
+        "ends_silently_wrong": float(((ends["squared"] > WRONG_SQUARED) & (ends["status"] != "lost")).sum()),
+    }
+
+
+def by_trajectory(rows: pd.DataFrame) -> dict[tuple[str, str], dict[str, float]]:
+    """Figures of each descent over its draws."""
+    groups = rows.groupby(["scene_id", "trajectory_id"])
+    return {(str(scene), str(trajectory)): run_summary(own) for (scene, trajectory), own in groups}
 
 
 def page_of(dataset: str, split: str, draws: Draws, rows: pd.DataFrame, seconds: float, pictures: Sequence[str]) -> str:
@@ -66,3 +95,48 @@ def _cell(key: str, value: float) -> str:
     if not np.isfinite(value):
         return "-"
     return f"{100 * value:.2f} %" if key.endswith("_share") else number(float(value))
+
+
+def draw_bands(path: Path, rows: pd.DataFrame) -> None:
+    """Draw quantiles of the error of position over the draws of each descent, and the stated error."""
+    groups = list(rows.groupby(["scene_id", "trajectory_id"]))
+    figure, axes = _panels(len(groups))
+    for axis, (ids, own) in zip(axes, groups, strict=True):
+        stated = 3 * np.sqrt(sum(own[f"sigma_{name}_m"] ** 2 for name in "xyz"))
+        by_time = own.assign(stated=stated).groupby("time_s")
+        for shade, quantile in zip((0.9, 0.5, 0.25), _QUANTILES, strict=True):
+            axis.plot(
+                by_time["error_m"].quantile(quantile), color="tab:blue", alpha=shade, label=f"{100 * quantile:g} %"
+            )
+        axis.plot(by_time["stated"].median(), color="black", linestyle="--", label="3 sigma, stated")
+        axis.set(yscale="log", title="/".join(map(str, ids)), xlabel="time (s)", ylabel="error of position (m)")
+        axis.grid(alpha=0.3)
+    axes[0].legend()
+    save_figure(path, figure)
+
+
+def draw_consistency(path: Path, rows: pd.DataFrame) -> None:
+    """Draw the mean normalised error squared over the draws of each descent with its 95 % band."""
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    axis = figure.subplots()
+    for ids, own in rows.groupby(["scene_id", "trajectory_id"]):
+        axis.plot(own.groupby("time_s")["squared"].mean(), label="/".join(map(str, ids)))
+    draws = rows["draw"].nunique()
+    axis.axhspan(
+        *(chi2.ppf([0.025, 0.975], 6 * draws) / draws), color="black", alpha=0.15, label="95 % band of the mean"
+    )
+    axis.axhline(6, color="black", linewidth=1)
+    axis.set(yscale="log", xlabel="time (s)", ylabel="mean normalised error squared")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=7, ncols=2)
+    save_figure(path, figure)
+
+
+def _panels(count: int):
+    n_columns = min(count, _MOST_COLUMNS)
+    n_rows = -(-count // n_columns)
+    figure = Figure(figsize=(max(5 * n_columns, 8), 3.2 * n_rows + 0.6), layout="constrained")
+    axes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for unused in axes[count:]:
+        unused.axis("off")
+    return figure, axes[:count]

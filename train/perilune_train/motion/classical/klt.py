@@ -34,8 +34,6 @@ SHIFT_SHARE = 0.02
 crowded corners cannot separate tilt from sideways shift, which look alike from above."""
 _ITERATIONS = 15
 _MIN_TRACKS = 8
-
-
 _MEDIAN_OF_SIGMA = 1.1774
 """Median length of a vector with two normal components, divided by their standard deviation."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from perilune_shared.errors import UserError
-from perilune_train.data.lost import DataLost
+from perilune_train.data.epochs import DataLost
 from perilune_train.motion.data.ahead import Ahead
 from perilune_train.motion.data.epochs import Key, TrainingSequences
 from perilune_train.motion.data.sequences import Sequence

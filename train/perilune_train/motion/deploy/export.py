@@ -20,7 +20,7 @@ from perilune_train.motion.data.sequences import pair_sequence
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.motion.deploy.flight_navigator import INPUTS, OUTPUTS, FlightNavigator
 from perilune_train.motion.deploy.readme import readme
-from perilune_train.motion.finished_run import fusion_of
+from perilune_train.motion.evaluate_runs import fusion_of
 from perilune_train.motion.network import Fusion, check_motion, load_navigator
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.provenance import read_provenance

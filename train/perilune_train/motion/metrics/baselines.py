@@ -7,7 +7,7 @@ import numpy as np
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
-from perilune_train.motion.classical.descent import aligned_trajectory
+from perilune_train.motion.classical.alignment import aligned_trajectory
 from perilune_train.motion.classical.estimate import EstimatedMotion
 from perilune_train.motion.classical.klt import klt_trajectory
 from perilune_train.motion.data.trajectories import Motion, Trajectory

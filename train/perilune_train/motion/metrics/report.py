@@ -9,9 +9,9 @@ from perilune_shared.export.foreign_text import for_markdown
 from perilune_shared.storage.files import written_aside
 from perilune_train.motion.data.trajectories import Pose, Trajectory
 from perilune_train.motion.metrics.baselines import MethodMotions
-from perilune_train.motion.metrics.figures import draw_errors, draw_pose_errors, draw_trajectory
+from perilune_train.motion.metrics.errors import motion_errors, pose_errors, pose_summary, summary, summary_spreads
 from perilune_train.motion.metrics.floors import FLOORS
-from perilune_train.motion.metrics.metrics import motion_errors, pose_errors, pose_summary, summary, summary_spreads
+from perilune_train.motion.metrics.pictures import draw_errors, draw_pose_errors, draw_trajectory
 from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics

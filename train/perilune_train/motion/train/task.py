@@ -20,7 +20,7 @@ from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.streamed import StreamedSequences
 from perilune_train.motion.data.trajectories import Motion, Pose, Trajectory, own_trajectories
 from perilune_train.motion.geometry import euler_from_rotation
-from perilune_train.motion.metrics.metrics import motion_errors, pose_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, pose_errors, summary
 from perilune_train.motion.network import (
     Batch,
     Collate,

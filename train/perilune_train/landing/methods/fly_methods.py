@@ -15,14 +15,14 @@ from perilune_train.landing.craters.fix import PosePrior
 from perilune_train.landing.craters.locate import locate
 from perilune_train.landing.map.files import read_maps
 from perilune_train.landing.methods.absolute import absolute_errors, absolute_summary, catalogues_of
-from perilune_train.landing.methods.figures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.page import page_of
+from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.finished_run import fusion_of
+from perilune_train.motion.evaluate_runs import fusion_of
 from perilune_train.motion.metrics.baselines import baselines
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 from perilune_train.motion.network import check_motion, load_navigator, predict
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.marks import mark_files

@@ -1,4 +1,4 @@
-"""Make crater catalogues of the scenes of a survey: detect, match both images, write and measure."""
+"""Make crater catalogues of the scenes of a survey: detect, match both images, write files, errors and a page."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
@@ -26,9 +27,8 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.map.files import SceneMap, write_maps
 from perilune_train.landing.map.measure import DIAMETERS_M, measured
-from perilune_train.landing.map.page import PICTURE, page_of
 from perilune_train.landing.map.stereo import Matched, View, matched
-from perilune_train.records.markdown import write_markdown
+from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.marks import mark_files
 from perilune_train.records.pictures import save_image
 from perilune_train.records.provenance import check_terrain, read_provenance
@@ -43,6 +43,7 @@ _LEAST_SIGMA_M = 0.05
 _WINDOW_PX = 1000
 _BOTH, _ONE = (227, 211, 25), (60, 60, 230)
 """Cyan and red, in OpenCV's order blue, green, red."""
+PICTURE = "map.png"
 
 
 def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool = False) -> pd.DataFrame:
@@ -130,3 +131,31 @@ def _picture(image: NDArray[np.uint8], view: View, both: Matched) -> NDArray[np.
             spot = (round(8 * (centre[0] - 0.5)), round(8 * (centre[1] - 0.5)))
             cv2.circle(canvas, spot, round(8 * radius), _BOTH if twice else _ONE, 1, cv2.LINE_AA, 3)
     return np.asarray(canvas, np.uint8)
+
+
+def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
+    """The page as Markdown."""
+    lines = ["# Crater map", "", f"Dataset {code_span(dataset.info.name)}, {len(maps)} scenes, two images of each.", ""]
+    lines += [
+        "Poses of the images are exact. A crater of the map is true if one of the terrain is near: distance in radii,",
+        "plus twice the difference of the logarithms of both radii, is below 0.8. Errors are those of true craters.",
+        "",
+    ]
+    for one in maps:
+        share = one.catalogue.radius_sigma_share
+        stated = f"position {number(one.catalogue.position_sigma_m)} m, diameter {100 * share:.0f} %"
+        lines += [f"## {for_markdown(one.scene_id)}: {len(one.catalogue)} craters", "", f"Stated errors: {stated}.", ""]
+        head = ["diameter (m)", "mapped", "true", "found", "position RMSE per axis (m)", "height RMSE (m)"]
+        rows = [
+            [
+                str(row["diameter_m"]),
+                str(row["mapped"]),
+                *(f"{100 * row[key]:.1f} %" for key in ("true_share", "found_share")),
+                *(number(row[key]) for key in ("position_rmse_m", "height_rmse_m")),
+                f"{100 * row['diameter_bias_share']:+.1f} %, {100 * row['diameter_sigma_share']:.1f} %",
+            ]
+            for row in one.errors.to_dict("records")
+        ]
+        lines += [*table([*head, "diameter: mean error, standard deviation"], rows), ""]
+    caption = "Middle of the first image: craters found in both images (cyan) and in this one alone (red)"
+    return "\n".join([*lines, f"![{caption}]({PICTURE})", "", f"*{caption}.*", ""])

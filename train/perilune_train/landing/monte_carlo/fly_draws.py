@@ -32,8 +32,7 @@ from perilune_train.landing.filter.flight import Instruments, fly_together, toge
 from perilune_train.landing.methods.flights import Start, default_sigmas, lander_of, mounting_of, row_of, table_of
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
 from perilune_train.landing.monte_carlo.draw import drawn
-from perilune_train.landing.monte_carlo.figures import draw_bands, draw_consistency
-from perilune_train.landing.monte_carlo.page import page_of
+from perilune_train.landing.monte_carlo.page import draw_bands, draw_consistency, page_of
 from perilune_train.landing.monte_carlo.scenario import Draws, Scenario
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.records.markdown import write_markdown

@@ -19,11 +19,17 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
-from perilune_train.explain.causal import bins, figures
+from perilune_train.explain.causal import bins, pictures
 from perilune_train.explain.causal.claims import Tested, detection_claim, pose_claim, reaction_claim
-from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects, with_found
+from perilune_train.explain.causal.effects import (
+    check_descents,
+    detection_effects,
+    filled_frames,
+    mask_effects,
+    pose_effects,
+    with_found,
+)
 from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed, same_frames
-from perilune_train.explain.causal.pose import check_descents, pose_effects
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.stability import between
 from perilune_train.explain.inputs import frames_of
@@ -139,7 +145,7 @@ def causal_run(
     moved = mask_effects(pairs, masks, shifts)
     found = detection_effects(pairs, lambda images: _detect(detector, images), versions)
     found = with_found(found, threshold, shifts)
-    gates = figures.by_gate(moved, rng)
+    gates = pictures.by_gate(moved, rng)
     tables = {"mask_effects": moved, "detection_effects": found, "gate_effects": gates}
     tables |= {"mask_bins": bins.binned(moved, "change"), "detection_bins": bins.binned(found, "found")}
     if turned is not None:
@@ -195,12 +201,12 @@ def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, c
 
 
 def _draw(folder: Path, pairs: CraterPairs, masks: dict, tables: dict[str, pd.DataFrame], gate: str) -> None:
-    figures.draw_gate_effects(folder / "gates_causal.png", tables["gate_effects"])
+    pictures.draw_gate_effects(folder / "gates_causal.png", tables["gate_effects"])
     bins.draw_bins(folder / "detections_causal.png", {"share of craters that are found": tables["detection_bins"]})
     bins.draw_gate_bins(folder / "bins_causal.png", tables["mask_bins"])
     image = int(np.bincount(pairs.craters["image"].to_numpy()).argmax())
     both = {version: masks[version][gate] for version in ("factual", "rendered")}
-    figures.draw_pair(folder / "before_after_causal.png", pairs, both, image, gate)
+    pictures.draw_pair(folder / "before_after_causal.png", pairs, both, image, gate)
 
 
 def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:
