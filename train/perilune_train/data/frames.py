@@ -79,8 +79,8 @@ def load_frames(dataset: Dataset, split: str, share: Share = ALONE, table: pd.Da
     frames do not fit into memory, or if one is invalid.
     """
     table = frame_table(dataset, split) if table is None else table
-    own = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
-    return FrameStore(own, load_images(dataset, own, split))
+    rows = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
+    return FrameStore(rows, load_images(dataset, rows, split))
 
 
 def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np.uint8]:

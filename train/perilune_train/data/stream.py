@@ -180,25 +180,25 @@ class FrameStream(torch_data.IterableDataset):
         sizes = np.full(len(self), self.batch_size)
         sizes[-1] = stop - start - sizes[:-1].sum()
         start += sum(int(sizes[before::lanes].sum()) for before in range(lane))
-        own = np.arange(len(self))[lane::lanes]
-        done = int(sizes[own[own < self.batches]].sum())
-        frames = self._frames(start, start + int(sizes[own].sum()), done)
-        for batch in own[own >= self.batches]:
+        numbers = np.arange(len(self))[lane::lanes]
+        n_done = int(sizes[numbers[numbers < self.batches]].sum())
+        frames = self._frames(start, start + int(sizes[numbers].sum()), n_done)
+        for batch in numbers[numbers >= self.batches]:
             yield self.make([next(frames) for _ in range(sizes[batch])], self.epoch)
 
-    def _frames(self, start: int, stop: int, done: int) -> Iterator[StreamedFrame]:
-        """Yield the frames at the places [start, stop) of the epoch's order of row groups, after the first `done`."""
+    def _frames(self, start: int, stop: int, n_done: int) -> Iterator[StreamedFrame]:
+        """Yield the frames at the places [start, stop) of the epoch's order of row groups, after the first `n_done`."""
         opened: dict[str, Part] = {}
         with ThreadPoolExecutor(1) as reader:
             pending = []
-            for window in self._windows(start, stop, done):
+            for window in self._windows(start, stop, n_done):
                 pending.append((window, reader.submit(self._read, opened, np.unique(window[0]))))
                 if len(pending) > 1:
                     yield from self._of_window(*pending.pop(0))
             for last in pending:
                 yield from self._of_window(*last)
 
-    def _windows(self, start: int, stop: int, done: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def _windows(self, start: int, stop: int, n_done: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Yield row groups (N,) and rows in them (N,) of the frames of each window, in their order."""
         order = np.random.default_rng([self.seed, self.epoch]).permutation(len(self._groups.shard))
         ends = np.cumsum(self._groups.n_frames[order])
@@ -208,13 +208,13 @@ class FrameStream(torch_data.IterableDataset):
             sizes = self._groups.n_frames[order[places]]
             groups = np.repeat(order[places], sizes)
             rows = np.concatenate([np.arange(size) for size in sizes])
-            at = np.arange(len(rows)) + ends[window] - sizes[0]
-            own = np.flatnonzero((at >= start) & (at < stop))
-            own = np.random.default_rng([self.seed, self.epoch, int(at[own[0]])]).permutation(own)
-            skipped, done = own[:done], max(done - len(own), 0)
-            own = own[len(skipped) :]
-            if len(own):
-                yield groups[own], rows[own]
+            position = np.arange(len(rows)) + ends[window] - sizes[0]
+            chosen = np.flatnonzero((position >= start) & (position < stop))
+            chosen = np.random.default_rng([self.seed, self.epoch, int(position[chosen[0]])]).permutation(chosen)
+            skipped, n_done = chosen[:n_done], max(n_done - len(chosen), 0)
+            chosen = chosen[len(skipped) :]
+            if len(chosen):
+                yield groups[chosen], rows[chosen]
 
     def _read(self, opened: dict[str, Part], groups: NDArray[np.int64]) -> dict[int, pa.Table]:
         """Read row groups, by number."""
@@ -255,9 +255,9 @@ def _groups_of(dataset: Dataset, split: str) -> _Groups:
     with ThreadPoolExecutor(16) as readers:
         sizes = list(readers.map(functools.partial(_group_sizes, dataset), shards))
     return _Groups(
-        [path for path, own in zip(shards, sizes, strict=True) for _ in own],
-        np.array([number for own in sizes for number in range(len(own))]),
-        np.array([size for own in sizes for size in own]),
+        [path for path, sizes_of_shard in zip(shards, sizes, strict=True) for _ in sizes_of_shard],
+        np.array([number for sizes_of_shard in sizes for number in range(len(sizes_of_shard))]),
+        np.array([size for sizes_of_shard in sizes for size in sizes_of_shard]),
     )
 
 

@@ -93,9 +93,9 @@ def evaluate_again(
         seen, _ = detect_split(detector, val, "val")
         chosen, chosen_on = threshold_on_validation(detector, val, seen)
         threshold_source = f"{chosen_on} of the dataset"
-    found, rate = detect_split(detector, frames, split)
-    evaluation = evaluate_split(frames, found, config, chosen)
-    write_detections(folder / "detections.parquet", frames, found)
+    detections, rate = detect_split(detector, frames, split)
+    evaluation = evaluate_split(frames, detections, config, chosen)
+    write_detections(folder / "detections.parquet", frames, detections)
     about = report_head(dataset, split, config, protocol, run.resolve().name, threshold_source)
     write_evaluation(folder, evaluation, list(frames.frames.images), about)
     metrics = (

@@ -38,10 +38,10 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
 
 def chosen_threshold(run: Path) -> float:
     """The score threshold that a run chose on its validation split. Raises UserError if it has none."""
-    found = read_metrics(run).get("test/threshold")
-    if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
-        raise UserError(run / METRICS_FILE, "test/threshold", found, "a number; or give --threshold")
-    return float(found)
+    threshold = read_metrics(run).get("test/threshold")
+    if isinstance(threshold, bool) or not isinstance(threshold, float | int) or not math.isfinite(threshold):
+        raise UserError(run / METRICS_FILE, "test/threshold", threshold, "a number; or give --threshold")
+    return float(threshold)
 
 
 def check_output(folder: Path, run: Path) -> None:

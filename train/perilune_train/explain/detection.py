@@ -45,9 +45,9 @@ def explain_detector(
     """
     network = detector.network
     rng = np.random.default_rng([settings.seed, 1])
-    masks, known = (detector_masks(network, one.images, where) for one in (frames, validation))
+    masks, known = (detector_masks(network, subset.images, where) for subset in (frames, validation))
     untrained = untrained_detector(detector, validation.images, settings.seed)
-    blank, known_blank = (detector_masks(untrained, one.images, where) for one in (frames, validation))
+    blank, known_blank = (detector_masks(untrained, subset.images, where) for subset in (frames, validation))
     say("detector: masks and null maps")
     before = _values(validation, known, known_blank, rng)
     signs = validation_signs(before)
@@ -118,9 +118,9 @@ def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
 
     A gate without a defined correlation is never chosen, unless there is no other.
     """
-    own = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
-    own = own[own["map"].str[2].isin(list(SHALLOW_STAGES))]
-    means = own.groupby("map", sort=False)["value"].mean()
+    rows = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
+    rows = rows[rows["map"].str[2].isin(list(SHALLOW_STAGES))]
+    means = rows.groupby("map", sort=False)["value"].mean()
     strength = means * pd.Series(signs).reindex(means.index)
     return str(strength.idxmax()) if strength.notna().any() else str(means.index[0])
 
@@ -149,6 +149,6 @@ def _targets(frames: LabelledFrames) -> FrameTargets:
 
 def _attribution_values(frames: LabelledFrames, some: list[int], maps: Masks) -> pd.DataFrame:
     images = frames.images[some]
-    ids, scenes = ([own[i] for i in some] for own in (frames.frame_ids, frames.scene_ids))
+    ids, scenes = ([names[i] for i in some] for names in (frames.frame_ids, frames.scene_ids))
     targets = FrameTargets(frames.truth[some], brightness_map(images), gradient_map(images), ids, scenes)
     return detector_values(maps, targets, "attribution")

@@ -97,7 +97,7 @@ def _run(
     parts += [] if flown is None else [_explain_navigator(run, settings, flown)]
     claims = [claim for part in parts for claim in part.claims]
     _write_tables(run, {part.task: part.evidence for part in parts})
-    write_text(run.root / "claims.json", json.dumps([one.plain() for one in claims], indent=2) + "\n")
+    write_text(run.root / "claims.json", json.dumps([claim.plain() for claim in claims], indent=2) + "\n")
     captions = {name: CAPTIONS[name] for part in networks for name in PICTURES[part]}
     write_text(run.root / "captions.json", json.dumps(captions, indent=2) + "\n")
     for part in parts:
@@ -128,43 +128,47 @@ class _Part:
 
 def _explain_detector(run: RunFolder, settings: ExplainConfig, seen: ExplainedDetector) -> _Part:
     where = seen.checkpoint
-    found, masks = detection.explain_detector(settings, seen.detector, seen.frames, seen.known_frames, where)
+    evidence, masks = detection.explain_detector(settings, seen.detector, seen.frames, seen.known_frames, where)
     along = detector_masks(seen.detector.network, seen.descent.images, where)
-    draw_detector(run.root, settings, found, Masked(seen.frames, masks), Masked(seen.descent, along))
+    draw_detector(run.root, settings, evidence, Masked(seen.frames, masks), Masked(seen.descent, along))
     save_masks(run.root / "masks_detect.npz", seen.descent.frame_ids, along)
     deviations, guided = _deviations(masks), GUIDED if seen.config.loss.lambda_guide > 0 else ()
-    metrics = figures_of(found, detection.TASK, higher_is_better=True) | selection_entries(seen.config, seen.split)
+    metrics = figures_of(evidence, detection.TASK, higher_is_better=True) | selection_entries(seen.config, seen.split)
     metrics |= {f"mask_deviation/{block}": value for block, value in deviations.items()}
     metrics |= {"detect/guided_gates": " ".join(guided), "detector": where.as_posix()}
     metrics |= {"frames": len(seen.frames.images), "scenes": len(set(seen.frames.scene_ids))}
-    return _Part(detection.TASK, found, page.detector_claims(found, deviations, guided), metrics)
+    return _Part(detection.TASK, evidence, page.detector_claims(evidence, deviations, guided), metrics)
 
 
 def _explain_navigator(run: RunFolder, settings: ExplainConfig, flown: ExplainedNavigator) -> _Part:
     where, network, pairs = flown.checkpoint, flown.network, flown.pairs
-    found, masks = navigation.explain_navigator(settings, network, flown.architecture, pairs, flown.known_pairs, where)
+    evidence, masks = navigation.explain_navigator(
+        settings, network, flown.architecture, pairs, flown.known_pairs, where
+    )
     along = navigator_masks(network, flown.flight.images, flown.architecture["size_px"], where)
-    draw_navigator(run.root, settings, found, Masked(pairs, masks), Masked(flown.flight, along))
+    draw_navigator(run.root, settings, evidence, Masked(pairs, masks), Masked(flown.flight, along))
     deviations = _deviations(masks)
-    metrics = figures_of(found, navigation.TASK, higher_is_better=False) | {"navigator": where.as_posix()}
+    metrics = figures_of(evidence, navigation.TASK, higher_is_better=False) | {"navigator": where.as_posix()}
     metrics |= {f"mask_deviation_stack/{block}": value for block, value in deviations.items()}
     metrics |= {"pairs": len(pairs.images), "pair_scenes": len(set(pairs.scene_ids))}
-    return _Part(navigation.TASK, found, page.navigator_claims(found, deviations), metrics)
+    return _Part(navigation.TASK, evidence, page.navigator_claims(evidence, deviations), metrics)
 
 
 def _deviations(masks: Masks) -> dict[str, float]:
     """Standard deviation of each gate's mask over pixels and images."""
-    return {block: float(found.std()) for block, found in masks.items()}
+    return {block: float(gate_masks.std()) for block, gate_masks in masks.items()}
 
 
 def _write_tables(run: RunFolder, evidence: Mapping[str, Evidence]) -> None:
-    tables = [found.with_task(task) for task, found in evidence.items()]
+    tables = [task_evidence.with_task(task) for task, task_evidence in evidence.items()]
     for name in TABLES:
         with written_aside(run.root / f"{name}.parquet") as aside:
-            pd.concat([one[name] for one in tables], ignore_index=True).to_parquet(aside, index=False)
+            pd.concat([evidence_table[name] for evidence_table in tables], ignore_index=True).to_parquet(
+                aside, index=False
+            )
 
 
-def figures_of(found: Evidence, task: str, *, higher_is_better: bool) -> Metrics:
+def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metrics:
     """Figures of one network by name; undefined ones are left out.
 
     <measure>/<map>, _low and _high: means of gates and attribution methods. <measure>_null/<gate>/<null>: means of the
@@ -173,36 +177,36 @@ def figures_of(found: Evidence, task: str, *, higher_is_better: bool) -> Metrics
     <task>/randomised/<direction>/<step>/<gate>: similarity of masks.
     """
     numbers: dict[str, float] = {}
-    for row in found.summary[found.summary["kind"] != "null"].to_dict("records"):
+    for row in evidence.summary[evidence.summary["kind"] != "null"].to_dict("records"):
         key = f"{row['measure']}/{row['map']}"
         numbers |= {key: row["value"], f"{key}_low": row["low"], f"{key}_high": row["high"]}
-    for row in found.differences.to_dict("records"):
+    for row in evidence.differences.to_dict("records"):
         numbers[f"{row['measure']}_null/{row['map']}/{row['null']}"] = row["null_value"]
-    for row in found.tested.to_dict("records"):
+    for row in evidence.tested.to_dict("records"):
         numbers[f"{row['measure']}_p/{row['map']}"] = row["p_adjusted"]
-    for scope, harm in forced_harm(found, higher_is_better=higher_is_better).items():
+    for scope, harm in forced_harm(evidence, higher_is_better=higher_is_better).items():
         numbers[f"{task}/forced/{scope}"] = harm
-    for row in removal_summary(found.removal, higher_is_better).to_dict("records"):
+    for row in removal_summary(evidence.removal, higher_is_better).to_dict("records"):
         for which in ("most", "least", "random", "shifted"):
             numbers[f"{task}/removal/{row['map']}/{row['how']}/{which}"] = row[which]
-    alike = found.stability.groupby(["change", "map"], sort=False)["pearson"].mean()
+    alike = evidence.stability.groupby(["change", "map"], sort=False)["pearson"].mean()
     for row in alike.reset_index().to_dict("records"):
         numbers[f"{task}/stability/{row['change']}/{row['map']}"] = row["pearson"]
-    kept = found.randomisation.groupby(["direction", "step", "map"], sort=False)["spearman"].mean()
+    kept = evidence.randomisation.groupby(["direction", "step", "map"], sort=False)["spearman"].mean()
     for row in kept.reset_index().to_dict("records"):
         numbers[f"{task}/randomised/{row['direction']}/{row['step']}/{row['map']}"] = row["spearman"]
 
     metrics: Metrics = {name: float(value) for name, value in numbers.items() if math.isfinite(value)}
-    for row in found.tested.to_dict("records"):
+    for row in evidence.tested.to_dict("records"):
         metrics[f"{row['measure']}_beats_nulls/{row['map']}"] = bool(row["beats_all"])
-    least = removal_row(found, higher_is_better=higher_is_better)
+    least = removal_row(evidence, higher_is_better=higher_is_better)
     metrics |= {f"{task}/removal_{name}": float(least[name]) for name in ("most", "least", "random", "shifted")}
     # Without harm by a control there is no ratio.
     metrics[f"{task}/removal_ratio"] = float(least["ratio"]) if np.isfinite(least["ratio"]) else 0.0
-    metrics[f"{task}/strongest_gate"] = found.strongest
+    metrics[f"{task}/strongest_gate"] = evidence.strongest
     for measure in _COUNTED[task]:
-        metrics[f"{task}/{measure}_beating_to_stride_8"] = len(beating_gates(found, measure))
-        metrics[f"{task}/{measure}_beating"] = len(beating_gates(found, measure, "12345"))
-    gates = found.summary[found.summary["kind"] == "gate"]
+        metrics[f"{task}/{measure}_beating_to_stride_8"] = len(beating_gates(evidence, measure))
+        metrics[f"{task}/{measure}_beating"] = len(beating_gates(evidence, measure, "12345"))
+    gates = evidence.summary[evidence.summary["kind"] == "gate"]
     metrics[f"{task}/undefined"] = int(gates["undefined"].sum())
     return metrics

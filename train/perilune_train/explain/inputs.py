@@ -109,8 +109,14 @@ def frames_of(split: DetectSplit, chosen: Sequence[int], ring_factors: tuple[flo
     labels = [split.labels[i] for i in chosen]
     height, width = split.frames.images.shape[1:]
     truth = [
-        ground_truth_mask(width, height, own.ellipses[own.selected, :2], own.radius_px[own.selected], ring_factors)
-        for own in labels
+        ground_truth_mask(
+            width,
+            height,
+            frame_labels.ellipses[frame_labels.selected, :2],
+            frame_labels.radius_px[frame_labels.selected],
+            ring_factors,
+        )
+        for frame_labels in labels
     ]
     table = split.frames.table.iloc[list(chosen)]
     return LabelledFrames(
@@ -132,8 +138,8 @@ def first_descent(split: DetectSplit) -> list[int]:
 
 def consecutive_pairs(descents: Sequence[navigation.Trajectory], count: int) -> Pairs:
     """At most `count` pairs of descents in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes."""
-    length = min(RUN_PAIRS, *(one.n_pairs for one in descents))
-    places = [(one, start) for one in descents for start in range(0, one.n_pairs - length + 1, length)]
+    length = min(RUN_PAIRS, *(descent.n_pairs for descent in descents))
+    places = [(descent, start) for descent in descents for start in range(0, descent.n_pairs - length + 1, length)]
     return _pairs_of([(*places[i], length) for i in evenly_spaced(len(places), max(1, count // length))])
 
 
@@ -145,16 +151,16 @@ def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:
 def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:
     """Pairs of runs of equal length: trajectory, first step, number of pairs."""
     images, homographies, translations, positions, ids, scenes, heights = [], [], [], [], [], [], []
-    for one, start, length in runs:
-        translations.append(one.motion[0][start : start + length])
-        positions.append(one.pose[0][start : start + length])
+    for trajectory, start, length in runs:
+        translations.append(trajectory.motion[0][start : start + length])
+        positions.append(trajectory.pose[0][start : start + length])
         for step in range(start, start + length):
-            images.append(np.concatenate([one.images[step], one.images[step + 1]]))
-            poses = [(one.position_m[k], one.rotation_camera_from_site[k]) for k in (step, step + 1)]
-            homographies.append(true_homography(one.camera, *poses[0], *poses[1]))
-            ids.append("/".join([*one.ids, str(step)]))
-            scenes.append(one.ids[0])
-            heights.append(float(one.position_m[step][2]))
+            images.append(np.concatenate([trajectory.images[step], trajectory.images[step + 1]]))
+            poses = [(trajectory.position_m[k], trajectory.rotation_camera_from_site[k]) for k in (step, step + 1)]
+            homographies.append(true_homography(trajectory.camera, *poses[0], *poses[1]))
+            ids.append("/".join([*trajectory.ids, str(step)]))
+            scenes.append(trajectory.ids[0])
+            heights.append(float(trajectory.position_m[step][2]))
     truths = np.stack(translations), np.stack(positions)
     return Pairs(np.stack(images), np.stack(homographies), *truths, ids, scenes, heights)
 

@@ -114,6 +114,6 @@ def _targets(pairs: Pairs) -> PairTargets:
 def strongest_gate(masks: Masks, validation: Pairs) -> str:
     """The gate up to stride 8 of the largest mean PCC4 on validation pairs; the first gate if none is defined."""
     values = pair_values(masks, _targets(validation))
-    own = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
-    means = own.groupby("map", sort=False)["value"].mean()
+    rows = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
+    means = rows.groupby("map", sort=False)["value"].mean()
     return str(means.idxmax()) if means.notna().any() else str(means.index[0])

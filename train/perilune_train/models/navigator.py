@@ -272,9 +272,9 @@ class WarpNavigator(nn.Module):
         focal = self.focal_over_width * width_px / self.STRIDE
         x = ((torch.arange(columns, device=self.unit.device) + 0.5 - columns / 2) / focal).expand(rows, columns)
         y = ((torch.arange(rows, device=self.unit.device) + 0.5 - rows / 2) / focal)[:, None].expand(rows, columns)
-        zero, one = torch.zeros_like(x), torch.ones_like(x)
-        along_x = torch.stack([-one, zero, x, -x * y, 1 + x * x, -y], dim=-1)
-        along_y = torch.stack([zero, -one, y, -1 - y * y, x * y, x], dim=-1)
+        zero, ones = torch.zeros_like(x), torch.ones_like(x)
+        along_x = torch.stack([-ones, zero, x, -x * y, 1 + x * x, -y], dim=-1)
+        along_y = torch.stack([zero, -ones, y, -1 - y * y, x * y, x], dim=-1)
         return torch.stack([along_x, along_y], dim=-2)
 
 

@@ -68,7 +68,9 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     stated = stated_covariances(run, network, architecture, trajectories)
     if stated is not None:
         covariances = {fusion: stated, **covariances}
-    errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
+    errors = {
+        method: motion_errors(trajectories, estimated, covariances.get(method)) for method, estimated in motions.items()
+    }
     mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
     counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}
     ms = round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2)
@@ -91,26 +93,26 @@ def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str
         for row in part.dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist():
             scene = f"{part.name}/{row['scene_id']}"
             regions[scene], suns[scene] = part.region, float(row["sun_elevation_deg"])
-        for one in load_split(part.dataset, "test"):
-            trajectories.append(replace(one, ids=(f"{part.name}/{one.ids[0]}", one.ids[1])))
+        for trajectory in load_split(part.dataset, "test"):
+            trajectories.append(replace(trajectory, ids=(f"{part.name}/{trajectory.ids[0]}", trajectory.ids[1])))
     return trajectories, regions, suns
 
 
 def _figures(errors: dict[str, pd.DataFrame], regions: dict[str, str], suns: dict[str, float]) -> Metrics:
     """Flat keys: <method>/<figure>, <method>/region/<name>/..., <method>/altitude/<bin>/..., <method>/sun/<bin>/..."""
     figures: Metrics = {}
-    for method, own in errors.items():
-        figures |= {f"{method}/{key}": value for key, value in summary(own).items()}
-        for key, spread in summary_spreads(own).items():
+    for method, pairs in errors.items():
+        figures |= {f"{method}/{key}": value for key, value in summary(pairs).items()}
+        for key, spread in summary_spreads(pairs).items():
             figures |= spread.keys(f"{method}/{key}")
         for kind, names in (
-            ("region", own["scene_id"].map(regions)),
-            ("altitude_m", _bins(own["altitude_m"], _ALTITUDES_M)),
-            ("sun_deg", _bins(own["scene_id"].map(suns), _SUNS_DEG)),
+            ("region", pairs["scene_id"].map(regions)),
+            ("altitude_m", _bins(pairs["altitude_m"], _ALTITUDES_M)),
+            ("sun_deg", _bins(pairs["scene_id"].map(suns), _SUNS_DEG)),
         ):
-            for name, rows in own.groupby(names):
-                found = summary(rows)
-                figures |= {f"{method}/{kind}/{name}/{key}": found[key] for key in _OF_BINS}
+            for name, rows in pairs.groupby(names):
+                figures_of_group = summary(rows)
+                figures |= {f"{method}/{kind}/{name}/{key}": figures_of_group[key] for key in _OF_BINS}
                 figures[f"{method}/{kind}/{name}/scenes"] = int(rows["scene_id"].nunique())
     return figures
 
@@ -129,7 +131,7 @@ def _page(
     counts: dict[str, tuple[int, int]],
 ) -> str:
     """The page as Markdown."""
-    spreads = {method: summary_spreads(own) for method, own in errors.items()}
+    spreads = {method: summary_spreads(table_of_method) for method, table_of_method in errors.items()}
     headline = spreads[fusion][HEADLINE].text(float(figures[f"{fusion}/{HEADLINE}"] or np.nan))
     lines = ["# Locked benchmark of navigation", ""]
     lines += [

@@ -63,16 +63,18 @@ def information_of(network: WarpNavigator, architecture: dict[str, Any], traject
     # The turn leads from the estimate to the truth, the shift from the truth to the estimate (`EstimatedMotion`).
     unit = np.array([*scales.spread_m, *[-scales.rotation_rad] * 3])
     order = np.r_[3:6, 0:3]
-    found = (information / unit[:, None] / unit)[:, order][:, :, order]
-    return MotionInformation(found, (prior / unit**2)[order], shrunk.altitude_m)
+    arranged = (information / unit[:, None] / unit)[:, order][:, :, order]
+    return MotionInformation(arranged, (prior / unit**2)[order], shrunk.altitude_m)
 
 
 def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
     """The five numbers under which the errors of these motions are most likely, as those of a Gaussian."""
-    errors = np.concatenate([signed_errors(one, motion) for one, motion in zip(trajectories, motions, strict=True)])
+    errors = np.concatenate(
+        [signed_errors(trajectory, motion) for trajectory, motion in zip(trajectories, motions, strict=True)]
+    )
 
     def cost(numbers: Array) -> float:
-        stated = np.concatenate([one.covariance(numbers) for one in known])
+        stated = np.concatenate([item.covariance(numbers) for item in known])
         squared = np.einsum("ni,ni->n", errors, np.linalg.solve(stated, errors[:, :, None])[:, :, 0])
         return float(np.mean(np.linalg.slogdet(stated)[1] + squared))
 
@@ -86,9 +88,11 @@ def calibrate(
     folder: Path, network: WarpNavigator, architecture: dict[str, Any], trajectories: list[Trajectory]
 ) -> None:
     """Fit the five numbers to validation trajectories, and write covariance.json to a run's folder."""
-    motions = [predict(network, architecture, one) for one in trajectories]
-    numbers = fit_numbers([information_of(network, architecture, one) for one in trajectories], trajectories, motions)
-    write_numbers(folder, numbers, sum(one.n_pairs for one in trajectories))
+    motions = [predict(network, architecture, trajectory) for trajectory in trajectories]
+    numbers = fit_numbers(
+        [information_of(network, architecture, trajectory) for trajectory in trajectories], trajectories, motions
+    )
+    write_numbers(folder, numbers, sum(trajectory.n_pairs for trajectory in trajectories))
 
 
 def write_numbers(folder: Path, numbers: list[float], n_pairs: int) -> None:
@@ -118,4 +122,4 @@ def stated_covariances(
     numbers = read_numbers(folder)
     if numbers is None or not isinstance(network, WarpNavigator):
         return None
-    return [information_of(network, architecture, one).covariance(numbers) for one in trajectories]
+    return [information_of(network, architecture, trajectory).covariance(numbers) for trajectory in trajectories]

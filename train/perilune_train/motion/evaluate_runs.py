@@ -67,7 +67,7 @@ def evaluate_navigator(run: Path, evaluated: EvaluatedSplit, out: Path) -> Path:
         named: Metrics = {"dataset/name": dataset.info.name, "dataset/protocol": protocol_of(dataset.info)}
         _evaluate_pose(network, architecture, split, trajectories, out, named | terrain_check.metrics())
         return out
-    found, seconds = _timed(predict, network, architecture, trajectories)
+    motions_of_network, seconds = _timed(predict, network, architecture, trajectories)
     pairs = sum(trajectory.n_pairs for trajectory in trajectories)
     details = {
         f"{split}/pairs": pairs,
@@ -80,7 +80,7 @@ def evaluate_navigator(run: Path, evaluated: EvaluatedSplit, out: Path) -> Path:
     }
     # Mean motions are those of the training set, which this dataset may not have.
     classical = baselines([], trajectories)
-    motions, covariances = {fusion: found, **classical.motions}, classical.covariances
+    motions, covariances = {fusion: motions_of_network, **classical.motions}, classical.covariances
     stated = stated_covariances(run, network, architecture, trajectories)
     if stated is not None:
         covariances = {fusion: stated, **covariances}
@@ -105,14 +105,14 @@ def _evaluate_pose(
     mean = np.array(scales.mean_m), np.array(scales.mean_rotation)
     pairs = sum(trajectory.n_pairs for trajectory in trajectories)
     _, by_pairs = predict_pose_by_pairs(network, architecture, trajectories[0])
-    own: Metrics = {
+    measured: Metrics = {
         f"{split}/pairs": pairs,
         f"{split}/ms_per_pair": round(1e3 * seconds / pairs, 2),
         f"{split}/ms_per_single_pair": round(1e3 * by_pairs, 2),
         "network/parameters": sum(p.numel() for p in network.parameters()),
     }
-    methods = {"stack": poses, "mean_pose": [constant_pose(*mean, one.n_pairs) for one in trajectories]}
-    page = write_pose_evaluation(out, "stack", split, trajectories, methods, own | details)
+    methods = {"stack": poses, "mean_pose": [constant_pose(*mean, trajectory.n_pairs) for trajectory in trajectories]}
+    page = write_pose_evaluation(out, "stack", split, trajectories, methods, measured | details)
     say_page(page)
 
 
@@ -134,11 +134,11 @@ def _timed(
     started = time.monotonic()
     with progress_bar() as progress:
         task = progress.add_task("evaluate", total=len(trajectories), unit="trajectories", note="")
-        found = []
+        predictions = []
         for trajectory in trajectories:
-            found.append(predicted(network, architecture, trajectory))
+            predictions.append(predicted(network, architecture, trajectory))
             progress.advance(task)
-    return found, time.monotonic() - started
+    return predictions, time.monotonic() - started
 
 
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
@@ -166,8 +166,8 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         target = metrics.get("evaluation/target", "motion")
         label = method if target == "motion" else f"{method}, {target}"
         rows.append([for_markdown(f"{name} ({label})"), *where, *_cells(metrics, split)])
-        own = _read_errors(folder / ERRORS_FILE)
-        errors[name] = own[own["method"] == method]
+        run_errors = _read_errors(folder / ERRORS_FILE)
+        errors[name] = run_errors[run_errors["method"] == method]
         for other in ("klt", "nominal", "mean_at_step", "mean", *FLOORS):
             if (target, *where[:-1]) not in seen and f"baseline/{other}/position_rmse_vector_m" in metrics:
                 rows.append([other, *where[:-1], "-", *_cells(metrics, f"baseline/{other}")])
@@ -185,8 +185,8 @@ def _cells(metrics: Metrics, prefix: str) -> list[str]:
     cells = []
     for key in _COLUMNS:
         value = metrics.get(f"{prefix}/{key}")
-        found = float(value) if isinstance(value, int | float) else None
-        cells.append(number(None) if found is None else read_spread(metrics, f"{prefix}/{key}").text(found))
+        known = float(value) if isinstance(value, int | float) else None
+        cells.append(number(None) if known is None else read_spread(metrics, f"{prefix}/{key}").text(known))
     return cells
 
 

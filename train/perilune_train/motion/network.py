@@ -47,7 +47,7 @@ class Scales:
     def measured(cls, trajectories: list[Trajectory], fusion: Fusion, target: Target = "motion") -> "Scales":
         """Compute the scales of a training set."""
         if target == "pose":
-            position, attitude = (np.concatenate([one.pose[i] for one in trajectories]) for i in range(2))
+            position, attitude = (np.concatenate([trajectory.pose[i] for trajectory in trajectories]) for i in range(2))
             mean = mean_rotation(attitude)
             spread_m = np.maximum(position.std(0), 1e-3).tolist()
             turns = rotation_vectors(attitude @ mean.T)

@@ -43,8 +43,8 @@ def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
     u, v, w = (rows[:, i, 0] * x + rows[:, i, 1] * y + rows[:, i, 2] for i in range(3))
     grid = torch.stack([2 * u / (w * width) - 1, 2 * v / (w * height) - 1], dim=-1)
     pixels = frames[:, None].float()
-    found = functional.grid_sample(pixels, grid, mode="bicubic", padding_mode="reflection", align_corners=False)
-    return found[:, 0].clamp(0, 255)
+    sampled = functional.grid_sample(pixels, grid, mode="bicubic", padding_mode="reflection", align_corners=False)
+    return sampled[:, 0].clamp(0, 255)
 
 
 def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tensor | None = None) -> Iterator[Tensor]:
@@ -114,4 +114,4 @@ def predict_pose_by_pairs(network: Any, architecture: dict[str, Any], trajectory
         output, _ = network.recurrent.over_time(torch.cat(list(last))[None])
         poses.append(pose_of(output[0, -1:], scales))
     seconds = (time.perf_counter() - started) / trajectory.n_pairs
-    return (np.concatenate([one[0] for one in poses]), np.concatenate([one[1] for one in poses])), seconds
+    return (np.concatenate([pose[0] for pose in poses]), np.concatenate([pose[1] for pose in poses])), seconds

@@ -33,11 +33,11 @@ _STATE_KEY = "perilune/run"
 
 def hashes_of(inputs: Mapping[str, Address | None]) -> dict[str, str | None]:
     """Hash of each input: of the dataset.json of a dataset (a folder or an address), or of the file itself."""
-    return {name: None if place is None else _hash_of(place) for name, place in inputs.items()}
+    return {name: None if address is None else _hash_of(address) for name, address in inputs.items()}
 
 
-def _hash_of(place: Address) -> str | None:
-    store = open_store(place)
+def _hash_of(address: Address) -> str | None:
+    store = open_store(address)
     if store.folder is None:
         return store.sha256(INFO_NAME) if store.exists(INFO_NAME) else None
     file = store.folder / INFO_NAME if store.folder.is_dir() else store.folder

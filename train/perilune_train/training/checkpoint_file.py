@@ -145,12 +145,12 @@ def _check_directory(stream: BinaryIO, size: int) -> None:
     start = max(0, size - _END.size - 2**16)
     stream.seek(start)
     tail = stream.read(_END.size + 2**16)
-    place = tail.rfind(b"PK\x05\x06")
-    if place < 0 or len(tail) < place + _END.size:
+    end = tail.rfind(b"PK\x05\x06")
+    if end < 0 or len(tail) < end + _END.size:
         raise _Refused("no checkpoint, or the beginning of one")
-    length = _END.unpack_from(tail, place)[5]
+    length = _END.unpack_from(tail, end)[5]
     if length == 0xFFFFFFFF:
-        stream.seek(max(0, start + place - _LOCATOR.size))
+        stream.seek(max(0, start + end - _LOCATOR.size))
         stream.seek(_LOCATOR.unpack(stream.read(_LOCATOR.size))[2])
         length = _END_64.unpack(stream.read(_END_64.size))[8]
     if length > _MOST_DIRECTORY_BYTES:

@@ -161,10 +161,10 @@ def load_state(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path
 
 def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Module) -> None:
     """Raise UserError naming the first tensor of a checkpoint that is missing, extra or of the wrong shape."""
-    own = network.state_dict()
-    for key in sorted(own.keys() | state.keys()):
+    tensors = network.state_dict()
+    for key in sorted(tensors.keys() | state.keys()):
         found = tuple(state[key].shape) if key in state else "nothing"
-        expected = str(tuple(own[key].shape)) if key in own else "no such tensor"
+        expected = str(tuple(tensors[key].shape)) if key in tensors else "no such tensor"
         if str(found) != expected:
             raise UserError(path, key, found, f"{expected}; the checkpoint is of another architecture")
 

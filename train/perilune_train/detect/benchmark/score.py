@@ -73,28 +73,28 @@ class Score:
 
     def figures(self) -> Metrics:
         """Flat keys for benchmark.json: headline/..., <rule>/<key of an evaluation>, <rule>/region/<name>/..."""
-        found: Metrics = {}
+        figures: Metrics = {}
         for metric in ("ap50_paper", "f1"):
             rule, account, value = self.least(metric)
-            found |= {f"headline/{metric}": value, f"headline/{metric}_account": f"{rule}, {account}"}
+            figures |= {f"headline/{metric}": value, f"headline/{metric}_account": f"{rule}, {account}"}
         for rule, evaluation in self.evaluations.items():
-            found |= {f"{rule}/{key}": value for key, value in evaluation.figures().items()}
+            figures |= {f"{rule}/{key}": value for key, value in evaluation.figures().items()}
             for region in self.regions[rule]:
                 prefix = f"{rule}/region/{region.name.replace(' ', '_')}"
                 for name in ("scenes", "labels", "ap50_paper", "edge_ap50_paper", "f1"):
-                    found[f"{prefix}/{name}"] = getattr(region, name)
-                found |= region.spread.keys(f"{prefix}/ap50_paper")
+                    figures[f"{prefix}/{name}"] = getattr(region, name)
+                figures |= region.spread.keys(f"{prefix}/ap50_paper")
         for part, (n_frames, n_locked) in self.frames_of.items():
-            found |= {f"frames/{part}": n_frames, f"locked_frames/{part}": n_locked}
-        return found
+            figures |= {f"frames/{part}": n_frames, f"locked_frames/{part}": n_locked}
+        return figures
 
 
 def load_parts(parts: Sequence[Part]) -> dict[str, dict[str, DetectSplit]]:
     """Frames and labels of each part, by rule. Raises UserError if the parts have frames of different sizes."""
     settings = {rule: LabelSettings(selection=rule) for rule in RULES}
     loaded = {
-        rule: {part.name: load_split(part.dataset, "test", own, (1.0, 1 / EDGE)) for part in parts}
-        for rule, own in settings.items()
+        rule: {part.name: load_split(part.dataset, "test", labels, (1.0, 1 / EDGE)) for part in parts}
+        for rule, labels in settings.items()
     }
     ranges = {split.radius_px for split in loaded["paper"].values()}
     if len(ranges) > 1:
@@ -105,7 +105,7 @@ def load_parts(parts: Sequence[Part]) -> dict[str, dict[str, DetectSplit]]:
 def score(
     parts: Sequence[Part],
     loaded: Mapping[str, Mapping[str, DetectSplit]],
-    found: Mapping[str, list[Detections]],
+    detections_by_part: Mapping[str, list[Detections]],
     threshold: float,
 ) -> Score:
     """Score detections, by part one entry for each frame; `loaded` is from `load_parts`."""
@@ -113,7 +113,7 @@ def score(
     splits = loaded[RULES[0]]
     facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})
     of_frame = [part.region for part in parts for _ in range(len(splits[part.name]))]
-    detections = [each for part in parts for each in found[part.name]]
+    detections = [each for part in parts for each in detections_by_part[part.name]]
     for rule, by_part in loaded.items():
         labels: list[FrameLabels] = [each for part in parts for each in by_part[part.name].labels]
         radius_px = next(iter(by_part.values())).radius_px

@@ -42,15 +42,15 @@ def score_run(
     provenance = read_provenance(runs.load_weights(best), best)
     checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
     detector, loaded = open_detector(best, config), load_parts(parts)
-    found, rates = {}, {}
+    detections, rates = {}, {}
     for name, split in next(iter(loaded.values())).items():
-        found[name], rates[name] = detect_split(detector, split, name)
+        detections[name], rates[name] = detect_split(detector, split, name)
     scales = " and ".join(f"{factor:g}" for factor in config.evaluation.scales)
     about = [f"run {code_span(run.resolve().name)}, best weights, frames evaluated at scale {scales}"]
     about.append(f"threshold {threshold:.4f}, chosen on the validation split of the run's own dataset")
     more: Metrics = {"scored": f"run {run.resolve().name}", "scales": scales}
     more |= {f"images_per_s/{name}": round(rate, 2) for name, rate in rates.items()}
-    return _write(out, parts, loaded, _Entry(found, threshold, about, more, checks))
+    return _write(out, parts, loaded, _Entry(detections, threshold, about, more, checks))
 
 
 def score_submission(
@@ -63,10 +63,10 @@ def score_submission(
     parts = open_parts("detect", data, manifests)
     loaded = load_parts(parts)
     ids = {name: split.frames.table["frame_id"].tolist() for name, split in next(iter(loaded.values())).items()}
-    found = read_submission(detections, ids)
+    submitted = read_submission(detections, ids)
     about = [f"detections of {code_span(name)}; training data and choices are as its authors state"]
     about.append(f"threshold {threshold:g}, as given; it must be chosen on other frames")
-    return _write(out, parts, loaded, _Entry(found, threshold, about, {"scored": f"detections of {name}"}, []))
+    return _write(out, parts, loaded, _Entry(submitted, threshold, about, {"scored": f"detections of {name}"}, []))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class _Entry:
 def _write(out: Path, parts: Sequence[Part], loaded: dict[str, dict[str, DetectSplit]], entry: _Entry) -> Score:
     """Score detections and write all files; returns the score."""
     about, threshold = entry.about, entry.threshold
-    made = score(parts, loaded, entry.detections, threshold)
+    result = score(parts, loaded, entry.detections, threshold)
     mark = "; ".join(dict.fromkeys(check.mark for check in entry.checks if check.mark))
-    for rule, evaluation in made.evaluations.items():
-        write_evaluation(out / rule, evaluation, made.images, [*about, f"labels: selection `{rule}`"])
+    for rule, evaluation in result.evaluations.items():
+        write_evaluation(out / rule, evaluation, result.images, [*about, f"labels: selection `{rule}`"])
         mark_files(out / rule, _PICTURES, mark)
-    write_markdown(out / PAGE, page_of(made, about))
+    write_markdown(out / PAGE, page_of(result, about))
     mark_files(out, [PAGE], mark)
-    write_metrics(out, made.figures() | entry.entries | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
-    return made
+    write_metrics(out, result.figures() | entry.entries | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
+    return result

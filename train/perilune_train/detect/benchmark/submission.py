@@ -34,20 +34,20 @@ def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[
     datasets, ids = table.texts("dataset"), table.texts("frame_id")
     of_dataset = _known(datasets, list(frames))
     table.check("dataset", of_dataset >= 0, f"one of {', '.join(sorted(frames))}")
-    found = {}
-    for place, (name, own_ids) in enumerate(frames.items()):
-        rows = np.flatnonzero(of_dataset == place)
+    by_dataset = {}
+    for number, (name, own_ids) in enumerate(frames.items()):
+        rows = np.flatnonzero(of_dataset == number)
         at = _known(ids, own_ids)[rows]
         if (at < 0).any():
             raise table.fault(int(rows[(at < 0).argmax()]), "frame_id", f"a frame of {name}")
-        found[name] = _of_dataset(table, rows, at, len(own_ids))
-    return found
+        by_dataset[name] = _of_dataset(table, rows, at, len(own_ids))
+    return by_dataset
 
 
 def _known(texts: Texts, names: list[str]) -> np.ndarray:
     """Place in `names` of each row's text; -1 for others."""
-    place = {name: k for k, name in enumerate(names)}
-    return np.array([*(place.get(word, -1) for word in texts.words), -1], np.int64)[texts.codes]
+    number_of = {name: k for k, name in enumerate(names)}
+    return np.array([*(number_of.get(word, -1) for word in texts.words), -1], np.int64)[texts.codes]
 
 
 def _check_numbers(table: Columns) -> None:
@@ -64,4 +64,4 @@ def _of_dataset(table: Columns, rows: np.ndarray, at: np.ndarray, n_frames: int)
     order = np.lexsort((-scores, at))
     bounds = np.searchsorted(at[order], np.arange(n_frames + 1))
     parts = (order[start:stop] for start, stop in pairwise(bounds))
-    return [Detections(boxes[own], scores[own]) for own in parts]
+    return [Detections(boxes[chosen], scores[chosen]) for chosen in parts]

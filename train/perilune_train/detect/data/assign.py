@@ -134,8 +134,8 @@ def assign(
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
         places = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
-        made = Assignment(places, labels.boxes[label], ignored)
-        result.append(replace(made, ignored=ignored & ~made.positive))
+        assignment = Assignment(places, labels.boxes[label], ignored)
+        result.append(replace(assignment, ignored=ignored & ~assignment.positive))
     return result
 
 

@@ -34,8 +34,8 @@ class TrainingFrames(torch_data.Dataset):
     def keys(self, epoch: int) -> list[Key]:
         """Keys of the share's frames in the order of an epoch, which depends on seed and epoch only."""
         order = np.random.default_rng([self.seed, epoch]).permutation(self.split.n_frames)
-        own = order[self.split.share.owns(order)] // self.split.share.processes
-        return [(epoch, int(number)) for number in own]
+        numbers = order[self.split.share.owns(order)] // self.split.share.processes
+        return [(epoch, int(number)) for number in numbers]
 
     def __getitem__(self, key: Key) -> Sample:
         epoch, number = key

@@ -84,10 +84,10 @@ class SplitLabels(Sequence[FrameLabels]):
         if isinstance(place, slice):
             return [self[i] for i in range(*place.indices(len(self)))]
         place = range(len(self))[place]
-        own = slice(self.bounds[place], self.bounds[place + 1])
-        shape = self.shape[own]
+        rows = slice(self.bounds[place], self.bounds[place + 1])
+        shape = self.shape[rows]
         return FrameLabels(
-            shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[own], self.labelled[own], self.depth_ratio[own]
+            shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[rows], self.labelled[rows], self.depth_ratio[rows]
         )
 
 
@@ -124,14 +124,16 @@ def read_split_labels(
             # Labels of another split have the place -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
             labels, bounds = labels.take(order), np.searchsorted(frame[order], [*places, places[-1] + 1])
-            own = _SceneLabels.of(labels, craters, limits.selection)
-            sizes.append((own.shape[:, 2:4] - own.shape[:, :2])[own.selected])
+            scene_labels = _SceneLabels.of(labels, craters, limits.selection)
+            sizes.append((scene_labels.shape[:, 2:4] - scene_labels.shape[:, :2])[scene_labels.selected])
             for place, start, stop in zip(places, bounds, bounds[1:], strict=False):
                 if place in own_places:
                     part, row = slice(start, stop), table.iloc[place].to_dict()
-                    ids = own.crater_id[part]
+                    ids = scene_labels.crater_id[part]
                     ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, ids)
-                    frames.add(own.shape[part], own.selected[part], own.depth_ratio[part], ignored)
+                    frames.add(
+                        scene_labels.shape[part], scene_labels.selected[part], scene_labels.depth_ratio[part], ignored
+                    )
     check.finish()
     return frames.joined(), np.concatenate(sizes)
 
@@ -152,10 +154,10 @@ def frame_labels(
     if not known.all():
         found = f"{ids[known.argmin()]} in {row['frame_id']}"
         raise UserError(dataset.store, "labels: crater_id", found, "craters; see `perilune-manifest validate`")
-    own = _SceneLabels.of(labels, craters, limits.selection)
-    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, own.crater_id)
+    scene_labels = _SceneLabels.of(labels, craters, limits.selection)
+    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, scene_labels.crater_id)
     frames = _Joined()
-    frames.add(own.shape, own.selected, own.depth_ratio, ignored)
+    frames.add(scene_labels.shape, scene_labels.selected, scene_labels.depth_ratio, ignored)
     return frames.joined()[0]
 
 

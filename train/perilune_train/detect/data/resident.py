@@ -66,9 +66,11 @@ class ResidentFrames:
         for start in range(0, len(split), _PORTION):
             labels = split.labels[start : start + _PORTION]
             rows = BatchLabels(
-                torch.cat([torch.as_tensor(one.boxes, dtype=torch.float32) for one in labels]),
-                torch.repeat_interleave(torch.arange(len(labels)), torch.tensor([len(one.boxes) for one in labels])),
-                torch.cat([torch.as_tensor(one.selected) for one in labels]),
+                torch.cat([torch.as_tensor(frame.boxes, dtype=torch.float32) for frame in labels]),
+                torch.repeat_interleave(
+                    torch.arange(len(labels)), torch.tensor([len(frame.boxes) for frame in labels])
+                ),
+                torch.cat([torch.as_tensor(frame.selected) for frame in labels]),
             )
             shapes = [(len(labels), height // stride, width // stride) for stride in config.strides]
             parts.append(assign(rows, anchors.cpu(), config.strides, shapes, ratio))
@@ -94,9 +96,9 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
         counts = torch.bincount(part.places[0], minlength=len(part.ignored)).tolist()
         places += list(part.places[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
-    counted = pad_sequence([torch.ones(len(one), dtype=torch.bool) for one in boxes], batch_first=True)
+    counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
     # A box with an area, since the loss is computed for all rows.
-    filled = pad_sequence([one - one.new_tensor([0, 0, 1, 1]) for one in boxes], batch_first=True)
+    filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
     return ResidentScale(
         pad_sequence(places, batch_first=True).to(device),
         (filled + filled.new_tensor([0, 0, 1, 1])).to(device),

@@ -47,8 +47,8 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
     labels = _Labels(dataset, config, radius_px)
     sizes = []
     for batch in sampled:
-        boxes = [own.boxes[own.selected] for own in map(labels, batch)]
-        sizes += [own[:, 2:] - own[:, :2] for own in boxes]
+        boxes = [frame.boxes[frame.selected] for frame in map(labels, batch)]
+        sizes += [frame[:, 2:] - frame[:, :2] for frame in boxes]
         if len(sizes) >= _SAMPLED_FRAMES:
             break
     stream = FrameStream(dataset, "train", config.batch_size, config.seed, share, FrameContent(_COLUMNS))

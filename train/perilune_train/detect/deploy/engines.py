@@ -44,9 +44,9 @@ def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engi
 
     @torch.inference_mode()
     def run(images: Array) -> tuple[Array, Array]:
-        given = torch.as_tensor(images).contiguous(memory_format=torch.channels_last)
+        inputs = torch.as_tensor(images).contiguous(memory_format=torch.channels_last)
         with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
-            boxes, scores = network(given)
+            boxes, scores = network(inputs)
         return boxes.float().numpy(), scores.float().numpy()
 
     return run
@@ -92,8 +92,8 @@ def openvino_engine(
     request = core.compile_model(model, "CPU", settings).create_infer_request()
 
     def run(images: Array) -> tuple[Array, Array]:
-        found = request.infer({"images": images})
-        return found["boxes"].copy(), found["scores"].copy()
+        outputs = request.infer({"images": images})
+        return outputs["boxes"].copy(), outputs["scores"].copy()
 
     return run
 

@@ -137,9 +137,9 @@ def _terrain(
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None
-    own = split_terrain(calibration, "train", "calibrated") | split_terrain(calibration, "val", "calibrated")
-    check = check_calibration(provenance, own, calibration, allow_overlap)
-    return Provenance(provenance.uses | own, provenance.known), check
+    calibrated = split_terrain(calibration, "train", "calibrated") | split_terrain(calibration, "val", "calibrated")
+    check = check_calibration(provenance, calibrated, calibration, allow_overlap)
+    return Provenance(provenance.uses | calibrated, provenance.known), check
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,27 +88,27 @@ def figures_by_bin(
     The outer altitude bins include frames up to a tenth beyond the first and the last altitude, because trajectories
     end near the nominal altitude, not exactly at it.
     """
-    made, threshold, radius_px = [], criteria.threshold, criteria.radius_px
+    bins, threshold, radius_px = [], criteria.threshold, criteria.radius_px
     for low, high in pairwise(RADIUS_BINS_PX):
         # A radius of exactly 50 px belongs to the paper's largest bin.
-        own = within(overlaps.label_radius_px, low, high, high == _PAPER_MAX_RADIUS_PX)
-        own &= (low < _PAPER_MAX_RADIUS_PX) | (overlaps.label_radius_px > low)
+        in_bin = within(overlaps.label_radius_px, low, high, high == _PAPER_MAX_RADIUS_PX)
+        in_bin &= (low < _PAPER_MAX_RADIUS_PX) | (overlaps.label_radius_px > low)
         evaluated = max(low, radius_px[0]), min(high, radius_px[1])
-        part = overlaps.match(criteria.match_iou, evaluated, overlaps.label_selected & own)
-        made.append(_of_matches(_Bin("radius", "px", low, high), part, threshold, resamples))
+        part = overlaps.match(criteria.match_iou, evaluated, overlaps.label_selected & in_bin)
+        bins.append(_of_matches(_Bin("radius", "px", low, high), part, threshold, resamples))
     margins = {ALTITUDE_BINS_M[0]: 1 - _ALTITUDE_MARGIN, ALTITUDE_BINS_M[-1]: 1 + _ALTITUDE_MARGIN}
     for low, high in pairwise(ALTITUDE_BINS_M):
         chosen = within(facts.altitude_m, low * margins.get(low, 1), high * margins.get(high, 1), high in margins)
         limits = _Bin("altitude", "m", low, high)
-        made.append(_of_matches(limits, matches.of_frames(chosen), threshold, resamples))
+        bins.append(_of_matches(limits, matches.of_frames(chosen), threshold, resamples))
     for low, high in pairwise(SUN_BINS_DEG):
         chosen = within(facts.sun_elevation_deg, low, high, high == SUN_BINS_DEG[-1])
         limits = _Bin("sun", "deg", low, high)
-        made.append(_of_matches(limits, matches.of_frames(chosen), threshold, resamples))
+        bins.append(_of_matches(limits, matches.of_frames(chosen), threshold, resamples))
     for low, high in pairwise(DEPTH_RATIO_BINS):
-        own = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_selected
-        made.append(_of_labels(_Bin("depth_ratio", "", low, high), own, overlaps, matches, threshold, resamples))
-    return [one for one in made if one.labels]
+        in_bin = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_selected
+        bins.append(_of_labels(_Bin("depth_ratio", "", low, high), in_bin, overlaps, matches, threshold, resamples))
+    return [part_bin for part_bin in bins if part_bin.labels]
 
 
 class _Bin(NamedTuple):
@@ -146,23 +146,23 @@ def _of_matches(limits: _Bin, matches: Matches, threshold: float, resamples: Res
 
 def _of_labels(
     limits: _Bin,
-    own: Flags,
+    in_bin: Flags,
     overlaps: Overlaps,
     matches: Matches,
     threshold: float,
     resamples: Resamples,
 ) -> BinFigures:
-    """Recall of the labels `own` (L,) in the matching with all labels."""
-    hit = np.zeros(len(own), np.bool_)
+    """Recall of the labels `in_bin` (L,) in the matching with all labels."""
+    hit = np.zeros(len(in_bin), np.bool_)
     hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
-    frames = overlaps.label_frame[own]
+    frames = overlaps.label_frame[in_bin]
 
     def recalls(drawn: Resamples) -> dict[str, Array]:
-        found, n_labels = drawn.totals(overlaps.label_frame[own & hit]), drawn.totals(frames)
-        return {"recall": np.divide(found, n_labels, out=np.full(len(n_labels), np.nan), where=n_labels > 0)}
+        n_found, n_labels = drawn.totals(overlaps.label_frame[in_bin & hit]), drawn.totals(frames)
+        return {"recall": np.divide(n_found, n_labels, out=np.full(len(n_labels), np.nan), where=n_labels > 0)}
 
     nan = float("nan")
-    recall = float(hit[own].mean()) if own.any() else nan
+    recall = float(hit[in_bin].mean()) if in_bin.any() else nan
     return BinFigures(
         *limits,
         len(np.unique(frames)),

@@ -120,7 +120,7 @@ class Evaluation:
 
 
 def evaluate_detections(
-    found: list[Detections],
+    detections: list[Detections],
     labels: Sequence[FrameLabels],
     facts: FrameFacts,
     criteria: Criteria,
@@ -132,7 +132,7 @@ def evaluate_detections(
     is the random seed of the bootstrap only.
     """
     match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
-    overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
+    overlaps = find_overlaps(detections, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
     matches = overlaps.match(match_iou, radius_px)
     at_edge = overlaps.match(match_iou, edge_range(radius_px))
     by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
@@ -148,7 +148,7 @@ def evaluate_detections(
         }
 
     return Evaluation(
-        found,
+        detections,
         labels,
         facts,
         threshold,
@@ -170,8 +170,8 @@ def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> d
     a rotated ellipse it is slightly larger than sqrt(a b), which a box does not determine. Bias is the mean of detected
     minus true.
     """
-    own = (matches.label >= 0) & (matches.scores >= threshold)
-    ours, truth = overlaps.boxes[own], overlaps.label_boxes[matches.label[own]]
+    hits = (matches.label >= 0) & (matches.scores >= threshold)
+    ours, truth = overlaps.boxes[hits], overlaps.label_boxes[matches.label[hits]]
     radius, true_radius = (np.sqrt(np.prod(box[:, 2:] - box[:, :2], axis=1)) / 2 for box in (ours, truth))
     centre_error = np.linalg.norm((ours[:, :2] + ours[:, 2:] - truth[:, :2] - truth[:, 2:]) / 2, axis=1)
     difference = radius - true_radius

@@ -100,8 +100,8 @@ class CraterDetector:
 
     def _craters(self, image: ImageLike, threshold: float) -> Craters:
         name, grey = _read(image)
-        found = above(detect_image(self._detector, grey, self._tiling), threshold)
-        return Craters(_with_ellipses(table_of(name, found), found), grey)
+        detections = above(detect_image(self._detector, grey, self._tiling), threshold)
+        return Craters(_with_ellipses(table_of(name, detections), detections), grey)
 
     def __repr__(self) -> str:
         where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"
@@ -149,9 +149,9 @@ def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
     raise UserError("detector", "image", type(image).__name__, expected)
 
 
-def _with_ellipses(table: pd.DataFrame, found: Detections) -> pd.DataFrame:
+def _with_ellipses(table: pd.DataFrame, detections: Detections) -> pd.DataFrame:
     """The table with the axis-aligned ellipses inside the boxes, by the columns and rules of labels."""
-    x0, y0, x1, y1 = found.boxes.T
+    x0, y0, x1, y1 = detections.boxes.T
     width, height = x1 - x0, y1 - y0
     columns = [(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(width, height) / 2, np.minimum(width, height) / 2]
     # The direction of the longer axis.

@@ -57,16 +57,16 @@ class Request:
 def read_images(source: Path, request: Request = Request()) -> ImageSet:
     """Read the labelled images of a folder or a label file. Raises UserError, naming file and line."""
     if source.is_dir():
-        found, split = _of_folder(source, request)
+        label_file, split = _of_folder(source, request)
     elif source.is_file():
-        found, split = _of_file(source, request)
+        label_file, split = _of_file(source, request)
     else:
         raise UserError(source, "--images", "no such folder", "a folder of images with labels, or a label file")
     if request.split is not None and not split:
         raise UserError("--split", "split", request.split, f"a source with splits; {source.name} has none")
     if split:
         say(f"{source.name}: {split}")
-    return replace(image_set(found, request.categories), split=split)
+    return replace(image_set(label_file, request.categories), split=split)
 
 
 def _of_file(path: Path, request: Request) -> tuple[LabelFile, str]:
@@ -120,17 +120,17 @@ def _split_of(name: str) -> str:
 
 def _coco_files(folder: Path) -> list[Path]:
     """The JSON files of a folder, or of its folder annotations, that hold COCO; not those of LabelMe."""
-    for place in (folder, folder / "annotations"):
-        paths = sorted(place.glob("*.json")) if place.is_dir() else []
-        stems = {path.stem for path in pictures_of(place)} if paths else set()
-        found = [path for path in paths if path.stem not in stems and not path.name.startswith(".")]
-        found = [path for path in found if '"shapes"' not in (head := _head(path)) and "{" in head]
+    for parent in (folder, folder / "annotations"):
+        paths = sorted(parent.glob("*.json")) if parent.is_dir() else []
+        stems = {path.stem for path in pictures_of(parent)} if paths else set()
+        candidates = [path for path in paths if path.stem not in stems and not path.name.startswith(".")]
+        candidates = [path for path in candidates if '"shapes"' not in (head := _head(path)) and "{" in head]
         # Beside them COCO has files of captions and key points.
-        found = [path for path in found if path.stem.startswith("instances")] or found
-        if len(found) == 1:
-            return found if is_coco(read_content(found[0])) else []
-        if found and all(_split_of(path.stem.rpartition("_")[2]) for path in found):
-            return found
+        candidates = [path for path in candidates if path.stem.startswith("instances")] or candidates
+        if len(candidates) == 1:
+            return candidates if is_coco(read_content(candidates[0])) else []
+        if candidates and all(_split_of(path.stem.rpartition("_")[2]) for path in candidates):
+            return candidates
     return []
 
 
@@ -171,35 +171,35 @@ def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFil
 
 
 def _numbers_as_names(entries: Sequence[Entry]) -> dict[str, str]:
-    return {one.category: one.category for entry in entries for one in entry.objects}
+    return {item.category: item.category for entry in entries for item in entry.objects}
 
 
 def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
     """Images with a label file each, beside them or in another folder."""
-    own = pictures_of(folder)
+    images = pictures_of(folder)
     root = folder
-    if not own:
+    if not images:
         places = [folder / name for name in _PICTURE_FOLDERS if (folder / name).is_dir()]
         root = places[0] if places else folder
-        own = pictures_of(root, recursive=True) if places else []
-    if not own:
+        images = pictures_of(root, recursive=True) if places else []
+    if not images:
         raise UserError(folder, "--images", "no PNG, TIFF or JPEG", "images with labels beside them")
     labels = [root, *(folder / name for name in _LABEL_FOLDERS if (folder / name).is_dir())]
     by_suffix = {suffix: {} for suffix in _LABEL_SUFFIXES}  # type: dict[str, dict[Path, Path]]
-    for picture in own:
-        for place in labels:
+    for picture in images:
+        for label_folder in labels:
             for suffix in _LABEL_SUFFIXES:
-                path = (place / picture.relative_to(root)).with_suffix(suffix)
-                if path.is_file() and path not in own:
+                path = (label_folder / picture.relative_to(root)).with_suffix(suffix)
+                if path.is_file() and path not in images:
                     by_suffix[suffix].setdefault(picture, path)
     kinds = [suffix for suffix, files in by_suffix.items() if files]
     if not kinds:
-        missing = own[0].with_suffix(".txt")
+        missing = images[0].with_suffix(".txt")
         raise UserError(missing, "boxes", "no such file", "a file of labels for each image (.txt, .xml or .json)")
     if len(kinds) > 1:
         raise UserError(folder, "labels", f"files of {len(kinds)} kinds: {', '.join(kinds)}", "one kind")
     files = by_suffix[kinds[0]]
-    return _of_pairs(folder, root, files, len(own) - len(files)), ""
+    return _of_pairs(folder, root, files, len(images) - len(files)), ""
 
 
 def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: int) -> LabelFile:

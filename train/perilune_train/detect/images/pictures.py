@@ -35,12 +35,12 @@ def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
     if masks or hidden:
         parts = [f"{hidden} hidden files"] * bool(hidden) + [f"{len(masks)} masks or overlays"] * bool(masks)
         say(f"{folder.name}: {' and '.join(parts)} are left out")
-    found = []
+    images = []
     for path in named:
         if path not in masks:
             label = labels.get(path.with_suffix("").as_posix().lower()) if path.suffix.lower() == ".img" else None
-            found.append(label or path)
-    return found
+            images.append(label or path)
+    return images
 
 
 def check_names(paths: list[Path], names: list[str]) -> None:

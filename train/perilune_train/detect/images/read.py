@@ -229,9 +229,9 @@ def _pillow_image(path: Path, stack: contextlib.ExitStack) -> Any:
 
 
 def _bits(tags: dict[int, Any]) -> tuple[int, ...]:
-    found = tags.get(_BITS_TAG, (1,))
-    found = found if isinstance(found, tuple) else (found,)
-    return tuple(value for value in found if isinstance(value, int)) or (1,)
+    bits = tags.get(_BITS_TAG, (1,))
+    bits = bits if isinstance(bits, tuple) else (bits,)
+    return tuple(value for value in bits if isinstance(value, int)) or (1,)
 
 
 def _is_deep_or_signed(tags: dict[int, Any]) -> bool:
@@ -296,20 +296,20 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
     with rasterio.Env(GDAL_CACHEMAX=_CACHE_MB), opened_raster(files, "image") as raster:
         colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
         kinds = list(raster.colorinterp)
-        found = all(colour in kinds for colour in colours)
-        indexes = [kinds.index(colour) + 1 for colour in colours] if found else [1]
+        is_colour = all(colour in kinds for colour in colours)
+        indexes = [kinds.index(colour) + 1 for colour in colours] if is_colour else [1]
         width, height = raster.width, raster.height
         # OpenJPEG decodes whole tiles, of which there may be one, to 4 bytes.
         _check_size(path, width, height, 4 if driver == "JP2OpenJPEG" else 1)
         block_rows = raster.block_shapes[0][0]
-        some = max(_STRIP_PIXELS // width, 1)
-        rows = max(some // block_rows, 1) * block_rows
+        n_rows = max(_STRIP_PIXELS // width, 1)
+        rows = max(n_rows // block_rows, 1) * block_rows
 
         def strips() -> Iterator[NDArray]:
             for top in range(0, height, rows):
                 bands = raster.read(indexes, window=Window(0, top, width, min(rows, height - top)))
-                for start in range(0, bands.shape[1], some):
-                    yield bands[:, start : start + some]
+                for start in range(0, bands.shape[1], n_rows):
+                    yield bands[:, start : start + n_rows]
 
         yield _Picture(
             path,

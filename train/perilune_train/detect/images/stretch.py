@@ -49,8 +49,8 @@ def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
     if find_fills:
         # Fill at one end can hide that at the other, so the first end is looked at twice.
         for sign in (1, -1, 1):
-            own = _isolated_end(sign * rest, len(sample))
-            fills += [sign * value for value in own]
+            end = _isolated_end(sign * rest, len(sample))
+            fills += [sign * value for value in end]
             rest = rest[~np.isin(rest, fills)]
     low, high = np.percentile(rest, PERCENT) if len(rest) else (0.0, 1.0)
     share = 1 - len(rest) / max(len(sample), 1)

@@ -69,13 +69,13 @@ def detect_image(
         large = scale > 1 and size[0] * size[1] > _MOST_ENLARGED_PIXELS and min(size) >= tiling.tile_px
         scaled = Enlarged(image, *size) if large else resized(image, *size)
         whole = scaled if isinstance(scaled, Enlarged) else padded(scaled, tiling.tile_px)
-        for found in _detect_tiles(detector, whole, tiling, advance):
-            own = np.ones(len(found.scores), bool)
+        for detections in _detect_tiles(detector, whole, tiling, advance):
+            inside = np.ones(len(detections.scores), bool)
             if whole.shape != scaled.shape:
                 # Drop craters in the reflected padding.
-                own = ((found.boxes[:, :2] + found.boxes[:, 2:]) / 2 < size).all(axis=1)
-            boxes.append(found.boxes[own] / np.tile([size[0] / width, size[1] / height], 2))
-            scores.append(found.scores[own])
+                inside = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2 < size).all(axis=1)
+            boxes.append(detections.boxes[inside] / np.tile([size[0] / width, size[1] / height], 2))
+            scores.append(detections.scores[inside])
     all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
     kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
     margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
@@ -115,17 +115,17 @@ def _detect_tiles(
         batch = places[first : first + detector.config.batch_size]
         tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
         predictions = detections_of(*detector.predict(tiles), detector.config.evaluation)
-        for place, found in zip(batch, predictions, strict=True):
-            boxes = found.boxes + np.tile(place[::-1], 2)
+        for corner, detections in zip(batch, predictions, strict=True):
+            boxes = detections.boxes + np.tile(corner[::-1], 2)
             clear = [
                 _clearance(boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
                 for axis, starts, length in ((0, lefts, tile_w), (1, tops, tile_h))
             ]
-            column, row = int(np.searchsorted(lefts, place[1])), int(np.searchsorted(tops, place[0]))
-            own = np.minimum(clear[0][:, column], clear[1][:, row])
+            column, row = int(np.searchsorted(lefts, corner[1])), int(np.searchsorted(tops, corner[0]))
+            clearance = np.minimum(clear[0][:, column], clear[1][:, row])
             best = np.minimum(clear[0].max(axis=1), clear[1].max(axis=1))
-            kept = own >= best - _TOLERANCE_PX
-            yield Detections(boxes[kept], found.scores[kept])
+            kept = clearance >= best - _TOLERANCE_PX
+            yield Detections(boxes[kept], detections.scores[kept])
         advance(len(batch))
 
 

@@ -61,12 +61,12 @@ def detection_loss(
     """
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
     total = sum(1 / stride for stride in strides)
-    for raw, own_anchors, stride, found in zip(outputs, anchors, strides, targets, strict=True):
-        _, anchor, row, column = found.places
-        flat = flat_places(found.places, raw.shape[:4])
+    for raw, own_anchors, stride, assignment in zip(outputs, anchors, strides, targets, strict=True):
+        _, anchor, row, column = assignment.places
+        flat = flat_places(assignment.places, raw.shape[:4])
         chosen, cells = raw.flatten(0, 3)[flat].float(), torch.stack([column, row], 1)
-        boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), found.boxes
-        counted = None if found.counted is None else found.counted.float()
+        boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), assignment.boxes
+        counted = None if assignment.counted is None else assignment.counted.float()
         n_labels = max(len(labels), 1) if counted is None else counted.sum().clamp(min=1)
         sums = settings.reduction == "sums"
         # What the sums over the predictors of this scale are divided by.
@@ -76,8 +76,8 @@ def detection_loss(
         # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
         losses = ciou_loss(boxes, labels, settings.aspect)
         box = box + (losses if counted is None else losses * counted).sum() / of_boxes
-        positive = found.positive
-        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.ignored))
+        positive = assignment.positive
+        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~assignment.ignored))
         target = positive.float()
         if settings.objectness == "iou":
             # If two labels share a predictor, use the larger IoU.

@@ -17,13 +17,15 @@ VARIED = AugmentSettings(flips_and_turns=False, gain=0.3, gamma=0.6, stretch=0.1
 _STREAM = 7
 
 
-def threshold_on_validation(detector: Detector, split: DetectSplit, found: list[Detections]) -> tuple[float, str]:
+def threshold_on_validation(
+    detector: Detector, split: DetectSplit, plain_detections: list[Detections]
+) -> tuple[float, str]:
     """The threshold by `detect.evaluation`, and how it was chosen, from the detections of a split.
 
     With `detect.evaluation.varied_frames` the frames count twice: as they are and varied.
     """
     config = detector.config
-    labels, detections, frames = list(split.labels), list(found), "val"
+    labels, detections, frames = list(split.labels), list(plain_detections), "val"
     if config.evaluation.varied_frames:
         varied, _ = detect_split(detector, varied_split(split, config.seed), "varied val")
         labels, detections, frames = labels * 2, detections + varied, "val and varied val"
@@ -37,8 +39,8 @@ def varied_split(split: DetectSplit, seed: int) -> DetectSplit:
     """The same frames with other contrast, black and white points, blur and noise (`VARIED`); same labels."""
     images = np.empty_like(split.frames.images)
     for number, image in enumerate(split.frames.images):
-        own = split.labels[number]
+        frame_labels = split.labels[number]
         rng = np.random.default_rng([seed, _STREAM, number])
-        pixels, _, _ = augment(image, own.boxes, own.selected, split.radius_px, VARIED, rng)
+        pixels, _, _ = augment(image, frame_labels.boxes, frame_labels.selected, split.radius_px, VARIED, rng)
         images[number] = np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
     return replace(split, frames=replace(split.frames, images=images))

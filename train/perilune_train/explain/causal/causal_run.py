@@ -143,11 +143,11 @@ def causal_run(
     say(f"{len(pairs.craters)} views of {len(removed)} removed craters in {len(pairs.factual)} frames")
     masks = {version: detector_masks(detector.network, images, checkpoint) for version, images in versions.items()}
     moved = mask_effects(pairs, masks, shifts)
-    found = detection_effects(pairs, lambda images: _detect(detector, images), versions)
-    found = with_found(found, threshold, shifts)
+    detected = detection_effects(pairs, lambda images: _detect(detector, images), versions)
+    detected = with_found(detected, threshold, shifts)
     gates = pictures.by_gate(moved, rng)
-    tables = {"mask_effects": moved, "detection_effects": found, "gate_effects": gates}
-    tables |= {"mask_bins": bins.binned(moved, "change"), "detection_bins": bins.binned(found, "found")}
+    tables = {"mask_effects": moved, "detection_effects": detected, "gate_effects": gates}
+    tables |= {"mask_bins": bins.binned(moved, "change"), "detection_bins": bins.binned(detected, "found")}
     if turned is not None:
         tables["turned_sun"] = _turned(detector, opened, open_single(turned), split, checkpoint)
     if pose is not None:
@@ -160,7 +160,7 @@ def causal_run(
     mark_files(run.root, list(CAPTIONS), "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
     tested = _tested(tables, gate, rng)
     metrics = _metrics(tables, gate) | _p_values(tested) | terrain
-    claims = [one.claim for one in tested.values()]
+    claims = [claim.claim for claim in tested.values()]
     write_text(run.root / "claims.json", json.dumps(claims, indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
     for claim in claims:
@@ -174,19 +174,19 @@ def _versions(
 ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[float, float] | None]]:
     """All versions of the frames by name, and the shifts of the placebo regions."""
     whole = load_split(dataset, split, labels)
-    place = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
-    frames = frames_of(whole, [place[one] for one in pairs.frames["frame_id"]], settings.ring_factors)
+    index_of = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
+    frames = frames_of(whole, [index_of[name] for name in pairs.frames["frame_id"]], settings.ring_factors)
     inpainted, placebo, shifts = filled_frames(pairs, frames.truth < 1, rng)
     names = ("factual", "rendered", "inpainted", "placebo")
     return dict(zip(names, (pairs.factual, pairs.counterfactual, inpainted, placebo), strict=True)), shifts
 
 
 def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
-    found = []
+    detections = []
     for start in range(0, len(images), _BATCH):
         boxes, scores = detector.predict(images[start : start + _BATCH])
-        found += detections_of(boxes, scores, detector.config.evaluation)
-    return found
+        detections += detections_of(boxes, scores, detector.config.evaluation)
+    return detections
 
 
 def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, checkpoint: Path) -> pd.DataFrame:
@@ -196,7 +196,7 @@ def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, c
     """
     tables = same_frames(factual, turned, split)
     images = [load_images(dataset, rows, split) for dataset, rows in zip((factual, turned), tables, strict=True)]
-    masks = [detector_masks(detector.network, one, checkpoint) for one in images]
+    masks = [detector_masks(detector.network, image, checkpoint) for image in images]
     return between(masks[0], masks[1], "turned Sun")
 
 
@@ -238,5 +238,5 @@ def _tested(tables: dict[str, pd.DataFrame], gate: str, rng: np.random.Generator
 
 
 def _p_values(tested: dict[str, Tested]) -> Metrics:
-    metrics: Metrics = {f"{name}_p": one.p for name, one in tested.items()}
+    metrics: Metrics = {f"{name}_p": test.p for name, test in tested.items()}
     return metrics | {f"{name}_p_placebo": tested[name].p_placebo for name in ("gate", "found")}

@@ -45,10 +45,10 @@ def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tes
     views = _views(effects[effects["map"] == gate], "change")
     changed = _scene_means(views["rendered"], views)
     sign = -1.0 if changed.sum() < 0 else 1.0
-    own = sign * views["rendered"]
-    beyond = [_scene_means(own + other * views["placebo"], views) for other in (-1, 1)]
+    effect = sign * views["rendered"]
+    beyond = [_scene_means(effect + other * views["placebo"], views) for other in (-1, 1)]
     p = _p(sign * changed, both_ways=True)
-    p_placebo = float(np.max([_p(one, both_ways=True) for one in beyond]))
+    p_placebo = float(np.max([_p(effect, both_ways=True) for effect in beyond]))
     rows = gates[gates["map"] == gate].set_index("version").reindex(_VERSIONS)
     mean = {str(version): float(value) for version, value in rows["change"].items()}
     low, high = ({str(version): float(value) for version, value in rows[end].items()} for end in ("low", "high"))
@@ -132,8 +132,8 @@ def _p(by_scene: NDArray[np.float64], *, both_ways: bool = False) -> float:
 
 def _ends(values: pd.Series, rows: pd.DataFrame, rng: np.random.Generator) -> tuple[float, float]:
     known = values[np.isfinite(values)]
-    own = rows.loc[known.index]
-    return scene_interval(known.to_numpy(), own["scene_id"].tolist(), own["frame_id"].tolist(), rng)
+    known_rows = rows.loc[known.index]
+    return scene_interval(known.to_numpy(), known_rows["scene_id"].tolist(), known_rows["frame_id"].tolist(), rng)
 
 
 def _verdict(n_scenes: int, n_placebo: int | None, needed: int, holds: bool) -> str:

@@ -94,7 +94,8 @@ def filled_frames(
             placebo[image] |= chosen
             taken[image] |= chosen
     fill = [
-        np.stack([inpainted(*one) for one in zip(pairs.factual, chosen, strict=True)]) for chosen in (without, placebo)
+        np.stack([inpainted(*pair) for pair in zip(pairs.factual, chosen, strict=True)])
+        for chosen in (without, placebo)
     ]
     return fill[0], fill[1], shifts
 
@@ -110,9 +111,9 @@ def mask_effects(
     """
     shape, rows = pairs.factual.shape[1:], []
     for (_, crater), shift in zip(pairs.craters.iterrows(), shifts, strict=True):
-        own, image = region(shape, crater), int(crater["image"])
+        inside, image = region(shape, crater), int(crater["image"])
         moved = None if shift is None else region(shape, crater, shift)
-        regions = {"rendered": own, "inpainted": own, "placebo": moved}
+        regions = {"rendered": inside, "inpainted": inside, "placebo": moved}
         for version, chosen in regions.items():
             for block, factual in masks["factual"].items():
                 if chosen is None or not chosen.any():
@@ -121,7 +122,7 @@ def mask_effects(
                     change = float((factual[image] - masks[version][block][image])[chosen].mean())
                 rows.append({"crater": crater.name, "map": block, "version": version, "change": change})
     table = pd.DataFrame(rows)
-    spread = {block: max(float(found.std()), 1e-9) for block, found in masks["factual"].items()}
+    spread = {block: max(float(gate_masks.std()), 1e-9) for block, gate_masks in masks["factual"].items()}
     table["change"] /= table["map"].map(spread)
     return table.merge(_facts(pairs), left_on="crater", right_index=True)
 
@@ -136,11 +137,11 @@ def detection_effects(
     boxes = pairs.craters[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     image, rows = pairs.craters["image"].to_numpy(), []
     for version, images in versions.items():
-        found = detect(images)
+        detections = detect(images)
         for k in range(len(boxes)):
-            own = found[image[k]]
-            overlap = iou_matrix(own.boxes.reshape(-1, 4), boxes[k : k + 1])[:, 0]
-            score = float(own.scores[overlap >= _MIN_IOU].max(initial=0.0))
+            frame_detections = detections[image[k]]
+            overlap = iou_matrix(frame_detections.boxes.reshape(-1, 4), boxes[k : k + 1])[:, 0]
+            score = float(frame_detections.scores[overlap >= _MIN_IOU].max(initial=0.0))
             rows.append({"crater": k, "version": version, "score": score})
     return pd.DataFrame(rows).merge(_facts(pairs), left_on="crater", right_index=True)
 
@@ -151,8 +152,8 @@ def with_found(effects: pd.DataFrame, threshold: float, shifts: Sequence[tuple[f
     NaN for the placebo of a crater without free ground (a shift of None): nothing was inpainted for it.
     """
     missing = np.array([shift is None for shift in shifts], bool)[effects["crater"].to_numpy(int)]
-    found = (effects["score"] >= threshold).astype(float)
-    return effects.assign(found=found.mask((effects["version"] == "placebo") & missing))
+    is_found = (effects["score"] >= threshold).astype(float)
+    return effects.assign(found=is_found.mask((effects["version"] == "placebo") & missing))
 
 
 def _facts(pairs: CraterPairs) -> pd.DataFrame:
@@ -169,14 +170,14 @@ def pose_effects(
     pairs would not be consecutive; render it with as many frames per trajectory as the dataset has.
     """
     check_descents(factual, counterfactual, split)
-    originals = {one.ids: one for one in load_split(factual, split)}
+    originals = {trajectory.ids: trajectory for trajectory in load_split(factual, split)}
     of_pose, tables = target_of(architecture) == "pose", []
     predicted = predict_pose if of_pose else predict
     for changed in load_split(counterfactual, split):
         original = originals[changed.ids]
-        estimates = [predicted(navigator, architecture, one)[0] for one in (original, changed)]
+        estimates = [predicted(navigator, architecture, version)[0] for version in (original, changed)]
         truth_m = original.pose[0] if of_pose else original.motion[0]
-        before, after = (np.linalg.norm(one - truth_m, axis=1) for one in estimates)
+        before, after = (np.linalg.norm(version - truth_m, axis=1) for version in estimates)
         steps = ["/".join([*changed.ids, str(step)]) for step in range(changed.n_pairs)]
         moved = np.linalg.norm(estimates[1] - estimates[0], axis=1)
         columns = {"frame_id": steps, "scene_id": changed.ids[0], "before": before, "after": after, "moved_m": moved}
@@ -187,7 +188,7 @@ def pose_effects(
 def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> None:
     """Raise UserError unless the trajectories of a split of the second dataset have all frames of the first one."""
     whole, changed = (
-        Counter(frame_table(one, split)[_TRAJECTORY].agg("/".join, axis=1)) for one in (factual, counterfactual)
+        Counter(frame_table(dataset, split)[_TRAJECTORY].agg("/".join, axis=1)) for dataset in (factual, counterfactual)
     )
     for trajectory, count in changed.items():
         if whole[trajectory] != count:

@@ -95,9 +95,9 @@ def _shown(
     inside = (craters["bbox_x0_px"] >= 0) & (craters["bbox_x1_px"] <= camera.width_px)
     inside &= (craters["bbox_y0_px"] >= 0) & (craters["bbox_y1_px"] <= camera.height_px)
     craters = craters[inside].reset_index(drop=True)
-    place = {frame_id: index for index, frame_id in enumerate(rows["frame_id"])}
+    index_of = {frame_id: index for index, frame_id in enumerate(rows["frame_id"])}
     sun = {
         frame_id: np.degrees(np.arcsin(direction[2]))
         for frame_id, direction in zip(rows["frame_id"], rows["sun_direction"], strict=True)
     }
-    return craters.assign(image=craters["frame_id"].map(place), sun_elevation_deg=craters["frame_id"].map(sun))
+    return craters.assign(image=craters["frame_id"].map(index_of), sun_elevation_deg=craters["frame_id"].map(sun))

@@ -41,8 +41,8 @@ def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool
     """Which pixels (height, width) of frame 1 see ground that is inside frame 2, which has the same shape."""
     height, width = shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    found = apply_homography(homography, np.stack([u, v], axis=-1))
-    return ((found >= 0) & (found < [width, height])).all(axis=-1)
+    moved = apply_homography(homography, np.stack([u, v], axis=-1))
+    return ((moved >= 0) & (moved < [width, height])).all(axis=-1)
 
 
 def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array) -> Array:

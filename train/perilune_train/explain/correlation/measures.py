@@ -77,8 +77,8 @@ def detector_values(
     basis = given_basis([targets.brightness, targets.gradient])
     residuals = residual_rows(craterness, basis)
     tables = []
-    for name, found in masks.items():
-        rows = standardised_rows(found)
+    for name, maps in masks.items():
+        rows = standardised_rows(maps)
         pcc1 = dot_rows(rows, craterness)
         values = {
             "pcc1_background": -pcc1,
@@ -102,11 +102,11 @@ def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pix
     the overlap. Without `all_pixels` only the measures over the overlap are computed, in half the time.
     """
     height, width = (size // part for size, part in zip(next(iter(masks.values())).shape[1:], (2, 1), strict=True))
-    seen = np.stack([seen_in_second((height, width), one) for one in targets.homographies])
+    seen = np.stack([seen_in_second((height, width), homography) for homography in targets.homographies])
     tables = []
-    for name, found in masks.items():
-        upper, lower = found[:, :height], found[:, height:]
-        moved = np.stack([moved_to_first(one, h) for one, h in zip(lower, targets.homographies, strict=True)])
+    for name, maps in masks.items():
+        upper, lower = maps[:, :height], maps[:, height:]
+        moved = np.stack([moved_to_first(mask, h) for mask, h in zip(lower, targets.homographies, strict=True)])
         seen_upper = standardised_rows(upper, seen)
         values = {
             "pcc3": dot_rows(seen_upper, standardised_rows(lower, seen)),

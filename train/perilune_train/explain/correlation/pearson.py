@@ -44,7 +44,9 @@ def partial_of_rows(rows: Array, residuals: Array, basis: Sequence[Array]) -> Ar
 
     The residuals are orthogonal to the basis, so that only the length of the map's own residual is needed.
     """
-    left = np.sqrt(np.maximum(1 - sum((dot_rows(rows, one) ** 2 for one in basis), np.zeros(len(rows))), 0))
+    left = np.sqrt(
+        np.maximum(1 - sum((dot_rows(rows, basis_rows) ** 2 for basis_rows in basis), np.zeros(len(rows))), 0)
+    )
     return dot_rows(rows, residuals) / np.where(left > _ROUNDING, left, np.nan)
 
 
@@ -100,6 +102,6 @@ def is_constant(values: ArrayLike) -> bool:
 def _without(rows: Array, basis: Sequence[Array]) -> Array:
     """Rows (N, P) without their components along the basis; twice, against rounding."""
     for _ in range(2):
-        for one in basis:
-            rows = rows - dot_rows(rows, one)[:, None] * one
+        for basis_rows in basis:
+            rows = rows - dot_rows(rows, basis_rows)[:, None] * basis_rows
     return rows

@@ -21,7 +21,7 @@ ALL = "all gates"
 
 def gate_means(masks: Masks) -> dict[str, float]:
     """Mean of each gate's mask over pixels and images."""
-    return {block: float(found.mean()) for block, found in masks.items()}
+    return {block: float(gate_masks.mean()) for block, gate_masks in masks.items()}
 
 
 def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:

@@ -32,9 +32,9 @@ def localisation(
     0.5. Values are NaN where the map is constant, or no pixel or every pixel is a crater's.
     """
     rows = []
-    for name, found in maps.items():
-        for i, (one, inside) in enumerate(zip(found, craters, strict=True)):
-            values = localised(sign[name] * one.astype(np.float64), inside)
+    for name, images_map in maps.items():
+        for i, (image_map, inside) in enumerate(zip(images_map, craters, strict=True)):
+            values = localised(sign[name] * image_map.astype(np.float64), inside)
             frame = {"frame_id": frames["frame_id"].iloc[i], "scene_id": frames["scene_id"].iloc[i]}
             rows += [{"map": name, "measure": measure, **frame, "value": value} for measure, value in values.items()]
     table = pd.DataFrame(rows, columns=["map", "measure", "frame_id", "scene_id", "value"])

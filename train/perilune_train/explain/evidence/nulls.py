@@ -31,7 +31,7 @@ def detector_nulls(
     """
     maps = baseline_maps(images) | renamed("untrained", untrained)
     exchanged = renamed("other frame", of_other_rows(masks, targets.scene_ids, rng))
-    known, shuffled = (detector_values(one, targets, "null") for one in (maps, exchanged))
+    known, shuffled = (detector_values(null_maps, targets, "null") for null_maps in (maps, exchanged))
     return pd.concat([known, shuffled.loc[shuffled["measure"] != "pcc2"]], ignore_index=True)
 
 
@@ -61,15 +61,15 @@ def pair_nulls(
 
 def renamed(null: str, masks: Masks) -> Masks:
     """The same masks with the names "<null>/<gate>"."""
-    return {f"{null}/{gate}": found for gate, found in masks.items()}
+    return {f"{null}/{gate}": gate_masks for gate, gate_masks in masks.items()}
 
 
 def of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generator) -> Masks:
     """Masks (N, height, width) of other frames, in the order of `other_rows`; NaN if there is one frame."""
     if len(scene_ids) < 2:
-        return {gate: np.full_like(found, np.nan) for gate, found in masks.items()}
+        return {gate: np.full_like(gate_masks, np.nan) for gate, gate_masks in masks.items()}
     other = other_rows(scene_ids, rng)
-    return {gate: found[other] for gate, found in masks.items()}
+    return {gate: gate_masks[other] for gate, gate_masks in masks.items()}
 
 
 def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray:

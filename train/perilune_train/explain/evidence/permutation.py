@@ -42,8 +42,8 @@ def permuted(
     observed, means = np.nanmean(np.diagonal(values)), []
     for _ in range(n_draws):
         partner = everyone.copy()
-        for own, to in zip(members, rng.permutation(len(members)), strict=True):
-            partner[own] = members[to][np.arange(len(own)) * len(members[to]) // len(own)]
+        for rows, source in zip(members, rng.permutation(len(members)), strict=True):
+            partner[rows] = members[source][np.arange(len(rows)) * len(members[source]) // len(rows)]
         drawn = values[everyone, partner]
         if np.isfinite(drawn).any():
             means.append(np.nanmean(drawn))
@@ -61,9 +61,12 @@ def detector_permutations(masks: Masks, targets: FrameTargets, signs: Signs, rng
     craterness = standardised_rows(1 - targets.truth)
     residuals = residual_rows(craterness, basis)
     rows = []
-    for gate, found in masks.items():
-        own = standardised_rows(found)
-        matrices = {"pcc1_craterness": own @ craterness.T, "pcc1_partial": residual_rows(own, basis) @ residuals.T}
+    for gate, gate_masks in masks.items():
+        mask_rows = standardised_rows(gate_masks)
+        matrices = {
+            "pcc1_craterness": mask_rows @ craterness.T,
+            "pcc1_partial": residual_rows(mask_rows, basis) @ residuals.T,
+        }
         for measure, matrix in matrices.items():
             signed = signs["detect", measure, gate] * matrix
             rows.append(_row("detect", measure, gate, signed, targets.scene_ids, rng))
@@ -78,19 +81,21 @@ def pair_permutations(masks: Masks, targets: PairTargets, rng: np.random.Generat
     values therefore differ slightly from those of `pair_values`.
     """
     scale = np.diag([1 / _PAIR_STEP, 1 / _PAIR_STEP, 1.0])
-    small = [scale @ one @ np.linalg.inv(scale) for one in targets.homographies]
+    small = [scale @ homography @ np.linalg.inv(scale) for homography in targets.homographies]
     rows = []
-    for gate, found in masks.items():
-        upper, lower = np.split(found, 2, axis=1)
-        upper, lower = (one[:, _PAIR_STEP // 2 :: _PAIR_STEP, _PAIR_STEP // 2 :: _PAIR_STEP] for one in (upper, lower))
+    for gate, gate_masks in masks.items():
+        upper, lower = np.split(gate_masks, 2, axis=1)
+        upper, lower = (
+            half_masks[:, _PAIR_STEP // 2 :: _PAIR_STEP, _PAIR_STEP // 2 :: _PAIR_STEP] for half_masks in (upper, lower)
+        )
         matrices: dict[str, list[Array]] = {"pcc3": [], "pcc4": []}
         for mask, homography in zip(upper, small, strict=True):
             seen = np.broadcast_to(seen_in_second(mask.shape, homography), lower.shape)
             same = np.broadcast_to(mask, lower.shape)
             matrices["pcc3"].append(pearson_rows(same, lower, seen))
-            moved = np.stack([moved_to_first(one, homography) for one in lower])
+            moved = np.stack([moved_to_first(half_masks, homography) for half_masks in lower])
             matrices["pcc4"].append(pearson_rows(same, moved, seen))
-        both = {measure: np.stack(own) for measure, own in matrices.items()}
+        both = {measure: np.stack(rows_of_measure) for measure, rows_of_measure in matrices.items()}
         both["pcc4_minus_pcc3"] = both["pcc4"] - both["pcc3"]
         rows += [_row("navigate", measure, gate, matrix, targets.scene_ids, rng) for measure, matrix in both.items()]
     return pd.DataFrame(rows)
@@ -99,10 +104,10 @@ def pair_permutations(masks: Masks, targets: PairTargets, rng: np.random.Generat
 def _row(
     task: str, measure: str, gate: str, matrix: Array, scene_ids: Sequence[str], rng: np.random.Generator
 ) -> dict[str, object]:
-    own = np.diagonal(matrix)
-    value = float(np.nanmean(own)) if np.isfinite(own).any() else float("nan")
+    diagonal = np.diagonal(matrix)
+    value = float(np.nanmean(diagonal)) if np.isfinite(diagonal).any() else float("nan")
     null_value, p = permuted(matrix, scene_ids, rng)
-    scenes = len(set(np.asarray(scene_ids)[np.isfinite(own)].tolist()))
+    scenes = len(set(np.asarray(scene_ids)[np.isfinite(diagonal)].tolist()))
     names = {"task": task, "measure": measure, "map": gate, "null": NULL, "value": value, "null_value": null_value}
     interval = {"difference": value - null_value, "low": float("nan"), "high": float("nan")}
     tested = {"p_bootstrap": float("nan"), "p": p if scenes >= MIN_UNITS else float("nan")}

@@ -51,8 +51,8 @@ def random_like(
     decile[np.lexsort((rng.random(means.size), means))] = np.arange(means.size) * _BINS // means.size
     taken = block_means(chosen, block_px).ravel() > 0.5
     drawn = [
-        rng.choice(np.flatnonzero(decile == one), int((taken & (decile == one)).sum()), replace=False)
-        for one in range(_BINS)
+        rng.choice(np.flatnonzero(decile == number), int((taken & (decile == number)).sum()), replace=False)
+        for number in range(_BINS)
     ]
     return _pixels(np.concatenate(drawn), image.shape, block_px)
 
@@ -107,18 +107,21 @@ def removal_effect(
     """
     before = np.asarray(measure(images))
     tables = []
-    for name, found in maps.items():
+    for name, image_maps in maps.items():
         most, least = (
-            [chosen_pixels(one, share, which, sign[name], rng) for one in found] for which in ("most", "least")
+            [chosen_pixels(image_map, share, which, sign[name], rng) for image_map in image_maps]
+            for which in ("most", "least")
         )
         choices = {
             "most": most,
             "least": least,
             "random": [random_like(*pair, rng) for pair in zip(images, most, strict=True)],
-            "shifted": [shifted_like(one, rng) for one in most],
+            "shifted": [shifted_like(image_map, rng) for image_map in most],
         }
         for which, chosen in choices.items():
-            overlap = [(one & first).sum() / one.sum() for one, first in zip(chosen, most, strict=True)]
+            overlap = [
+                (image_map & first).sum() / image_map.sum() for image_map, first in zip(chosen, most, strict=True)
+            ]
             for how in _FILLINGS:
                 changed = np.stack([removed(*pair, how) for pair in zip(images, chosen, strict=True)])
                 values = {"overlap": overlap, "before": before, "after": measure(changed)}
@@ -157,7 +160,7 @@ def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:
 
     Blocks at the right and at the lower edge are smaller if a side is not a multiple of block_px.
     """
-    sums, sizes = (_block_sums(one, block_px) for one in (values, np.ones(values.shape)))
+    sums, sizes = (_block_sums(array, block_px) for array in (values, np.ones(values.shape)))
     return sums / sizes
 
 

@@ -77,7 +77,7 @@ def stability(
             frames = values.reshape(-1, values.shape[1] // stacked, values.shape[2])
             return shifted(frames, dx, dy).reshape(values.shape)
 
-        after = {name: moved(found, -dx, -dy) for name, found in masks_of(moved(images)).items()}
+        after = {name: moved(gate_masks, -dx, -dy) for name, gate_masks in masks_of(moved(images)).items()}
         # A pixel is in both images if its place was not filled in, there and back.
         inside = np.zeros((images.shape[1] // stacked, images.shape[2]), bool)
         height, width = inside.shape
@@ -90,12 +90,12 @@ def stability(
         def bent(values: NDArray, maps: tuple = maps) -> NDArray:
             frames = values.reshape(-1, *maps[0].shape)
             x, y = maps
-            changed = [cv2.remap(one, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in frames]
+            changed = [cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for frame in frames]
             return np.stack(changed).reshape(values.shape)
 
         inside = (maps[0] >= 0) & (maps[0] <= images.shape[2] - 1) & (maps[1] >= 0) & (maps[1] <= len(maps[0]) - 1)
         seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
-        expected = {name: bent(found) for name, found in before.items()}
+        expected = {name: bent(gate_masks) for name, gate_masks in before.items()}
         tables.append(_compared(expected, masks_of(bent(images)), f"lens {100 * distortion:+g} %", seen))
     return pd.concat(tables, ignore_index=True)
 
@@ -117,8 +117,8 @@ def _compared(
     seen: NDArray[np.bool_] | None,
 ) -> pd.DataFrame:
     tables = []
-    for name, found in masks_a.items():
-        values = pearson_rows(found, masks_b[name], seen)
-        columns = {"frame_index": np.arange(len(found)), "pearson": values}
+    for name, before in masks_a.items():
+        values = pearson_rows(before, masks_b[name], seen)
+        columns = {"frame_index": np.arange(len(before)), "pearson": values}
         tables.append(pd.DataFrame({"map": name, "change": change, **columns}))
     return pd.concat(tables, ignore_index=True)

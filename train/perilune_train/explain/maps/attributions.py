@@ -87,8 +87,8 @@ def integrated_gradients(
     method = IntegratedGradients(target)
 
     def one(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
-        found = method.attribute(grey, additional_forward_args=fixed, n_steps=n_steps, internal_batch_size=_BATCH)
-        return found if signed else found.abs()
+        gradients = method.attribute(grey, additional_forward_args=fixed, n_steps=n_steps, internal_batch_size=_BATCH)
+        return gradients if signed else gradients.abs()
 
     return _each(target, frames, one)
 
@@ -129,8 +129,8 @@ def _each(target: DetectorTarget, frames: NDArray[np.float32], method: _Method) 
     maps = np.empty(frames.shape, np.float32)
     for i, frame in enumerate(frames):
         grey = torch.from_numpy(frame)[None, None].to(device)
-        found = method(grey, target.fixed(grey))[0, 0].detach().float().cpu().numpy()
-        maps[i] = cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR)
+        attribution = method(grey, target.fixed(grey))[0, 0].detach().float().cpu().numpy()
+        maps[i] = cv2.resize(attribution, (width, height), interpolation=cv2.INTER_LINEAR)
     return maps
 
 

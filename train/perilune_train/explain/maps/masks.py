@@ -72,11 +72,11 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
     with torch.no_grad():
         for batch in inputs:
             for name, mask in backbone.attention_masks(batch).items():
-                own = mask[:, 0].float().cpu().numpy()
-                masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in own)
+                image_masks = mask[:, 0].float().cpu().numpy()
+                masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in image_masks)
     if not masks:
         raise UserError(where, "attention", "none", "a checkpoint of a network with attention gates")
-    return {name: np.stack(found) for name, found in masks.items()}
+    return {name: np.stack(gate_masks) for name, gate_masks in masks.items()}
 
 
 def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
@@ -85,14 +85,14 @@ def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
     0 to 255 stand for `low` to `high`, the range of the block's masks (N, height, width).
     """
     arrays: dict[str, np.ndarray] = {}
-    for block, found in masks.items():
-        low, high = float(found.min()), float(found.max())
-        width = min(LARGEST_PX, max(8, found.shape[2] // 2 ** int(block[2])))
-        size = width, max(1, round(found.shape[1] * width / found.shape[2]))
-        small = np.stack([cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in found])
+    for block, block_masks in masks.items():
+        low, high = float(block_masks.min()), float(block_masks.max())
+        width = min(LARGEST_PX, max(8, block_masks.shape[2] // 2 ** int(block[2])))
+        size = width, max(1, round(block_masks.shape[1] * width / block_masks.shape[2]))
+        small = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in block_masks])
         arrays[block] = np.rint(255 * (small - low) / max(high - low, 1e-9)).clip(0, 255).astype(np.uint8)
     ends = {
-        name: np.array([float(getattr(found, name)()) for found in masks.values()], np.float32)
+        name: np.array([float(getattr(block_masks, name)()) for block_masks in masks.values()], np.float32)
         for name in ("min", "max")
     }
     with written_aside(path) as aside, aside.open("wb") as file:

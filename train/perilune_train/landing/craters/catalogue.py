@@ -39,7 +39,9 @@ class Catalogue:
         """Some of the craters."""
         places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
         # Many times as fast as an index.
-        centre_m, normal, radius_m = (own.take(places, axis=0) for own in (self.centre_m, self.normal, self.radius_m))
+        centre_m, normal, radius_m = (
+            column.take(places, axis=0) for column in (self.centre_m, self.normal, self.radius_m)
+        )
         return replace(self, centre_m=centre_m, normal=normal, radius_m=radius_m)
 
     def ground_m(self, position_m: Array, count: int) -> float:
@@ -81,8 +83,8 @@ def with_errors(exact: Catalogue, errors: CatalogueErrors, rng: np.random.Genera
     n_false = round(len(kept) * errors.false_share / (1 - errors.false_share))
     model = kept.part(rng.integers(len(kept), size=n_false))
     low, high = exact.centre_m.min(axis=0), exact.centre_m.max(axis=0)
-    place = np.column_stack([rng.uniform(low[:2], high[:2], (n_false, 2)), model.centre_m[:, 2]])
-    centre = np.concatenate([kept.centre_m, place])
+    false_centre = np.column_stack([rng.uniform(low[:2], high[:2], (n_false, 2)), model.centre_m[:, 2]])
+    centre = np.concatenate([kept.centre_m, false_centre])
     radius = np.concatenate([kept.radius_m, model.radius_m])
     return Catalogue(
         centre + errors.position_sigma_m * rng.normal(size=centre.shape),

@@ -75,24 +75,28 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     for gate_px in _GATES_PX:
         seen = projected(catalogue, camera, pose, 3 * gate_px, least_px)
         placed_px = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
-        found = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
-        expected = Circles(seen.centre_px, np.log(seen.radius_px), placed_px)
-        own, other, error = matched(found, expected, size_sigma**2 + (gate_px / 60) ** 2, _GATE_SIGMAS)
-        if len(own) < _LEAST_MATCHES:
+        seen_circles = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
+        expected_circles = Circles(seen.centre_px, np.log(seen.radius_px), placed_px)
+        sighting, crater, error = matched(
+            seen_circles, expected_circles, size_sigma**2 + (gate_px / 60) ** 2, _GATE_SIGMAS
+        )
+        if len(sighting) < _LEAST_MATCHES:
             return None
-        centre_sigma = np.hypot(noise_px[own], placed_px[other])
-        weight, normal, gradient = _normal_equations(error, centre_sigma, size_sigma, gate_px, seen.jacobian(other))
+        centre_sigma = np.hypot(noise_px[sighting], placed_px[crater])
+        weight, normal, gradient = _normal_equations(error, centre_sigma, size_sigma, gate_px, seen.jacobian(crater))
         normal += precision
         gradient -= precision @ _offset(pose, prior.pose)
         pose = pose.changed(np.linalg.solve(normal, gradient))
-    if len(own) < _LEAST_SHARE * len(sightings):
+    if len(sighting) < _LEAST_SHARE * len(sightings):
         return None
     # Stated errors that are too small must not make the fix look better than it is.
     squares = np.sum(weight[:, None] * (error[:, :2] / centre_sigma[:, None]) ** 2)
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
-    return Fix(pose, covariance, own, places[seen.index[other]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2))))
+    return Fix(
+        pose, covariance, sighting, places[seen.index[crater]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2)))
+    )
 
 
 @compiled
@@ -108,9 +112,9 @@ def _normal_equations(
         squared = (error[k, 0] ** 2 + error[k, 1] ** 2) / (centre_sigma[k] ** 2 + gate_px**2) / 2
         weight[k] = max(1 - squared / _TUKEY**2, 0.0) ** 2
         for part in range(3):
-            own = weight[k] / (size_sigma if part == 2 else centre_sigma[k]) ** 2
+            precision = weight[k] / (size_sigma if part == 2 else centre_sigma[k]) ** 2
             for i in range(6):
-                along = own * jacobian[k, part, i]
+                along = precision * jacobian[k, part, i]
                 right[i] += along * error[k, part]
                 for j in range(i + 1):
                     normal[i, j] += along * jacobian[k, part, j]

@@ -47,9 +47,9 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     sigma = np.sqrt(np.diag(prior.covariance))
     on_ground_m = float(np.hypot(sigma[:2].max(), altitude_m * sigma[3:5].max()))
     if on_ground_m * camera.fx_px < _NEAR_PX * max(altitude_m, 1.0):
-        found = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose)
-        if found is not None:
-            return Located(found, searched=False)
+        fix = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose)
+        if fix is not None:
+            return Located(fix, searched=False)
     margin = max(_SIGMAS * float(sigma[2]) / max(altitude_m, 1.0), _LEAST_MARGIN)
     reach_m = max(_SIGMAS * on_ground_m, 20 * altitude_m / camera.fx_px)
     altitudes = altitude_m * max(1 - margin, 0.2), altitude_m * (1 + margin)
@@ -66,19 +66,23 @@ def lost_in_space(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
 ) -> Located | None:
     """The pose of a frame somewhere in an area, from a tilt known to about a degree; None if it is not certain."""
-    found = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
+    hypotheses = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
     least = max(_LEAST_AGREED, _LEAST_SHARE * min(len(sightings), N_TESTED))
-    if not found or found[0].n_agreed < least:
+    if not hypotheses or hypotheses[0].n_agreed < least:
         return None
-    if len(found) > 1 and found[0].n_agreed < _AHEAD * found[1].n_agreed and not _same(found[0].pose, found[1].pose):
+    if (
+        len(hypotheses) > 1
+        and hypotheses[0].n_agreed < _AHEAD * hypotheses[1].n_agreed
+        and not _same(hypotheses[0].pose, hypotheses[1].pose)
+    ):
         return None
-    fix = refine(sightings, catalogue, camera, _around(found[0].pose), found[0].pose)
+    fix = refine(sightings, catalogue, camera, _around(hypotheses[0].pose), hypotheses[0].pose)
     return Located(fix, searched=True) if fix is not None else None
 
 
-def _same(one: Pose, other: Pose) -> bool:
+def _same(first: Pose, second: Pose) -> bool:
     """Whether two hypotheses differ by the error of a hypothesis only."""
-    return float(np.linalg.norm(one.position_m - other.position_m)) < 0.1 * float(one.position_m[2])
+    return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 
 def _around(pose: Pose) -> PosePrior:

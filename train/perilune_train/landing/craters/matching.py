@@ -62,12 +62,12 @@ def _best(
         kept[i + 1] = count
     first, crater = kept, kept_crater
     partner = assigned(first, crater, cost, len(craters.size))
-    own = np.flatnonzero(partner >= 0)
-    other = partner[own]
-    error = np.empty((len(own), 3))
-    error[:, :2] = seen.centre_px[own] - craters.centre_px[other]
-    error[:, 2] = seen.size[own] - craters.size[other]
-    return own, other, error
+    sighting = np.flatnonzero(partner >= 0)
+    partner_of = partner[sighting]
+    error = np.empty((len(sighting), 3))
+    error[:, :2] = seen.centre_px[sighting] - craters.centre_px[partner_of]
+    error[:, 2] = seen.size[sighting] - craters.size[partner_of]
+    return sighting, partner_of, error
 
 
 @compiled

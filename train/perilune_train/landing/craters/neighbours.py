@@ -83,7 +83,7 @@ def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.
 def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
     """The `count` points nearest to a place, or all if there are fewer, the nearest first."""
     count = min(count, len(grid.place))
-    found, squared = np.empty(count, np.int64), np.full(count, np.inf)
+    nearest_points, squared = np.empty(count, np.int64), np.full(count, np.inf)
     column, row = _cell(x, grid.corner[0], grid.side[0], grid.n), _cell(y, grid.corner[1], grid.side[1], grid.n)
     for ring in range(grid.n):
         # Points farther out than the ring before are at least this far away.
@@ -102,7 +102,7 @@ def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
                     # Insert in the order of distances.
                     at = count - 1
                     while at > 0 and squared[at - 1] > apart:
-                        squared[at], found[at] = squared[at - 1], found[at - 1]
+                        squared[at], nearest_points[at] = squared[at - 1], nearest_points[at - 1]
                         at -= 1
-                    squared[at], found[at] = apart, j
-    return found
+                    squared[at], nearest_points[at] = apart, j
+    return nearest_points

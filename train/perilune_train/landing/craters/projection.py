@@ -68,14 +68,14 @@ def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) ->
     for k in range(len(point_m)):
         x, y, z = point_m[k]
         right, down = fx_px / z, fy_px / z
-        own = derivatives[k]
+        by_step = derivatives[k]
         for axis in range(3):
-            own[0, axis] = right * (rotation[2, axis] * x / z - rotation[0, axis])
-            own[1, axis] = down * (rotation[2, axis] * y / z - rotation[1, axis])
-            own[2, axis] = rotation[2, axis] / z
-        own[0, 3], own[0, 4], own[0, 5] = -right * x * y / z, right * (z + x * x / z), -right * y
-        own[1, 3], own[1, 4], own[1, 5] = -down * (z + y * y / z), down * x * y / z, down * x
-        own[2, 3], own[2, 4], own[2, 5] = -y / z, x / z, 0.0
+            by_step[0, axis] = right * (rotation[2, axis] * x / z - rotation[0, axis])
+            by_step[1, axis] = down * (rotation[2, axis] * y / z - rotation[1, axis])
+            by_step[2, axis] = rotation[2, axis] / z
+        by_step[0, 3], by_step[0, 4], by_step[0, 5] = -right * x * y / z, right * (z + x * x / z), -right * y
+        by_step[1, 3], by_step[1, 4], by_step[1, 5] = -down * (z + y * y / z), down * x * y / z, down * x
+        by_step[2, 3], by_step[2, 4], by_step[2, 5] = -y / z, x / z, 0.0
     return derivatives
 
 
@@ -138,16 +138,16 @@ def _visible(
         index[large] = k
         large += (depth > radius_m[k]) & (fx_px * radius_m[k] >= least_px * depth)
     count = 0
-    for place in range(large):
-        k = index[place]
+    for number in range(large):
+        k = index[number]
         across, down, depth = _turned(centre_m[k], position_m, rotation)
         column, row = fx_px * across / depth + cx_px, fy_px * down / depth + cy_px
         index[count] = k
         near = (column > -margin_px) & (column < width_px + margin_px)
         count += near & (row > -margin_px) & (row < height_px + margin_px)
     index, points = index[:count].copy(), np.empty((count, 3))
-    for place in range(count):
-        points[place] = _turned(centre_m[index[place]], position_m, rotation)
+    for number in range(count):
+        points[number] = _turned(centre_m[index[number]], position_m, rotation)
     return index, points
 
 
@@ -193,8 +193,8 @@ def _boxes(
             # Relative to the image of the circle's centre: otherwise small, distant circles lose precision.
             middle = points[k, axis] / depth
             along = focal_px[axis] * (normal[axis] - middle * normal[2])
-            own = focal_px[axis] ** 2 * (1 + middle**2) - along**2
+            quadratic = focal_px[axis] ** 2 * (1 + middle**2) - along**2
             mixed = -focal_px[axis] * middle - along * normal[2]
             centre[k, axis] = focal_px[axis] * middle + middle_px[axis] + squared * mixed / last
-            half[k, axis] = np.sqrt(squared * (squared * mixed**2 - own * last)) / -last
+            half[k, axis] = np.sqrt(squared * (squared * mixed**2 - quadratic * last)) / -last
     return centre, half

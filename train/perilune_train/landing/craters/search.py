@@ -205,13 +205,13 @@ def _agreed(placements: _Placements, offset: Array, size: Array, local: Catalogu
     tree = KDTree(np.column_stack([local.centre_m[:, :2], per_log * np.log(local.radius_m)]))
     count = np.zeros(len(scale), int)
     for start in range(0, len(scale), 2000):
-        own = slice(start, start + 2000)
-        ground = placements.part(own).on_ground(offset)
-        sizes = per_log * np.log(scale[own, None] * size[None])
+        batch = slice(start, start + 2000)
+        ground = placements.part(batch).on_ground(offset)
+        sizes = per_log * np.log(scale[batch, None] * size[None])
         points = np.concatenate([ground, sizes[..., None]], axis=2).reshape(-1, 3)
         limit = _TEST_PX * altitude / camera.fx_px
         distance, _ = tree.query(points, distance_upper_bound=limit)
-        count[own] = np.isfinite(distance).reshape(len(ground), -1).sum(axis=1)
+        count[batch] = np.isfinite(distance).reshape(len(ground), -1).sum(axis=1)
     return count
 
 

@@ -47,9 +47,9 @@ class Instruments:
 
 def together(flights: Sequence[Instruments]) -> Instruments:
     """Instruments of F flights, whose measurements have the times and the ranges of the first."""
-    inertial = [one.inertial for one in flights]
-    rate = np.stack([one.angular_rate_radps for one in inertial])
-    force = np.stack([one.specific_force_mps2 for one in inertial])
+    inertial = [flight.inertial for flight in flights]
+    rate = np.stack([measured.angular_rate_radps for measured in inertial])
+    force = np.stack([measured.specific_force_mps2 for measured in inertial])
     return replace(flights[0], inertial=replace(inertial[0], angular_rate_radps=rate, specific_force_mps2=force))
 
 
@@ -73,7 +73,9 @@ def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Ite
     `seen` has the sightings of the frames at increasing times (n,); an iterator is advanced by one at each frame.
     Inertial measurements that are not finite are missing ones; what was measured before the lander's state is ignored.
     """
-    for (estimate,) in fly_together([lander], instruments, frame_time_s, ((own,) for own in seen)):
+    for (estimate,) in fly_together(
+        [lander], instruments, frame_time_s, ((frame_sightings,) for frame_sightings in seen)
+    ):
         yield estimate
 
 
@@ -87,32 +89,32 @@ def fly_together(
     """
     times = np.concatenate([instruments.range_time_s, frame_time_s])
     is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])
-    place = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
+    number = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
     # At the same time, the range is first.
     order = np.lexsort([is_frame, times])
-    sightings, surroundings = iter(seen), [one.surroundings for one in landers]
-    measured, done = instruments.inertial.measured(), 0
+    sightings, surroundings = iter(seen), [lander.surroundings for lander in landers]
+    measured, n_done = instruments.inertial.measured(), 0
     stretch = _stretch(landers)
     for k in order[times[order] >= stretch.time_s - _SAME_S]:
         end = int(np.searchsorted(measured.time_s, times[k] + _SAME_S, side="right"))
-        stretch.inertial(measured.part(slice(done, end)))
-        done = end
+        stretch.inertial(measured.part(slice(n_done, end)))
+        n_done = end
         if times[k] > stretch.time_s + _SAME_S:
-            following = measured.part(slice(done, done + 1))
+            following = measured.part(slice(n_done, n_done + 1))
             stretch.inertial(following.until(times[k])) if len(following) else stretch.coast(times[k])
         if is_frame[k]:
-            estimates, own = [], next(sightings)
-            for lander, state, frame in zip(landers, stretch.states(), own, strict=True):
+            estimates, frame_sightings = [], next(sightings)
+            for lander, state, frame in zip(landers, stretch.states(), frame_sightings, strict=True):
                 lander.state = state
                 located = lander.sightings(frame)
-                estimates.append(Estimate(int(place[k]), lander.state, lander.status, located))
+                estimates.append(Estimate(int(number[k]), lander.state, lander.status, located))
             yield estimates
             stretch = _stretch(landers)
         else:
-            range_update(stretch, float(instruments.range_m[place[k]]), surroundings)
+            range_update(stretch, float(instruments.range_m[number[k]]), surroundings)
     for lander, state in zip(landers, stretch.states(), strict=True):
         lander.state = state
 
 
 def _stretch(landers: Sequence[Lander]) -> Stretch:
-    return Stretch([one.state for one in landers], landers[0].noise, landers[0].surroundings.relief_m)
+    return Stretch([lander.state for lander in landers], landers[0].noise, landers[0].surroundings.relief_m)

@@ -131,27 +131,27 @@ class Lander:
 
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the present time; the fix, if one was accepted."""
-        found = self._matched(seen)
+        located = self._matched(seen)
         if self._keep_poses:
             self.state = self.state.keeping_pose()
-        return found
+        return located
 
     def _matched(self, seen: Sightings) -> Located | None:
-        found = locate(seen, self._around.catalogue, self._around.camera, self._expected())
-        if found is None:
+        located = locate(seen, self._around.catalogue, self._around.camera, self._expected())
+        if located is None:
             self._unmatched()
             return None
-        fix, mounting = found.fix, self._around.rotation_camera_from_body
+        fix, mounting = located.fix, self._around.rotation_camera_from_body
         if not pose_fits(self.state, fix.pose, fix.covariance, mounting):
             if not self._replaces(fix):
                 self._unmatched()
                 return None
-            self._restart(found)
+            self._restart(located)
         else:
             around = self._around
             self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting)
         self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
-        return found
+        return located
 
     def _replaces(self, fix: Fix) -> bool:
         """Whether a fix that contradicts the state shall replace it: if the fix before has the same offset.
@@ -175,9 +175,9 @@ class Lander:
     def _unmatched(self) -> None:
         self.status = "lost" if self._late or self._contradiction is not None else "coasting"
 
-    def _restart(self, found: Located) -> None:
+    def _restart(self, located: Located) -> None:
         """Take position and attitude from a fix; the velocity becomes uncertain by what the position was wrong."""
-        fix, mounting = found.fix, self._around.rotation_camera_from_body
+        fix, mounting = located.fix, self._around.rotation_camera_from_body
         state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
         covariance = state.covariance.copy()
         for part in (POSITION, ATTITUDE):
@@ -185,9 +185,9 @@ class Lander:
         covariance[VELOCITY, VELOCITY] += np.eye(3) * _UNKNOWN_VELOCITY_MPS**2
         body = np.zeros((6, 6))
         body[:3, :3], body[3:, 3:] = np.eye(3), -mounting.T
-        own = body @ fix.covariance @ body.T
-        covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = own[:3, :3], own[3:, 3:]
-        covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = own[:3, 3:], own[3:, :3]
+        of_body = body @ fix.covariance @ body.T
+        covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = of_body[:3, :3], of_body[3:, 3:]
+        covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = of_body[:3, 3:], of_body[3:, :3]
         self.state = replace(
             state,
             position_m=fix.pose.position_m,
@@ -198,8 +198,8 @@ class Lander:
     def _expected(self) -> PosePrior:
         """The camera's expected pose, with its covariance as of a step of `Pose`."""
         mounting, state = self._around.rotation_camera_from_body, self.state
-        own = [*range(3), *range(6, 9)]
+        pose_parts = [*range(3), *range(6, 9)]
         to_camera = np.zeros((6, 6))
         to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -mounting
-        covariance = to_camera @ state.covariance[np.ix_(own, own)] @ to_camera.T
+        covariance = to_camera @ state.covariance[np.ix_(pose_parts, pose_parts)] @ to_camera.T
         return PosePrior(Pose(state.position_m, mounting @ state.rotation_site_from_body.T), covariance)

@@ -63,7 +63,7 @@ def craters_update(
     Bell & Cathey 1993, doi 10.1109/9.250476).
     """
     used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
-    own, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
+    sighting, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
     unmatched = np.setdiff1d(state.craters, crater)
     unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]
     known = np.concatenate([crater, unmatched])
@@ -83,8 +83,8 @@ def craters_update(
         + pattern @ state.common_px
     )
     by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
-    innovation = (sightings.centre_px[own[seen.index]] - predicted).ravel()
-    variance = sightings.noise_px[own[seen.index]] ** 2 / weight[seen.index]
+    innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
+    variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
     # Errors of heights in the catalogue shift craters in the image, away from its middle. As parts of the state they
     # gave the same errors and normalised errors, for a state that is half as large again.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
@@ -116,9 +116,9 @@ def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDA
     for k in range(len(first)):
         east = first[k]
         for axis in range(2):
-            own, by_east, by_north = crossed[2 * k + axis], by_offset[k, axis, 0], by_offset[k, axis, 1]
-            for column in range(len(own)):
-                own[column] += by_east * covariance[east, column] + by_north * covariance[east + 1, column]
+            row, by_east, by_north = crossed[2 * k + axis], by_offset[k, axis, 0], by_offset[k, axis, 1]
+            for column in range(len(row)):
+                row[column] += by_east * covariance[east, column] + by_north * covariance[east + 1, column]
 
 
 @compiled

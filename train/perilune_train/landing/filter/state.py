@@ -117,9 +117,9 @@ class State:
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
         """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
-        place = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
-        place[self.craters] = np.arange(len(self.craters))
-        before = place[craters]
+        row_of = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
+        row_of[self.craters] = np.arange(len(self.craters))
+        before = row_of[craters]
         known, new = before >= 0, np.flatnonzero(before < 0)
         rows = np.full((len(craters), 2), -1)
         rows[known] = N_ERRORS + 2 * before[known, None] + [0, 1]
@@ -136,8 +136,8 @@ class State:
         """Shift and turn (6,) from the kept pose of an earlier frame to a true one, and their covariance (6, 6)."""
         turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
         start = N_ERRORS + 2 * len(self.craters) + 6 * number
-        own = slice(start, start + 6)
-        return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[own, own]
+        parts = slice(start, start + 6)
+        return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[parts, parts]
 
     def pose_error(self, position_m: Array, rotation_site_from_body: Array) -> Array:
         """Shift and turn (6,) from the estimate to a true pose."""
@@ -148,14 +148,14 @@ class State:
 @compiled
 def _rearranged(covariance: Array, source: NDArray[np.int64]) -> Array:
     """The covariance (n, n) of n parts, from their places in another one; those with the place -1 are zero."""
-    found = np.zeros((len(source), len(source)))
+    rearranged = np.zeros((len(source), len(source)))
     for i in range(len(source)):
         if source[i] < 0:
             continue
         for j in range(len(source)):
             if source[j] >= 0:
-                found[i, j] = covariance[source[i], source[j]]
-    return found
+                rearranged[i, j] = covariance[source[i], source[j]]
+    return rearranged
 
 
 _CROSS = np.zeros((3, 9))
@@ -183,7 +183,7 @@ def common_pattern(ray: Array) -> Array:
     position, altitude and tilt displaces craters likewise, and no frame can tell one from the other.
     """
     x, y = ray.T
-    none, one = np.zeros_like(x), np.ones_like(x)
+    zero, ones = np.zeros_like(x), np.ones_like(x)
     return np.stack(
-        [np.stack([one, none, x, x**2, x * y], axis=1), np.stack([none, one, y, x * y, y**2], axis=1)], axis=1
+        [np.stack([ones, zero, x, x**2, x * y], axis=1), np.stack([zero, ones, y, x * y, y**2], axis=1)], axis=1
     )

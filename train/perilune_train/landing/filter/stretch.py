@@ -49,14 +49,14 @@ class Stretch:
         self._begin, self._noise, self._relief_m = list(states), noise, relief_m
         self.time_s = states[0].time_s
         self._moving = Moving(
-            np.stack([one.position_m for one in states]),
-            np.stack([one.velocity_mps for one in states]),
-            np.stack([one.rotation_site_from_body for one in states]),
-            np.stack([one.gyro_bias_radps for one in states]),
-            np.stack([one.force_bias_mps2 for one in states]),
+            np.stack([state.position_m for state in states]),
+            np.stack([state.velocity_mps for state in states]),
+            np.stack([state.rotation_site_from_body for state in states]),
+            np.stack([state.gyro_bias_radps for state in states]),
+            np.stack([state.force_bias_mps2 for state in states]),
         )
-        self._ground_m = np.array([one.ground_m for one in states])
-        self._covariance = np.stack([one.covariance[np.ix_(CORE, CORE)] for one in states])
+        self._ground_m = np.array([state.ground_m for state in states])
+        self._covariance = np.stack([state.covariance[np.ix_(CORE, CORE)] for state in states])
         self._change = np.tile(np.eye(len(CORE)), (len(states), 1, 1))
         self._told: list[tuple[Array, Array]] = []
 
@@ -76,23 +76,23 @@ class Stretch:
             return
         start_s = measured.time_s - measured.interval_s
         after_s = np.concatenate([[self.time_s], measured.time_s[:-1]])
-        done = 0
+        n_done = 0
         for gap in np.flatnonzero(start_s > after_s + _GAP_S):
-            self._propagate(measured.part(slice(done, gap)))
+            self._propagate(measured.part(slice(n_done, gap)))
             self.coast(float(start_s[gap]))
-            done = int(gap)
-        self._propagate(measured.part(slice(done, None)))
+            n_done = int(gap)
+        self._propagate(measured.part(slice(n_done, None)))
 
     def _propagate(self, measured: Increments) -> None:
         """Propagate by measurements that follow one another; each begins where the one before ends."""
         if not len(measured):
             return
         measured = replace(measured, interval_s=np.diff(measured.time_s, prepend=self.time_s))
-        done = integrated(self._moving, measured, self._noise)
-        self._moving = done.end
+        motion = integrated(self._moving, measured, self._noise)
+        self._moving = motion.end
         kept = np.exp(-(measured.time_s[-1] - self.time_s) / _GROUND_S)
         self._ground_m = kept * self._ground_m
-        self._moved(float(measured.time_s[-1]), done.change, done.added, kept)
+        self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
 
     def coast(self, until_s: float) -> None:
         """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""

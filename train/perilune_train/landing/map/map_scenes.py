@@ -55,10 +55,10 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
     """
     dataset = open_single(address)
     frames = dataset.table("frames").to_pandas().sort_values("frame_id")
-    for scene_id, own in frames.groupby("scene_id"):
-        if len(own) != 2:
+    for scene_id, scene_frames in frames.groupby("scene_id"):
+        if len(scene_frames) != 2:
             expected = "2, as `perilune-render survey` makes them"
-            raise UserError(dataset.store, f"{scene_id}: frames", len(own), expected)
+            raise UserError(dataset.store, f"{scene_id}: frames", len(scene_frames), expected)
     camera = dataset.info.camera.intrinsics()
     if any(camera.distortion):
         raise UserError(dataset.store, "camera.distortion", camera.distortion, "no distortion")
@@ -71,12 +71,14 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
         with progress_bar() as progress:
             n_tiles = len(frames) * count_tiles(camera.height_px, camera.width_px, TILING)
             bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
-            for scene_id, own in frames.groupby("scene_id"):
+            for scene_id, scene_frames in frames.groupby("scene_id"):
                 progress.update(bar, note=str(scene_id))
                 maps.append(
-                    _scene_map(dataset, str(scene_id), own, network, threshold, lambda n: progress.advance(bar, n))
+                    _scene_map(
+                        dataset, str(scene_id), scene_frames, network, threshold, lambda n: progress.advance(bar, n)
+                    )
                 )
-        errors = pd.concat([one.errors.assign(scene_id=one.scene_id) for one in maps], ignore_index=True)
+        errors = pd.concat([map_.errors.assign(scene_id=map_.scene_id) for map_ in maps], ignore_index=True)
         write_maps(folder, dataset, maps)
         errors.to_parquet(folder / ERRORS, index=False)
         save_image(folder / PICTURE, maps[0].picture)
@@ -101,9 +103,9 @@ def _scene_map(
         where = f"{dataset.store}/{row['png_path']}"
         png = pngs[row["frame_id"]]
         images.append(decode(png, where, camera.height_px, camera.width_px, row["png_bytes"]))
-        found = above(detect_image(network, images[-1], TILING, advance), threshold)
+        detections = above(detect_image(network, images[-1], TILING, advance), threshold)
         pose = Pose(np.array(row["position_m"]), matrix_from_quaternion(row["rotation_wxyz"]))
-        views.append(View(camera, pose, Sightings.of_boxes(found.boxes, found.scores)))
+        views.append(View(camera, pose, Sightings.of_boxes(detections.boxes, detections.scores)))
     both = matched(views[0], views[1])
     chosen = np.flatnonzero(2 * both.radius_m >= DIAMETERS_M[0])
     if not len(chosen):
@@ -141,10 +143,15 @@ def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
         "plus twice the difference of the logarithms of both radii, is below 0.8. Errors are those of true craters.",
         "",
     ]
-    for one in maps:
-        share = one.catalogue.radius_sigma_share
-        stated = f"position {number(one.catalogue.position_sigma_m)} m, diameter {100 * share:.0f} %"
-        lines += [f"## {for_markdown(one.scene_id)}: {len(one.catalogue)} craters", "", f"Stated errors: {stated}.", ""]
+    for scene_map in maps:
+        share = scene_map.catalogue.radius_sigma_share
+        stated = f"position {number(scene_map.catalogue.position_sigma_m)} m, diameter {100 * share:.0f} %"
+        lines += [
+            f"## {for_markdown(scene_map.scene_id)}: {len(scene_map.catalogue)} craters",
+            "",
+            f"Stated errors: {stated}.",
+            "",
+        ]
         head = ["diameter (m)", "mapped", "true", "found", "position RMSE per axis (m)", "height RMSE (m)"]
         rows = [
             [
@@ -154,7 +161,7 @@ def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
                 *(number(row[key]) for key in ("position_rmse_m", "height_rmse_m")),
                 f"{100 * row['diameter_bias_share']:+.1f} %, {100 * row['diameter_sigma_share']:.1f} %",
             ]
-            for row in one.errors.to_dict("records")
+            for row in scene_map.errors.to_dict("records")
         ]
         lines += [*table([*head, "diameter: mean error, standard deviation"], rows), ""]
     caption = "Middle of the first image: craters found in both images (cyan) and in this one alone (red)"

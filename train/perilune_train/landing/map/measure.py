@@ -29,19 +29,19 @@ def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFr
     rows, best = np.arange(len(mapped)), cost.argmin(axis=1)
     nearest, by_size, true = index[rows, best], by_size[rows, best], cost[rows, best] < _MOST_APART
     error_m = mapped.centre_m - exact.centre_m[nearest]
-    found = np.zeros(len(exact), bool)
-    found[nearest[true]] = True
+    is_found = np.zeros(len(exact), bool)
+    is_found[nearest[true]] = True
     covered = (np.abs(exact.centre_m[:, :2]) < covered_m).all(axis=1)
     table = []
     for low, high in itertools.pairwise(DIAMETERS_M):
-        own = (2 * mapped.radius_m >= low) & (2 * mapped.radius_m < high)
-        good, there = own & true, covered & (2 * exact.radius_m >= low) & (2 * exact.radius_m < high)
+        in_bin = (2 * mapped.radius_m >= low) & (2 * mapped.radius_m < high)
+        good, there = in_bin & true, covered & (2 * exact.radius_m >= low) & (2 * exact.radius_m < high)
         table.append(
             {
                 "diameter_m": f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or more",
-                "mapped": int(own.sum()),
-                "true_share": _mean(true[own]),
-                "found_share": _mean(found[there]),
+                "mapped": int(in_bin.sum()),
+                "true_share": _mean(true[in_bin]),
+                "found_share": _mean(is_found[there]),
                 "position_rmse_m": _rms(error_m[good][:, :2]),
                 "height_rmse_m": _rms(error_m[good][:, 2]),
                 "diameter_bias_share": _mean(by_size[good]),

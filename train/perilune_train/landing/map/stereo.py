@@ -101,12 +101,14 @@ def matched(first: View, second: View) -> Matched:
     median height of its neighbours.
     """
     ground, pairs = Ground(), np.zeros((0, 2), np.intp)
-    for place, least_px in enumerate(_CLASSES_PX):
-        most_px = _CLASSES_PX[place - 1] if place else np.inf
+    for number, least_px in enumerate(_CLASSES_PX):
+        most_px = _CLASSES_PX[number - 1] if number else np.inf
         # A crater near the limit of a class may be beyond it in the other view.
         parts = [
-            np.flatnonzero((one.sightings.radius_px >= share * least_px) & (one.sightings.radius_px < most_px / share))
-            for one, share in ((first, 1.0), (second, 0.75))
+            np.flatnonzero(
+                (view.sightings.radius_px >= share * least_px) & (view.sightings.radius_px < most_px / share)
+            )
+            for view, share in ((first, 1.0), (second, 0.75))
         ]
         parts[0] = parts[0][first.sightings.radius_px[parts[0]] < most_px]
         parts[1] = np.setdiff1d(parts[1], pairs[:, 1])
@@ -114,8 +116,14 @@ def matched(first: View, second: View) -> Matched:
         pairs = np.concatenate([pairs, new])
         ground = _ground(first, second, pairs)
     heights = ground.at(ground.place_m)
-    places = [one.place_m(_spread(heights, own, one))[own] for one, own in zip((first, second), pairs.T, strict=True)]
-    radii = [one.radius_m(_spread(heights, own, one))[own] for one, own in zip((first, second), pairs.T, strict=True)]
+    places = [
+        view.place_m(_spread(heights, chosen, view))[chosen]
+        for view, chosen in zip((first, second), pairs.T, strict=True)
+    ]
+    radii = [
+        view.radius_m(_spread(heights, chosen, view))[chosen]
+        for view, chosen in zip((first, second), pairs.T, strict=True)
+    ]
     score = np.minimum(first.sightings.score[pairs[:, 0]], second.sightings.score[pairs[:, 1]])
     middle = (places[0] + places[1]) / 2
     return Matched(
@@ -128,10 +136,10 @@ def matched(first: View, second: View) -> Matched:
     )
 
 
-def _spread(values: Array, own: NDArray[np.intp], view: View) -> Array:
+def _spread(values: Array, chosen: NDArray[np.intp], view: View) -> Array:
     """Values of some sightings as an array for all of them; 0 elsewhere."""
     every = np.zeros(len(view.sightings))
-    every[own] = values
+    every[chosen] = values
     return every
 
 
@@ -144,12 +152,12 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
     across = np.array([-along[1], along[0]])
     steepness = float(np.linalg.norm(baseline[:2]) / first.pose.position_m[2])
     points = []
-    for one, part in zip((first, second), parts, strict=True):
-        height = np.zeros(len(one.sightings))
+    for view, part in zip((first, second), parts, strict=True):
+        height = np.zeros(len(view.sightings))
         for _ in range(3):
-            height = ground.at(one.place_m(height))
-        place, radius = one.place_m(height)[part], one.radius_m(height)[part]
-        noise_m = radius / one.sightings.radius_px[part] * one.sightings.noise_px[part]
+            height = ground.at(view.place_m(height))
+        place, radius = view.place_m(height)[part], view.radius_m(height)[part]
+        noise_m = radius / view.sightings.radius_px[part] * view.sightings.noise_px[part]
         points.append((place, radius, noise_m))
     typical = float(np.median(np.concatenate([noise for _, _, noise in points]))) * 2**0.5
     scale = np.array([np.hypot(steepness * ground.sigma_m, typical), typical, _SIZE_SIGMA]) * _GATE
@@ -165,8 +173,8 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
 
 def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
     """The ground of matched craters: heights at which their rays pass nearest to each other."""
-    start = [one.pose.position_m for one in (first, second)]
-    rays = [one.rays[own] for one, own in zip((first, second), pairs.T, strict=True)]
+    start = [view.pose.position_m for view in (first, second)]
+    rays = [view.rays[chosen] for view, chosen in zip((first, second), pairs.T, strict=True)]
     # Along both rays z falls alike, so their distance at a height is linear in it.
     apart = start[1][:2] + rays[1][:, :2] * start[1][2] - start[0][:2] - rays[0][:, :2] * start[0][2]
     by_height = rays[0][:, :2] - rays[1][:, :2]

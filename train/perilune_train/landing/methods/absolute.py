@@ -39,8 +39,8 @@ def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, C
     """The catalogues of some scenes. Raises UserError if the map lacks one of them."""
     exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in scene_ids}
     rough = {
-        scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(place))
-        for place, scene in enumerate(scene_ids)
+        scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(number))
+        for number, scene in enumerate(scene_ids)
     }
     missing = sorted(set(scene_ids) - set(mapped))
     if mapped and missing:

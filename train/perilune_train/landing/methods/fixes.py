@@ -31,8 +31,8 @@ def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Cat
         for true, sightings in zip(descent.true, descent.sightings, strict=True):
             prior = PosePrior(true.changed(sigma * rng.normal(size=6)), np.diag(sigma**2))
             begun = time.process_time()
-            found = locate(sightings, catalogues[descent.ids[0]], descent.camera, prior)
-            rows.append(_row(descent, true, found, time.process_time() - begun))
+            located = locate(sightings, catalogues[descent.ids[0]], descent.camera, prior)
+            rows.append(_row(descent, true, located, time.process_time() - begun))
     return pd.DataFrame(rows)
 
 
@@ -57,8 +57,8 @@ def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Ca
             )
             assumed = Pose(np.array([*area.centre_m, altitude_m]), descent.level_rotation_camera_from_site @ turned)
             begun = time.process_time()
-            found = lost_in_space(sightings, catalogue, descent.camera, PosePrior(assumed, np.eye(6)), area)
-            rows.append(_row(descent, true, found, time.process_time() - begun))
+            located = lost_in_space(sightings, catalogue, descent.camera, PosePrior(assumed, np.eye(6)), area)
+            rows.append(_row(descent, true, located, time.process_time() - begun))
     return pd.DataFrame(rows)
 
 
@@ -71,18 +71,25 @@ def _followed(name: str, descents: list[SeenDescent]) -> Iterator[SeenDescent]:
             progress.advance(task)
 
 
-def _row(descent: SeenDescent, true: Pose, found: Located | None, seconds: float) -> dict[str, object]:
-    own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1], "altitude_m": true.position_m[2]}
-    if found is None:
-        return {**own, "error_m": np.nan, "error_px": np.nan, "turn_deg": np.nan, "squared": np.nan, "seconds": seconds}
-    error = step_to(found.fix.pose, true)
+def _row(descent: SeenDescent, true: Pose, located: Located | None, seconds: float) -> dict[str, object]:
+    frame = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1], "altitude_m": true.position_m[2]}
+    if located is None:
+        return {
+            **frame,
+            "error_m": np.nan,
+            "error_px": np.nan,
+            "turn_deg": np.nan,
+            "squared": np.nan,
+            "seconds": seconds,
+        }
+    error = step_to(located.fix.pose, true)
     length_m = float(np.linalg.norm(error[:3]))
     return {
-        **own,
+        **frame,
         "error_m": length_m,
         "error_px": length_m * descent.camera.fx_px / true.position_m[2],
         "turn_deg": float(np.degrees(np.linalg.norm(error[3:]))),
-        "squared": float(error @ np.linalg.solve(found.fix.covariance, error)),
+        "squared": float(error @ np.linalg.solve(located.fix.covariance, error)),
         "seconds": seconds,
     }
 

@@ -43,9 +43,9 @@ def flights(
         task = progress.add_task(
             f"{'smoother' if smooth else 'filter'}, {attitude_deg:g} deg", total=len(descents), unit="descents", note=""
         )
-        for place, descent in enumerate(descents):
+        for number, descent in enumerate(descents):
             instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
-            start = Start(grade, sigmas, sigmas[:9] * np.random.default_rng(place).normal(size=9))
+            start = Start(grade, sigmas, sigmas[:9] * np.random.default_rng(number).normal(size=9))
             catalogue = catalogues[descent.ids[0]]
             begun = time.process_time()
             flown = flight(descent, instruments, rotation_camera_from_body, catalogue, start, smooth)
@@ -118,8 +118,8 @@ def lander_of(
 
 def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFrame:
     """The table of a flight from the rows of its frames."""
-    own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
-    return pd.DataFrame(rows).assign(**own, time_s=descent.time_s)
+    ids = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
+    return pd.DataFrame(rows).assign(**ids, time_s=descent.time_s)
 
 
 def row_of(descent: SeenDescent, estimate: Estimate, rotation_camera_from_body: Array) -> dict[str, object]:

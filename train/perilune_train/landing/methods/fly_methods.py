@@ -61,17 +61,19 @@ def fly_methods(
     mapped = {} if maps is None else read_maps(maps, dataset)
     with new_folder(out) as folder:
         trajectories = load_split(dataset, split)
-        catalogues = catalogues_of(dataset, sorted({one.ids[0] for one in trajectories}), mapped)
+        catalogues = catalogues_of(dataset, sorted({trajectory.ids[0] for trajectory in trajectories}), mapped)
         descents, detection_s = seen_descents(dataset, trajectories, detector)
         network, architecture = load_navigator(best["navigator"], fusion)
-        learned: dict[str, list[Motion]] = {fusion: [predict(network, architecture, one) for one in trajectories]}
+        learned: dict[str, list[Motion]] = {
+            fusion: [predict(network, architecture, trajectory) for trajectory in trajectories]
+        }
         stated = stated_covariances(navigator, network, architecture, trajectories)
         relative = _relative(trajectories, learned, {} if stated is None else {fusion: stated})
         errors = absolute_errors(dataset, descents, catalogues)
-        absolute = pd.DataFrame([{"method": name, **absolute_summary(name, own)} for name, own in errors.items()])
+        absolute = pd.DataFrame([{"method": name, **absolute_summary(name, table)} for name, table in errors.items()])
         rows = pd.concat([relative, absolute.assign(kind="absolute")], ignore_index=True)
         rows.to_parquet(folder / TABLE, index=False)
-        frames = pd.concat([own.assign(method=name) for name, own in errors.items()], ignore_index=True)
+        frames = pd.concat([table.assign(method=name) for name, table in errors.items()], ignore_index=True)
         frames.to_parquet(folder / FRAMES, index=False)
         draw_by_altitude(folder / PICTURES[0], {name: errors[name] for name in errors if not name.startswith("lost")})
         if "filter" in errors:
@@ -98,7 +100,7 @@ def _relative(
             {
                 "method": method,
                 "kind": "relative",
-                "n_frames": float(sum(one.n_pairs for one in trajectories)),
+                "n_frames": float(sum(trajectory.n_pairs for trajectory in trajectories)),
                 "position_rmse_m": figures["position_rmse_vector_m"],
                 "attitude_rmse_deg": figures["orientation_rmse_angle_deg"],
                 "stated_rmse_m": figures.get("stated_position_rmse_vector_m", np.nan),

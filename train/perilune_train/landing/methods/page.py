@@ -66,7 +66,7 @@ def page_of(
     pictures: Sequence[str],
 ) -> str:
     """The page as Markdown."""
-    scenes = {one.ids[0] for one in descents}
+    scenes = {descent.ids[0] for descent in descents}
     lines = [
         "# Navigation methods",
         "",

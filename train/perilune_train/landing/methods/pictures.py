@@ -55,9 +55,9 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
     groups = list(flown.groupby(["scene_id", "trajectory_id"]))[:_MOST_DESCENTS]
     figure = Figure(figsize=(14, 2.2 * len(groups) + 0.6), layout="constrained")
     axes = figure.subplots(len(groups), 3, squeeze=False, sharex=True)
-    for row, (ids, own) in zip(axes, groups, strict=True):
+    for row, (ids, flight) in zip(axes, groups, strict=True):
         for axis, place in zip("xyz", row, strict=True):
-            draw_band(place, own, axis)
+            draw_band(place, flight, axis)
             _label(place, f"{'/'.join(map(str, ids))}: {axis}", "", "m")
     for place in axes[-1]:
         place.set_xlabel("time (s)")
@@ -78,8 +78,8 @@ def draw_matches(
     )
     sightings, angle = descent.sightings[frame], np.linspace(0, 2 * np.pi, 60)
     matched = set(located.fix.sighting.tolist())
-    for place, (centre, radius) in enumerate(zip(sightings.centre_px, sightings.radius_px, strict=True)):
-        colour = "cyan" if place in matched else "red"
+    for number, (centre, radius) in enumerate(zip(sightings.centre_px, sightings.radius_px, strict=True)):
+        colour = "cyan" if number in matched else "red"
         axis.plot(centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), color=colour, linewidth=1)
     seen = projected(catalogue, descent.camera, located.fix.pose, least_radius_px=float(sightings.radius_px.min()))
     axis.plot(*seen.centre_px.T, "+", color="yellow", markersize=5)

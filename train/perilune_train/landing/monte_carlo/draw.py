@@ -47,11 +47,15 @@ def drawn(
         duration_s = descent.time_s[-1]
         start_s = rng.uniform(0.0, max(duration_s - OUTAGE_S, 0.0))
         blind = (descent.time_s >= start_s) & (descent.time_s < start_s + OUTAGE_S)
-        seen = [_none() if dark else own for own, dark in zip(descent.sightings, blind, strict=True)]
+        seen = [
+            _none() if dark else frame_sightings for frame_sightings, dark in zip(descent.sightings, blind, strict=True)
+        ]
         descent = replace(descent, sightings=seen)
     elif scenario == "false-detections":
         size_px = np.array([descent.camera.width_px, descent.camera.height_px])
-        descent = replace(descent, sightings=[_with_false(own, size_px, rng) for own in descent.sightings])
+        descent = replace(
+            descent, sightings=[_with_false(frame_sightings, size_px, rng) for frame_sightings in descent.sightings]
+        )
     return Draw(descent, instruments, start_error)
 
 

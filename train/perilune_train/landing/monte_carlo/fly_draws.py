@@ -115,70 +115,79 @@ def fly_draws(
 def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> list[Site]:
     """The descents of a split, after the detector of a run has seen their frames."""
     trajectories = load_split(dataset, split)
-    references = {one.ids: _reference(dataset, one.ids, address) for one in trajectories}
+    references = {trajectory.ids: _reference(dataset, trajectory.ids, address) for trajectory in trajectories}
     descents, _ = seen_descents(dataset, trajectories, detector)
-    exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {one.ids[0] for one in descents}}
-    return [Site(one, references[one.ids], exact[one.ids[0]]) for one in descents]
+    exact = {
+        scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {descent.ids[0] for descent in descents}
+    }
+    return [Site(descent, references[descent.ids], exact[descent.ids[0]]) for descent in descents]
 
 
 def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Instruments:
     """Measurements that are taken as the true motion."""
-    found = Instruments.of_trajectory(dataset, ids, REFERENCE)
-    if not len(found.inertial):
+    instruments = Instruments.of_trajectory(dataset, ids, REFERENCE)
+    if not len(instruments.inertial):
         expected = f"measurements of the grade {REFERENCE} (see the setting dataset.nav.instruments.inertial_grades)"
         raise UserError(str(address), f"inertial of {'/'.join(ids)}", "nothing", expected)
-    return found
+    return instruments
 
 
-def flown_draws(job: Job, place: int, draws: Sequence[int]) -> list[pd.DataFrame]:
+def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFrame]:
     """Draws of one descent, flown together.
 
     Each depends on the seed, the place of the descent and the number of the draw, and on the others by rounding alone.
     """
-    site, sigmas = job.sites[place], job.sigmas
-    landers, drawn_ones = [], []
+    site, sigmas = job.sites[number], job.sigmas
+    landers, drawn_descents = [], []
     for draw in draws:
-        rng = np.random.default_rng([job.seed, place, draw])
+        rng = np.random.default_rng([job.seed, number, draw])
         catalogue = with_errors(site.catalogue, CatalogueErrors(), rng)
-        one = drawn(site.descent, site.reference, GRADE, sigmas, job.scenario, rng)
+        draw_of_descent = drawn(site.descent, site.reference, GRADE, sigmas, job.scenario, rng)
         landers.append(
-            lander_of(one.descent, job.rotation_camera_from_body, catalogue, Start(GRADE, sigmas, one.start_error))
+            lander_of(
+                draw_of_descent.descent,
+                job.rotation_camera_from_body,
+                catalogue,
+                Start(GRADE, sigmas, draw_of_descent.start_error),
+            )
         )
-        drawn_ones.append(one)
-    instruments = together([one.instruments for one in drawn_ones])
-    seen = zip(*(one.descent.sightings for one in drawn_ones), strict=True)
+        drawn_descents.append(draw_of_descent)
+    instruments = together([draw_of_descent.instruments for draw_of_descent in drawn_descents])
+    seen = zip(*(draw_of_descent.descent.sightings for draw_of_descent in drawn_descents), strict=True)
     rows: list[list[dict[str, object]]] = [[] for _ in draws]
     for estimates in fly_together(landers, instruments, site.descent.time_s, seen):
-        for own, estimate in zip(rows, estimates, strict=True):
-            own.append(row_of(site.descent, estimate, job.rotation_camera_from_body))
-    return [table_of(site.descent, own).assign(draw=draw) for own, draw in zip(rows, draws, strict=True)]
+        for rows_of_draw, estimate in zip(rows, estimates, strict=True):
+            rows_of_draw.append(row_of(site.descent, estimate, job.rotation_camera_from_body))
+    return [
+        table_of(site.descent, rows_of_draw).assign(draw=draw) for rows_of_draw, draw in zip(rows, draws, strict=True)
+    ]
 
 
 def all_draws(job: Job, draws: int, workers: int) -> list[pd.DataFrame]:
     """Tables of all flights, in any order; in this process if there is one worker."""
-    asked = [
-        (place, range(first, min(first + _TOGETHER, draws)))
+    batches = [
+        (number, range(first, min(first + _TOGETHER, draws)))
         for first in range(0, draws, _TOGETHER)
-        for place in range(len(job.sites))
+        for number in range(len(job.sites))
     ]
     tables = []
     with progress_bar() as progress:
         task = progress.add_task("filter", total=draws * len(job.sites), unit="flights", note=job.scenario)
-        for flown in _flown(job, asked, min(workers, len(asked))):
+        for flown in _flown(job, batches, min(workers, len(batches))):
             tables += flown
             progress.advance(task, len(flown))
     return tables
 
 
-def _flown(job: Job, asked: list[tuple[int, range]], workers: int) -> Iterator[list[pd.DataFrame]]:
+def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator[list[pd.DataFrame]]:
     """Tables in any order."""
     if workers == 1:
-        yield from (flown_draws(job, *one) for one in asked)
+        yield from (flown_draws(job, *batch) for batch in batches)
         return
     # spawn: torch's threads do not survive a fork.
     with _one_thread(), ProcessPoolExecutor(workers, get_context("spawn"), _begin, (job,)) as pool:
-        remaining = iter(asked)
-        running = {pool.submit(_of_job, *one) for one in islice(remaining, 2 * workers)}
+        remaining = iter(batches)
+        running = {pool.submit(_of_job, *batch) for batch in islice(remaining, 2 * workers)}
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
@@ -210,5 +219,5 @@ def _begin(job: Job) -> None:
     _JOB.append(job)
 
 
-def _of_job(place: int, draws: range) -> list[pd.DataFrame]:
-    return flown_draws(_JOB[0], place, draws)
+def _of_job(number: int, draws: range) -> list[pd.DataFrame]:
+    return flown_draws(_JOB[0], number, draws)

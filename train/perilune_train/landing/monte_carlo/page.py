@@ -54,21 +54,23 @@ def run_summary(rows: pd.DataFrame) -> dict[str, float]:
 def by_trajectory(rows: pd.DataFrame) -> dict[tuple[str, str], dict[str, float]]:
     """Figures of each descent over its draws."""
     groups = rows.groupby(["scene_id", "trajectory_id"])
-    return {(str(scene), str(trajectory)): run_summary(own) for (scene, trajectory), own in groups}
+    return {
+        (str(scene), str(trajectory)): run_summary(trajectory_rows) for (scene, trajectory), trajectory_rows in groups
+    }
 
 
 def page_of(dataset: str, split: str, draws: Draws, rows: pd.DataFrame, seconds: float, pictures: Sequence[str]) -> str:
     """The page as Markdown."""
-    overall, own = run_summary(rows), by_trajectory(rows)
+    overall, by_descent = run_summary(rows), by_trajectory(rows)
     n_flights = len(rows.groupby(["scene_id", "trajectory_id", "draw"]))
     cells = [["all", *_cells(overall)]]
-    cells += [[for_markdown("/".join(map(str, ids))), *_cells(figures)] for ids, figures in own.items()]
+    cells += [[for_markdown("/".join(map(str, ids))), *_cells(figures)] for ids, figures in by_descent.items()]
     lines = [
         "# Monte Carlo of the navigation filter",
         "",
         f"Dataset {code_span(dataset)}, split {for_markdown(split)}, "
         f"scenario `{draws.scenario}`: {SCENARIOS[draws.scenario]}.",
-        f"Descents: {len(own)}, with {draws.count} draws of each, {n_flights} flights, {len(rows)} frames, seed "
+        f"Descents: {len(by_descent)}, with {draws.count} draws of each, {n_flights} flights, {len(rows)} frames, seed "
         f"{draws.seed}; {seconds / 60:.1f} minutes.",
         "",
         f"Drawn: errors of the start (60 m, 1 m/s and {draws.attitude_deg:g} degrees on each axis), of the tactical "
@@ -101,9 +103,9 @@ def draw_bands(path: Path, rows: pd.DataFrame) -> None:
     """Draw quantiles of the error of position over the draws of each descent, and the stated error."""
     groups = list(rows.groupby(["scene_id", "trajectory_id"]))
     figure, axes = _panels(len(groups))
-    for axis, (ids, own) in zip(axes, groups, strict=True):
-        stated = 3 * np.sqrt(sum(own[f"sigma_{name}_m"] ** 2 for name in "xyz"))
-        by_time = own.assign(stated=stated).groupby("time_s")
+    for axis, (ids, descent) in zip(axes, groups, strict=True):
+        stated = 3 * np.sqrt(sum(descent[f"sigma_{name}_m"] ** 2 for name in "xyz"))
+        by_time = descent.assign(stated=stated).groupby("time_s")
         for shade, quantile in zip((0.9, 0.5, 0.25), _QUANTILES, strict=True):
             axis.plot(
                 by_time["error_m"].quantile(quantile), color="tab:blue", alpha=shade, label=f"{100 * quantile:g} %"
@@ -119,8 +121,8 @@ def draw_consistency(path: Path, rows: pd.DataFrame) -> None:
     """Draw the mean normalised error squared over the draws of each descent with its 95 % band."""
     figure = Figure(figsize=(10, 5), layout="constrained")
     axis = figure.subplots()
-    for ids, own in rows.groupby(["scene_id", "trajectory_id"]):
-        axis.plot(own.groupby("time_s")["squared"].mean(), label="/".join(map(str, ids)))
+    for ids, descent in rows.groupby(["scene_id", "trajectory_id"]):
+        axis.plot(descent.groupby("time_s")["squared"].mean(), label="/".join(map(str, ids)))
     draws = rows["draw"].nunique()
     axis.axhspan(
         *(chi2.ppf([0.025, 0.975], 6 * draws) / draws), color="black", alpha=0.15, label="95 % band of the mean"

@@ -91,8 +91,8 @@ def align(first: list[Level], second: list[Level], prior: Prior, start: State) -
     precision[range(_N_POSE), range(_N_POSE)] = 1 / np.square(sigmas)
     precision[_N_POSE:, _N_POSE:] = np.linalg.inv(prior.heights.covariance_m2)
     state = start
-    for one, other in zip(first, second, strict=True):
-        residuals = _Residuals(one, other, prior)
+    for coarse_first, coarse_second in zip(first, second, strict=True):
+        residuals = _Residuals(coarse_first, coarse_second, prior)
         for _ in range(_ITERATIONS):
             normal, gradient = residuals.normal_equations(state)
             normal, gradient = normal + precision, gradient + precision @ state.offset(prior)
@@ -141,13 +141,13 @@ class _Residuals:
 
     def _jacobian(self, points: Array, moved: Array, along: Array, by_moved: Array, by_first: Array) -> Array:
         """Derivatives (n, n_unknown) of the differences, from those by the points of frame 2 and of frame 1 (n, 3)."""
-        found: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
+        jacobian: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
         # By a turn w from the left a point X moves by w x X, and the value by w . (X x derivative).
-        found[:, :3], found[:, 3:6] = np.cross(moved, by_moved), by_moved
+        jacobian[:, :3], jacobian[:, 3:6] = np.cross(moved, by_moved), by_moved
         tilted = self._rays @ _across(self._prior.plane.down_c).T.astype(np.float32)
-        found[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
-        found[:, _N_POSE:] = self._nodes * (-np.einsum("ni,ni->n", by_first, self._rays) / along)[:, None]
-        return found
+        jacobian[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
+        jacobian[:, _N_POSE:] = self._nodes * (-np.einsum("ni,ni->n", by_first, self._rays) / along)[:, None]
+        return jacobian
 
 
 def _by_point(by_u: Array, by_v: Array, points: Array, camera: Camera) -> Array:
@@ -159,9 +159,9 @@ def _by_point(by_u: Array, by_v: Array, points: Array, camera: Camera) -> Array:
 
 def _across(down_c: Array) -> Array:
     """Two unit vectors (2, 3) at right angles to a direction and to each other."""
-    one = np.cross(down_c, np.eye(3)[np.argmin(np.abs(down_c))])
-    one /= np.linalg.norm(one)
-    return np.stack([one, np.cross(down_c, one)])
+    first = np.cross(down_c, np.eye(3)[np.argmin(np.abs(down_c))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(down_c, first)])
 
 
 def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
@@ -189,11 +189,11 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
         tracked = klt_motion(camera, grey[i], grey[i + 1], expected, plane)
         prior = Prior(expected, plane, heights)
         start = State(tracked.translation_m, tracked.rotation_c2_from_c1, np.zeros(2), heights.mean_m)
-        found, covariance = align(first, second, prior, start)
-        motion = found.translation_m, found.rotation_c2_from_c1
-        down_1 = found.down_c(prior)
+        state, covariance = align(first, second, prior, start)
+        motion = state.translation_m, state.rotation_c2_from_c1
+        down_1 = state.down_c(prior)
         lower_m = altitude_m - float(down_1 @ motion[0])
-        seen = Heights(found.height_m, covariance[-N_NODES:, -N_NODES:])
+        seen = Heights(state.height_m, covariance[-N_NODES:, -N_NODES:])
         heights = carried(seen, camera, (down_1, motion[1] @ down_1), (altitude_m, lower_m), motion)
         altitude_m, first = lower_m, second
         motions.append(motion)

@@ -36,8 +36,8 @@ def node_pixels(camera: Camera) -> Array:
 
 def node_weights(camera: Camera, pixels: Array) -> Array:
     """Bilinear weights (n, N_NODES) of the nodes at image coordinates (n, 2)."""
-    place = pixels / np.array([camera.width_px, camera.height_px]) * (N_SIDE - 1)
-    across, down = (np.clip(1 - np.abs(place[:, k, None] - np.arange(N_SIDE)), 0, None) for k in (0, 1))
+    node = pixels / np.array([camera.width_px, camera.height_px]) * (N_SIDE - 1)
+    across, down = (np.clip(1 - np.abs(node[:, k, None] - np.arange(N_SIDE)), 0, None) for k in (0, 1))
     return (down[:, :, None] * across[:, None, :]).reshape(len(pixels), N_NODES).astype(np.float32)
 
 
@@ -68,12 +68,12 @@ def carried(
     nodes = node_pixels(camera)
     first = ground_points(camera, nodes, downs_c[0], altitudes_m[0])
     second = ground_points(camera, nodes, downs_c[1], altitudes_m[1]) @ rotation + translation
-    among, between, own = (
+    among, between, within = (
         _kernel(camera, altitudes_m[0], a, b) for a, b in ((first, first), (second, first), (second, second))
     )
     regression = np.linalg.solve(among, between.T).T
     mean = regression @ heights.mean_m
-    covariance = own - regression @ (among - heights.covariance_m2) @ regression.T
+    covariance = within - regression @ (among - heights.covariance_m2) @ regression.T
     kept = 1 - _NEW_SHARE
     new = unknown_heights(camera, downs_c[1], altitudes_m[1]).covariance_m2
     return Heights(kept * mean, kept**2 * covariance + (1 - kept**2) * new)

@@ -117,16 +117,16 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
     if corners is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     window = (_WINDOW_PX, _WINDOW_PX)
-    found, good, _ = cv2.calcOpticalFlowPyrLK(
+    tracked, good, _ = cv2.calcOpticalFlowPyrLK(
         image_1, warped, corners, corners.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     back, good_back, _ = cv2.calcOpticalFlowPyrLK(
-        warped, image_1, found, found.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+        warped, image_1, tracked, tracked.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     kept = (good & good_back).ravel().astype(bool)
     kept &= np.linalg.norm(back - corners, axis=-1).ravel() < _CONSISTENCY_PX
     pixels_1 = corners.reshape(-1, 2)[kept].astype(np.float64) + 0.5
-    return pixels_1, apply_homography(homography, found.reshape(-1, 2)[kept].astype(np.float64) + 0.5)
+    return pixels_1, apply_homography(homography, tracked.reshape(-1, 2)[kept].astype(np.float64) + 0.5)
 
 
 def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMotion) -> Tracked:

@@ -33,11 +33,11 @@ class Ahead(Generic[Key, Item]):
         """The item of a key, once it is made. Raises what making it raised."""
         if next(self._expected, None) != key:
             self._begin(key)
-        found = self._made.get()
-        if isinstance(found, BaseException):
+        result = self._made.get()
+        if isinstance(result, BaseException):
             self._expected = iter(())
-            raise found
-        return found[1]
+            raise result
+        return result[1]
 
     def close(self) -> None:
         """End the thread; one that waits for a reply ends after it."""
@@ -56,10 +56,10 @@ class Ahead(Generic[Key, Item]):
         self._thread.start()
 
     def _run(self, keys: Iterator[Key], made: queue.Queue, stop: threading.Event) -> None:
-        def put(found: tuple[Key, Item] | BaseException) -> None:
+        def put(result: tuple[Key, Item] | BaseException) -> None:
             while not stop.is_set():
                 try:
-                    made.put(found, timeout=_POLL_S)
+                    made.put(result, timeout=_POLL_S)
                     return
                 except queue.Full:
                     continue

@@ -51,8 +51,8 @@ class TrainingSequences(torch_data.Dataset):
             for start in rng.integers(0, trajectory.n_pairs - self.n_pairs + 1, count)
         ]
         rng.shuffle(places)
-        own = set(self.share.of(len(self.trajectories)))
-        return [(epoch, place, *sequence) for place, sequence in enumerate(places) if sequence[0] in own]
+        numbers = set(self.share.of(len(self.trajectories)))
+        return [(epoch, place, *sequence) for place, sequence in enumerate(places) if sequence[0] in numbers]
 
     def __getitem__(self, key: Key) -> Sequence:
         _, _, number, start = key

@@ -124,13 +124,13 @@ def _velocities(dataset: Dataset) -> dict[tuple[str, str], Array]:
     return {(str(key[0]), str(key[1])): np.array(rows["velocity_mps"].tolist()) for key, rows in groups}
 
 
-def _check_camera(address: str, served: Camera, own: Camera) -> None:
+def _check_camera(address: str, served: Camera, expected_camera: Camera) -> None:
     """Raise UserError unless both cameras have the same view; sizes may differ."""
-    sizes = (served.width_px, served.height_px), (own.width_px, own.height_px)
+    sizes = (served.width_px, served.height_px), (expected_camera.width_px, expected_camera.height_px)
     views = [
         (c.fx_px / w, c.fy_px / h, c.cx_px / w, c.cy_px / h, w / h, *c.distortion)
-        for c, (w, h) in zip((served, own), sizes, strict=True)
+        for c, (w, h) in zip((served, expected_camera), sizes, strict=True)
     ]
     if not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
-        expected = f"{own}, that of the dataset, or one with the same view and another size"
+        expected = f"{expected_camera}, that of the dataset, or one with the same view and another size"
         raise UserError(address, "camera", served, expected)

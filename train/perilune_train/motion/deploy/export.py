@@ -48,9 +48,9 @@ class Pairs:
 
     def inputs(self, pair: int, fusion: Fusion) -> list[Tensor]:
         """The inputs of one pair without the state."""
-        own = slice(pair, pair + 1)
-        known = [self.nominal_translation_m[own], self.altitude_m[own]] if fusion == "warp" else []
-        return [self.first[own], self.second[own], *known]
+        rows = slice(pair, pair + 1)
+        known = [self.nominal_translation_m[rows], self.altitude_m[rows]] if fusion == "warp" else []
+        return [self.first[rows], self.second[rows], *known]
 
 
 def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> float:
@@ -153,8 +153,8 @@ def _largest_difference(
     names, state = INPUTS[fusion], [np.zeros((2, 1, architecture["hidden"]), np.float32)] * 2
     streamed = []
     for pair in range(len(pairs.first)):
-        given = [part.numpy() for part in pairs.inputs(pair, fusion)]
-        translation, rotation, *state = session.run(list(OUTPUTS), dict(zip(names, [*given, *state], strict=True)))
+        inputs = [part.numpy() for part in pairs.inputs(pair, fusion)]
+        translation, rotation, *state = session.run(list(OUTPUTS), dict(zip(names, [*inputs, *state], strict=True)))
         streamed.append(np.concatenate([translation[0], rotation[0].ravel()]))
     whole = FlightNavigator(network, architecture, focal)
     with torch.no_grad():

@@ -45,31 +45,31 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotio
                     estimated.setdefault(f"{name}_gyroscope", []).append(method(trajectory, gyroscope))
             progress.advance(task)
     whole = {name: estimated[name] for name in CLASSICAL if len(estimated.get(name, [])) == len(test)}
-    found = {name: [one.motion for one in own] for name, own in whole.items()}
-    covariances = {name: [one.covariance for one in own] for name, own in whole.items()}
-    found["nominal"] = [trajectory.nominal_motion for trajectory in test]
+    motions = {name: [estimate.motion for estimate in estimates] for name, estimates in whole.items()}
+    covariances = {name: [estimate.covariance for estimate in estimates] for name, estimates in whole.items()}
+    motions["nominal"] = [trajectory.nominal_motion for trajectory in test]
     if training:
-        found["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
-        found["mean"] = [mean_motion(training, trajectory) for trajectory in test]
-    return MethodMotions(found, covariances)
+        motions["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
+        motions["mean"] = [mean_motion(training, trajectory) for trajectory in test]
+    return MethodMotions(motions, covariances)
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
     """The training set's mean motion, for every pair of the trajectory."""
-    translation = np.concatenate([one.motion[0] for one in training]).mean(0)
-    rotation = mean_rotation(np.concatenate([one.motion[1] for one in training]))
+    translation = np.concatenate([trajectory.motion[0] for trajectory in training]).mean(0)
+    rotation = mean_rotation(np.concatenate([trajectory.motion[1] for trajectory in training]))
     return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation, (trajectory.n_pairs, 1, 1))
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:
     """The training set's mean motion at each step; that of its last step for all later steps."""
     translations, rotations = [], []
-    longest = max(one.n_pairs for one in training)
+    longest = max(trajectory.n_pairs for trajectory in training)
     for step in range(trajectory.n_pairs):
         motions = [
-            (one.motion[0][min(step, longest - 1)], one.motion[1][min(step, longest - 1)])
-            for one in training
-            if one.n_pairs > min(step, longest - 1)
+            (trajectory.motion[0][min(step, longest - 1)], trajectory.motion[1][min(step, longest - 1)])
+            for trajectory in training
+            if trajectory.n_pairs > min(step, longest - 1)
         ]
         translations.append(np.mean([t for t, _ in motions], axis=0))
         rotations.append(mean_rotation(np.stack([r for _, r in motions])))

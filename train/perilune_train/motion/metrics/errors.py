@@ -84,9 +84,11 @@ def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
     figures["position_error_median_m"] = float(errors["position_error_m"].median())
     figures["orientation_error_median_deg"] = float(errors["orientation_error_deg"].median())
     for low, high in itertools.pairwise(_ALTITUDES_M):
-        own = errors[(errors["altitude_m"] >= low) & (errors["altitude_m"] < high)]
-        if len(own):
-            figures[f"altitude_{low}_{high}_m/position_rmse_per_component_m"] = _rms(own["position_error_m"]) / 3**0.5
+        in_bin = errors[(errors["altitude_m"] >= low) & (errors["altitude_m"] < high)]
+        if len(in_bin):
+            figures[f"altitude_{low}_{high}_m/position_rmse_per_component_m"] = (
+                _rms(in_bin["position_error_m"]) / 3**0.5
+            )
     return figures
 
 

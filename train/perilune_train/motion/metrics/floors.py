@@ -20,10 +20,13 @@ _PENALTIES = np.logspace(-6, 2, 17)
 
 def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Pose]]:
     """The training set's mean pose, and its mean pose at each frame, for every test trajectory."""
-    position_m, rotation = (np.concatenate([one.pose[i] for one in training]) for i in range(2))
+    position_m, rotation = (np.concatenate([trajectory.pose[i] for trajectory in training]) for i in range(2))
     mean, turn = position_m.mean(0), mean_rotation(rotation)
-    constant = [constant_pose(mean, turn, one.n_pairs) for one in test]
-    return {"mean_pose": constant, "mean_pose_at_frame": [_mean_pose_at_frame(training, one.n_pairs) for one in test]}
+    constant = [constant_pose(mean, turn, trajectory.n_pairs) for trajectory in test]
+    return {
+        "mean_pose": constant,
+        "mean_pose_at_frame": [_mean_pose_at_frame(training, trajectory.n_pairs) for trajectory in test],
+    }
 
 
 def constant_pose(position_m: Array, rotation: Array, n_pairs: int) -> Pose:
@@ -33,9 +36,9 @@ def constant_pose(position_m: Array, rotation: Array, n_pairs: int) -> Pose:
 
 def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
     """Mean pose of the training set at each frame; at its last frame for all later ones."""
-    last, positions, rotations = max(one.n_pairs for one in training) - 1, [], []
+    last, positions, rotations = max(trajectory.n_pairs for trajectory in training) - 1, [], []
     for step in np.minimum(np.arange(n_pairs), last):
-        known = [one.pose for one in training if one.n_pairs > step]
+        known = [trajectory.pose for trajectory in training if trajectory.n_pairs > step]
         positions.append(np.mean([pose[0][step] for pose in known], axis=0))
         rotations.append(mean_rotation(np.stack([pose[1][step] for pose in known])))
     return np.stack(positions), np.stack(rotations)
@@ -56,17 +59,20 @@ def ridge_poses(training: Known, validation: Known, features: list[Array]) -> li
 
     Features are standardised. The penalty is the one of the lowest squared error of position on validation.
     """
-    position_m, rotation = (np.concatenate([one.pose[i] for one in training.trajectories]) for i in range(2))
+    position_m, rotation = (
+        np.concatenate([trajectory.pose[i] for trajectory in training.trajectories]) for i in range(2)
+    )
     turn = mean_rotation(rotation)
     targets = np.concatenate([position_m, rotation_vectors(rotation @ turn.T)], axis=1)
     fit = _Ridge(np.concatenate(training.features), targets)
-    known = np.concatenate([one.pose[0] for one in validation.trajectories])
+    known = np.concatenate([trajectory.pose[0] for trajectory in validation.trajectories])
     unseen = fit.projected(np.concatenate(validation.features))
     costs = [np.sum((fit.targets(unseen, penalty)[:, :3] - known) ** 2) for penalty in _PENALTIES]
     best = _PENALTIES[int(np.argmin(costs))]
-    found = [fit.targets(fit.projected(one), best) for one in features]
+    predicted = [fit.targets(fit.projected(trajectory_features), best) for trajectory_features in features]
     return [
-        (one[:, :3], np.stack([matrix_from_rotation_vector(vector) @ turn for vector in one[:, 3:]])) for one in found
+        (target[:, :3], np.stack([matrix_from_rotation_vector(vector) @ turn for vector in target[:, 3:]]))
+        for target in predicted
     ]
 
 

@@ -91,10 +91,10 @@ def _run(
     opened = open_single(dataset_address)
     if "stack" in fusions and settings.stack.target == "pose":
         check_one_area(opened)
-    own = training_provenance(opened)
+    provenance = training_provenance(opened)
     start = _start_of_warp(settings) if "warp" in fusions else None
     of_start = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
-    terrain = {"warp": own.joined(of_start), "stack": own.joined(inherited)}
+    terrain = {"warp": provenance.joined(of_start), "stack": provenance.joined(inherited)}
     # One check for both, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"].joined(of_start), opened, "test", allow_overlap)
     share = own_share(1, 1)
@@ -174,9 +174,9 @@ def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
     """Content of the checkpoint `navigate.init_from`. Raises UserError if its network has another architecture."""
     if settings.init_from is None:
         return None
-    path, own = weights_file(settings.init_from), settings.warp
+    path, warp = weights_file(settings.init_from), settings.warp
     content = load_weights(path)
-    expected = {"fusion": "warp", **{key: getattr(own, key) for key in ("size_px", "width", "attention", "hidden")}}
+    expected = {"fusion": "warp", **{key: getattr(warp, key) for key in ("size_px", "width", "attention", "hidden")}}
     check_architecture(path, content["architecture"], expected)
     check_architecture_of(NavigatorArchitecture, content["architecture"], path)
     return content
@@ -201,21 +201,21 @@ def _warp_task(
 
 def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
     """Train one network; returns the training time in seconds."""
-    settings, own = task.settings, task.own
+    settings, network_settings = task.settings, task.own
     schedule = Schedule(
-        epochs=own.coarse_epochs + own.fine_epochs,
+        epochs=network_settings.coarse_epochs + network_settings.fine_epochs,
         monitor="val/position_rmse_vector_m",
         mode="min",
         checkpoint_minutes=settings.checkpoint_minutes,
-        accumulate=own.accumulate,
+        accumulate=network_settings.accumulate,
     )
     hardware = Hardware(
         device=choose_device(settings.device),
         # In coarse epochs some weights have no gradient.
-        strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
+        strategy="ddp_find_unused_parameters_true" if network_settings.coarse_epochs else "auto",
         precision=settings.precision,
     )
-    rate = f"navigate.{task.fusion}.learning_rate, which is {own.learning_rate:g}"
+    rate = f"navigate.{task.fusion}.learning_rate, which is {network_settings.learning_rate:g}"
     with closing(task):
         return fit(run, task, schedule, hardware, Wording(f"train {task.fusion}", rate), resume)
 
@@ -248,7 +248,7 @@ def _detector_backbone(
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
-    own = settings.stack.stages
-    source = f"stages 1 to {min(stages, own)} of {own} from {path}"
+    wanted = settings.stack.stages
+    source = f"stages 1 to {min(stages, wanted)} of {wanted} from {path}"
     say(f"stack: backbone {source}")
     return state, source, [read_provenance(content, path)]

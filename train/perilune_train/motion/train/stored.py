@@ -28,7 +28,7 @@ def stored_features(
     """
     modes = [(module, module.training) for module in network.backbone.modules()]
     network.backbone.eval()
-    found = []
+    features = []
     with progress_bar() as progress, torch.autocast(device.type, torch.bfloat16, enabled=bf16):
         total = sum(trajectory.n_pairs for trajectory in [*trajectories, *views])
         bar = progress.add_task("backbone", total=total, unit="pairs", note="")
@@ -39,7 +39,7 @@ def stored_features(
             for part in pooled_features(network, torch.from_numpy(trajectory.images), warp):
                 parts.append(part.float())
                 progress.advance(bar, len(part))
-            found.append(torch.cat(parts))
+            features.append(torch.cat(parts))
     for module, training in modes:
         module.training = training
-    return found
+    return features

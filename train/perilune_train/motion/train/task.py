@@ -119,7 +119,7 @@ class NavigationTask(lightning.LightningModule):
         self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
         # Initial weights predict motions on the scales of their own training.
-        training = [one for one in trajectories if one.split == "train"]
+        training = [trajectory for trajectory in trajectories if trajectory.split == "train"]
         self.scales = initial.scales or Scales.measured(training, fusion, self.own.target)
         self.architecture = {
             "fusion": fusion,
@@ -143,9 +143,11 @@ class NavigationTask(lightning.LightningModule):
         self.provenance: Provenance | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.share = share
-        self.training_trajectories = [one.shrunk(self.own.size_px) for one in training]
+        self.training_trajectories = [trajectory.shrunk(self.own.size_px) for trajectory in training]
         self.views = other_views(self.training_trajectories, self.own.views, self.own.view_spread, settings.seed)
-        self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
+        self.validation_trajectories = [
+            trajectory.shrunk(self.own.size_px) for trajectory in trajectories if trajectory.split == "val"
+        ]
         given = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
         self.stores = fusion == "stack" and given and self.own.coarse_epochs > 0
         self.stored: dict[str, list[Tensor]] = {}
@@ -180,20 +182,20 @@ class NavigationTask(lightning.LightningModule):
         return self.current_epoch < self.own.coarse_epochs
 
     def _sequences(self) -> TrainingSequences:
-        own: dict[str, Any] = {
+        options: dict[str, Any] = {
             "warp": self.fusion == "warp",
             "jitter": self.jitter,
             "seed": self.settings.seed,
             "share": self.share,
         }
-        place = self.training_trajectories, self.own.sequence_pairs
+        trajectories_and_length = self.training_trajectories, self.own.sequence_pairs
         if self.fusion == "stack":
-            places = WindowPlaces(*place, **own)
+            places = WindowPlaces(*trajectories_and_length, **options)
             places.views = self.own.views
             return places
         if self.stream is None:
-            return TrainingSequences(*place, **own)
-        return StreamedSequences(self.stream, self.own.size_px, *place, **own)
+            return TrainingSequences(*trajectories_and_length, **options)
+        return StreamedSequences(self.stream, self.own.size_px, *trajectories_and_length, **options)
 
     def train_dataloader(self) -> DataLoader:
         # The current epoch is one too low here if the run is resumed.
@@ -208,8 +210,8 @@ class NavigationTask(lightning.LightningModule):
         return batch_loader(self.sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
     def val_dataloader(self) -> DataLoader:
-        own = [self.validation_trajectories[number] for number in self.validated]
-        return DataLoader(own, batch_size=None)  # type: ignore[arg-type]
+        trajectories = [self.validation_trajectories[number] for number in self.validated]
+        return DataLoader(trajectories, batch_size=None)  # type: ignore[arg-type]
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         if isinstance(batch, Tensor):
@@ -259,19 +261,21 @@ class NavigationTask(lightning.LightningModule):
         validation = [self.validation_trajectories[number] for number in self.validated]
         bf16 = choose_bf16(self.settings.precision, self.device.type)
         pooled = [
-            stored_features(self.network, own, self.device, bf16, others)
-            for own, others in ((training, views), (validation, ()))
+            stored_features(self.network, split_features, self.device, bf16, others)
+            for split_features, others in ((training, views), (validation, ()))
         ]
         if self.network.standardised:
             self.network.measure(torch.cat(pooled[0]))
-        train, val = ([self.network.scaled(one) for one in own] for own in pooled)
+        train, val = (
+            [self.network.scaled(pair_features) for pair_features in split_features] for split_features in pooled
+        )
         self.stored = {"train": [torch.cat(train)], "val": val}
 
     def _loss(self, output: Tensor, true_position: Tensor, true_angles: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of the stage, and its parts."""
-        found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
+        angles = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
         position = ((output[..., :3] - true_position) * self.axis_weights).square().sum(-1).mean()
-        orientation = (found - true_angles).square().sum(-1).mean()
+        orientation = (angles - true_angles).square().sum(-1).mean()
         if self.coarse:
             loss = position + self.settings.kappa * orientation
         else:
@@ -296,8 +300,8 @@ class NavigationTask(lightning.LightningModule):
         assert self.windows is not None
         if self.own.dropout:
             # A resumed run has the same dropout.
-            place = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
-            torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0]))
+            seeds = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
+            torch.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]))
         pairs = self.windows.pairs(places)
         if self.coarse and self.stores:
             output, _ = self.network.recurrent(self.stored["train"][0][pairs])
@@ -355,10 +359,10 @@ class NavigationTask(lightning.LightningModule):
             # One pass over memory: ten times as fast on a CPU, where it is half of a step on stored features.
             fused=True,
         )
-        own = self.own
-        coarse = own.coarse_learning_rate and own.coarse_learning_rate / own.learning_rate
-        stages = own.coarse_epochs * steps, own.fine_epochs * steps
+        settings = self.own
+        coarse = settings.coarse_learning_rate and settings.coarse_learning_rate / settings.learning_rate
+        stages = settings.coarse_epochs * steps, settings.fine_epochs * steps
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: learning_rate_factor(step, *stages, own.cycles, coarse)
+            optimizer, lambda step: learning_rate_factor(step, *stages, settings.cycles, coarse)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

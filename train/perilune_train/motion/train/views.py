@@ -21,28 +21,30 @@ def other_views(trajectories: list[Trajectory], count: int, spread: float, seed:
     """
     deviations, versions = _deviations(trajectories) if count else [], []
     for version in range(count):
-        for number, own in enumerate(trajectories):
+        for number, trajectory in enumerate(trajectories):
             rng = np.random.default_rng([seed, version, number])
             moves = spread * rng.choice([-1.0, 1.0], 6) * deviations[rng.integers(len(deviations))]
             # Beyond the end of the other descent its last deviation stays.
-            moves = moves[np.minimum(np.arange(len(own.position_m)), len(moves) - 1)]
-            turns = np.stack([matrix_from_rotation_vector(one) for one in moves[:, 3:]])
-            rotation = turns @ own.rotation_camera_from_site
-            versions.append(replace(own, position_m=own.position_m + moves[:, :3], rotation_camera_from_site=rotation))
+            moves = moves[np.minimum(np.arange(len(trajectory.position_m)), len(moves) - 1)]
+            turns = np.stack([matrix_from_rotation_vector(vector) for vector in moves[:, 3:]])
+            rotation = turns @ trajectory.rotation_camera_from_site
+            versions.append(
+                replace(trajectory, position_m=trajectory.position_m + moves[:, :3], rotation_camera_from_site=rotation)
+            )
     return versions
 
 
 def _deviations(trajectories: list[Trajectory]) -> list[Array]:
     """Each trajectory's deviation (n, 6) from the mean pose of each frame: metres in O_L, rotation vector in O_C."""
-    found = []
-    for own, (position_m, rotation) in zip(
+    deviations = []
+    for trajectory, (position_m, rotation) in zip(
         trajectories, mean_poses(trajectories, trajectories)["mean_pose_at_frame"], strict=True
     ):
-        turns = rotation_vectors(own.pose[1] @ np.swapaxes(rotation, 1, 2))
-        pairs = np.concatenate([own.pose[0] - position_m, turns], axis=1)
+        turns = rotation_vectors(trajectory.pose[1] @ np.swapaxes(rotation, 1, 2))
+        pairs = np.concatenate([trajectory.pose[0] - position_m, turns], axis=1)
         # Poses are those of the later frames of pairs. The first frame moves like the second one.
-        found.append(np.concatenate([pairs[:1], pairs]))
-    return found
+        deviations.append(np.concatenate([pairs[:1], pairs]))
+    return deviations
 
 
 def view_homographies(trajectory: Trajectory, view: Trajectory) -> Tensor:
@@ -51,8 +53,8 @@ def view_homographies(trajectory: Trajectory, view: Trajectory) -> Tensor:
     They are exact for points of the mean ground plane, z = 0 of O_L. A point h above it appears off by about
     f h m / a^2 pixels, for a move by m metres, altitude a and focal length f.
     """
-    own, other = (
-        ground_homography(trajectory.camera.matrix, one.position_m, one.rotation_camera_from_site)
-        for one in (trajectory, view)
+    from_ground, other = (
+        ground_homography(trajectory.camera.matrix, poses.position_m, poses.rotation_camera_from_site)
+        for poses in (trajectory, view)
     )
-    return torch.from_numpy(own @ np.linalg.inv(other)).float()
+    return torch.from_numpy(from_ground @ np.linalg.inv(other)).float()

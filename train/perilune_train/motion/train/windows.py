@@ -71,9 +71,9 @@ class Windows:
         device: torch.device,
         views: Sequence[Trajectory] = (),
     ):
-        own = [trajectories[number] for number in numbers]
+        chosen = [trajectories[number] for number in numbers]
         count, versions = len(trajectories), 1 + len(views) // len(trajectories)
-        self.images, self.device = [one.images for one in own], device
+        self.images, self.device = [trajectory.images for trajectory in chosen], device
         self.frames: Tensor | None = None
         every = [*trajectories, *views]
         numbers = [version * count + number for version in range(versions) for number in numbers]
@@ -85,7 +85,7 @@ class Windows:
         sizes = [(every[number].n_pairs, every[number].n_pairs + 1) for number in numbers]
         before[numbers] = np.cumsum([(0, 0), *sizes], axis=0)[:-1]
         self.first_pair, self.first_frame = torch.from_numpy(before).to(device).unbind(1)
-        self.n_frames = sum(one.n_pairs + 1 for one in own)
+        self.n_frames = sum(trajectory.n_pairs + 1 for trajectory in chosen)
         self.homographies = (
             torch.cat([view_homographies(trajectories[number % count], every[number]) for number in numbers]).to(device)
             if views

@@ -60,16 +60,16 @@ def learning_curve(run: Path, key: str) -> list[float]:
 def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]]]) -> bool:
     """Draw learning curves, one panel for each title, of a metric's key and runs by name; whether there are any."""
     values = {
-        title: {name: own for name, run in runs.items() if (own := learning_curve(run, key))}
+        title: {name: heights for name, run in runs.items() if (heights := learning_curve(run, key))}
         for title, (key, runs) in panels.items()
     }
-    values = {title: own for title, own in values.items() if own}
+    values = {title: heights for title, heights in values.items() if heights}
     if not values:
         return False
     figure = Figure(figsize=(6 * len(values), 4.5), layout="constrained")
     for axes, (title, curves) in zip(figure.subplots(1, len(values), squeeze=False)[0], values.items(), strict=True):
-        for name, own in curves.items():
-            axes.plot(range(1, len(own) + 1), own, marker="o", label=name)
+        for name, heights in curves.items():
+            axes.plot(range(1, len(heights) + 1), heights, marker="o", label=name)
         axes.set(xlabel="validation", ylabel=_TITLES[panels[title][0]], title=title)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
@@ -87,16 +87,16 @@ def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]
         reading: {network: _first_trajectory(file) for network, file in files.items() if file.is_file()}
         for reading, files in readings.items()
     }
-    tables = {reading: own for reading, own in tables.items() if own}
+    tables = {reading: errors for reading, errors in tables.items() if errors}
     if not tables:
         return False
     figure = Figure(figsize=(12, 4.5 * len(tables)), layout="constrained")
     grid = figure.subplots(len(tables), 2, squeeze=False)
-    for row, (reading, own) in zip(grid, tables.items(), strict=True):
+    for row, (reading, errors) in zip(grid, tables.items(), strict=True):
         for axes, (column, title) in zip(row, _ERRORS.items(), strict=True):
-            for network, table in own.items():
+            for network, table in errors.items():
                 axes.plot(table["step"], table[column], label=network)
-            name = "/".join(next(iter(own.values()))[_TRAJECTORY].iloc[0])
+            name = "/".join(next(iter(errors.values()))[_TRAJECTORY].iloc[0])
             axes.set(xlabel="step", title=f"{reading}: {title}, {name}")
             axes.grid(alpha=0.3)
             axes.legend()
@@ -106,5 +106,5 @@ def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]
 
 def _first_trajectory(file: Path) -> pd.DataFrame:
     table = pd.read_parquet(file)
-    own = table[table["method"] == "stack"]
-    return own[(own[_TRAJECTORY] == own[_TRAJECTORY].iloc[0]).all(axis=1)]
+    rows = table[table["method"] == "stack"]
+    return rows[(rows[_TRAJECTORY] == rows[_TRAJECTORY].iloc[0]).all(axis=1)]

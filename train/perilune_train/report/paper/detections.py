@@ -55,7 +55,7 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
         if len(unusable):
             raise UserError(path, name, unusable.iloc[0], "finite numbers")
     table = table[table["score"] >= chosen_threshold(trained)]
-    of_frame = {str(name): own for name, own in table.groupby("frame_id")}
+    of_frame = {str(name): rows for name, rows in table.groupby("frame_id")}
     names = split.frames.table["frame_id"].tolist()
     unknown = set(of_frame) - set(names)
     if unknown:
@@ -122,14 +122,14 @@ def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
     figure = Figure(figsize=(6 * len(chosen), 6.3 * len(by_network)), layout="constrained")
     axes = np.atleast_2d(figure.subplots(len(by_network), len(chosen), squeeze=False))
     for row, (network, detected) in zip(axes, by_network.items(), strict=True):
-        for one, (what, index) in zip(row, chosen.items(), strict=True):
+        for panel, (what, index) in zip(row, chosen.items(), strict=True):
             image = split.frames.images[index]
-            one.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, image.shape[1], image.shape[0], 0))
+            panel.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, image.shape[1], image.shape[0], 0))
             labels = split.labels[index]
             for boxes, colour in ((labels.boxes[labels.selected], "red"), (detected.found[index].boxes, "cyan")):
                 for x0, y0, x1, y1 in boxes:
-                    one.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.8, color=colour))
-            one.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
-            one.set_title(f"{network}, {what}: {split.frames.table['frame_id'][index]}", fontsize=9)
-            one.axis("off")
+                    panel.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.8, color=colour))
+            panel.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+            panel.set_title(f"{network}, {what}: {split.frames.table['frame_id'][index]}", fontsize=9)
+            panel.axis("off")
     save_figure(path, figure)

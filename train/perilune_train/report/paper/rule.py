@@ -44,7 +44,7 @@ def compared(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics], *,
     if not ours or not others:
         return "not measured"
     if len(ours) == len(others) == 1:
-        intervals = [read_spread(one[0], key).interval for one in (attended, plain)]
+        intervals = [read_spread(runs[0], key).interval for runs in (attended, plain)]
         return by_order(intervals[0], intervals[1], higher)
     if min(len(ours), len(others)) < MIN_TRAININGS:
         return "open"

@@ -79,8 +79,8 @@ def nearest_share(curve: Mapping[str, Metrics], account: str = "") -> str | None
 
     `account` is "" (usual) or "strict/". None if the curve has no AP.
     """
-    found = {share: metrics.get(f"val/{account}ap50_paper") for share, metrics in curve.items() if share != USUAL}
-    known = {share: abs(ap - TARGET_AP) for share, ap in found.items() if isinstance(ap, int | float)}
+    ap_of_share = {share: metrics.get(f"val/{account}ap50_paper") for share, metrics in curve.items() if share != USUAL}
+    known = {share: abs(ap - TARGET_AP) for share, ap in ap_of_share.items() if isinstance(ap, int | float)}
     return min(known, key=lambda share: known[share], default=None)
 
 
@@ -115,7 +115,7 @@ class PaperRuns:
     def halves(self) -> dict[str, list[Metrics]]:
         """Metrics of the finished trainings at half width on the headline ground, for each network."""
         names = {network: [detect_name(network, seed=seed) for seed in SEEDS] for network in ATTENTION}
-        return {network: self._detect(*own) for network, own in names.items()}
+        return {network: self._detect(*run_names) for network, run_names in names.items()}
 
     def curve(self, headline: str | None = None) -> dict[str, Metrics]:
         """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
@@ -123,8 +123,8 @@ class PaperRuns:
         Runs on the sparse, the headline and our usual ground are points too if their networks are as large, and train
         for as many epochs, as in the runs of the curve. `headline` is the share of the headline ground.
         """
-        found = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
-        read = {share: finished(self.detector(name)) for share, name in found.items()}
+        name_of_share = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
+        read = {share: finished(self.detector(name)) for share, name in name_of_share.items()}
         plain = next(iter(ATTENTION))
         sizes = {_size(metrics) for metrics in read.values() if metrics is not None}
         others = [(SPARSE_SHARE, detect_name(plain, SPARSE)), (USUAL, detect_name(plain, USUAL))]
@@ -139,7 +139,7 @@ class PaperRuns:
 
     def navigation(self, reading: str) -> dict[str, Metrics]:
         """Metrics of the finished navigators of a reading, by the paper's names."""
-        folders = {name: self.navigator(navigate_name(own, reading)) for name, own in NAVIGATORS.items()}
+        folders = {name: self.navigator(navigate_name(network, reading)) for name, network in NAVIGATORS.items()}
         read = {name: finished(folder) for name, folder in folders.items()}
         return {name: metrics for name, metrics in read.items() if metrics is not None}
 

@@ -20,26 +20,28 @@ GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from ide
 
 def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
     """All claims in the order of the paper; `large` is the width of the large craters that attention-YOLOv3 finds."""
-    found = []
+    answers = []
     for key, (name, claimed) in _detection_claims().items():
-        found += [_detection(runs, f"attention raises {name} ({GATES[gates]})", claimed, key, gates) for gates in GATES]
-    found.append(_large_craters(large))
+        answers += [
+            _detection(runs, f"attention raises {name} ({GATES[gates]})", claimed, key, gates) for gates in GATES
+        ]
+    answers.append(_large_craters(large))
     for reading in READINGS:
-        found += _navigation(runs, reading)
-    return [*found, _as_fast(runs), *gate_verdicts(runs.explanation() or {})]
+        answers += _navigation(runs, reading)
+    return [*answers, _as_fast(runs), *gate_verdicts(runs.explanation() or {})]
 
 
 def _detection_claims() -> dict[str, tuple[str, str]]:
     """Name and the paper's figures of each claim, by the key of metrics.json."""
     names = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
     plain, attended = DETECTION.values()
-    found = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
-    found |= {
-        f"test/strict/{key}": (f"{names[key]}, strict account", found[f"test/{key}"][1])
+    compared = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
+    compared |= {
+        f"test/strict/{key}": (f"{names[key]}, strict account", compared[f"test/{key}"][1])
         for key in ("precision", "ap50_paper")
     }
     small = {"2_3": "AP of small craters, 2 to 3 px", "3_5": "AP of small craters, 3 to 5 px"}
-    return found | {f"test/radius_{bin_}_px/ap50_paper": (name, "no figure") for bin_, name in small.items()}
+    return compared | {f"test/radius_{bin_}_px/ap50_paper": (name, "no figure") for bin_, name in small.items()}
 
 
 def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) -> Verdict:
@@ -84,8 +86,8 @@ def _large_craters(ratio: WidthRatio | None) -> Verdict:
 
 
 def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
-    found = runs.navigation(reading)
-    plain, attended = ([found[name]] if name in found else [] for name in NAVIGATORS)
+    navigation = runs.navigation(reading)
+    plain, attended = ([navigation[name]] if name in navigation else [] for name in NAVIGATORS)
     where = {"pose": "pose in O_L", "attitude": "pose in O_L, attitude noise", "motion": "motion between frames"}[
         reading
     ]
@@ -94,14 +96,14 @@ def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
         unit = field.rpartition("_")[2]
         key = f"test/{what}_rmse_per_component_{unit}"
         claim = f"attention lowers the {what} RMSE, per component ({where})"
-        claimed = " against ".join(f"{one[field]:g} {unit}" for one in reversed(NAVIGATION.values()))
+        claimed = " against ".join(f"{figures[field]:g} {unit}" for figures in reversed(NAVIGATION.values()))
         answer = compared(key, attended, plain, higher=False)
         measured = _measured(key, attended, plain)
         if what == "orientation" and answer != "not measured" and _is_constant([*plain, *attended], key):
             measured, answer = "the true orientation is constant; ATTITUDE=1 measures it", "not measured"
         elif what == "position":
             names = (("with", attended), ("without", plain))
-            lost = {name: lost_to(own[0]) for name, own in names if own}
+            lost = {name: lost_to(trainings[0]) for name, trainings in names if trainings}
             measured += "".join(
                 f"; {name} attention, not better than the {FLOORS[by]}" for name, by in lost.items() if by
             )

@@ -28,5 +28,7 @@ def read_table(path: Path) -> NDArray[np.float64]:
         cells = line.split(separator)
         if len(cells) != len(names):
             raise UserError(path, f"line {number}", f"{len(cells)} values", f"{len(names)}, as in the header")
-        boxes.append(box_of([cells[place] for place in places], path, f"line {number}", may_be_empty=False))
+        boxes.append(
+            box_of([cells[column_number] for column_number in places], path, f"line {number}", may_be_empty=False)
+        )
     return np.array(boxes, np.float64).reshape(-1, 4)

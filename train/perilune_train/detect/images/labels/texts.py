@@ -58,11 +58,11 @@ def below(folder: Path, name: Any, path: Path, field: str) -> Path:
         # Labels made on Windows have its separators.
         parts = name if "\\" not in name or folder.joinpath(name).exists() else name.replace("\\", "/")
         try:
-            found = folder.joinpath(parts).resolve()
+            resolved = folder.joinpath(parts).resolve()
         except (OSError, RuntimeError):  # circular links
-            found = folder
-        if found != folder and found.is_relative_to(folder):
-            return found
+            resolved = folder
+        if resolved != folder and resolved.is_relative_to(folder):
+            return resolved
     raise UserError(path, field, name, "a path of an image below the labels' folder, or below images next to it")
 
 
