@@ -222,6 +222,7 @@ def _ordered() -> OrderedDict:
     return OrderedDict()
 
 
+# The parameters are those of torch's `_rebuild_tensor_v2`, which the pickle calls.
 def _tensor(
     storage: _Storage, offset: int, shape: tuple, strides: tuple, grad: bool, hooks: dict, _: object = None
 ) -> TensorRecord:

@@ -82,12 +82,6 @@ def picture_size(path: Path) -> tuple[int, int]:
         return picture.size_px(upright=True)
 
 
-def picture_format(path: Path) -> str:
-    """PNG, TIFF, JPEG or another format, by content. Raises UserError if it is none of these."""
-    with _opened(path) as picture:
-        return picture.kind
-
-
 def stored_from_upright(path: Path) -> NDArray[np.float64]:
     """The matrix (2, 3) from pixel coordinates of the upright picture to those of the file (orientation.py)."""
     with _opened(path) as picture:

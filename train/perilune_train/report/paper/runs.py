@@ -64,11 +64,6 @@ def detect_name(network: str, ground: str = HEADLINE, seed: int | None = None) -
     return "-".join([*([ground] if ground else []), network, *half])
 
 
-def curve_name(share: str) -> str:
-    """Name of the training on the ground of this equilibrium_share, or on our usual one (`lunar`)."""
-    return f"{CURVE}-{share}"
-
-
 def navigate_name(navigator: str, reading: str = "pose") -> str:
     """Name of the training of a navigator, a value of `NAVIGATORS`, in one of the `READINGS`."""
     return navigator + READINGS[reading]
