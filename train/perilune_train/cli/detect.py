@@ -259,8 +259,10 @@ def benchmark(
         folder = out or Path("runs/benchmark", run.resolve().name)
         check_output(folder, run)
         made = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
-    rule, account, value = made.least("ap50_paper")
-    say(f"AP {value:.3f} by the least favourable account (labels by {rule}, {account}); {folder}: {PAGE}, {FIGURES}")
+    selection, rule, value = made.least("ap50_paper")
+    say(
+        f"AP {value:.3f} by the least favourable scoring rule (labels by {selection}, {rule}); {folder}: {PAGE}, {FIGURES}"
+    )
 
 
 @app.command("compare")

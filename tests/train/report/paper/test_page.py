@@ -171,7 +171,7 @@ def test_the_first_paragraph(runs, dataset):
     assert text == write_page(runs, str(dataset)).read_text().splitlines()[2]
     assert "The headline ground has `equilibrium_share` 0.4: a ground of the paper's difficulty" in text
     assert "Of 4 grounds it has the validation AP (0.895) nearest to the paper's 0.893." in text
-    assert "By the strict account it would be 0.1 (0.870)." in text
+    assert "By the strict scoring rule it would be 0.1 (0.870)." in text
     assert "(precision 0.840 at recall 0.926; here 0.800 usual and 0.700 strict at recall 0.800)" in text
     assert "At half width there are 3 trainings of each network." in text
     assert "It was given; on the curve 0.4 is nearer to 0.893." in paragraph("0.8")

@@ -34,7 +34,7 @@ def answers(root, start):
 def test_every_claim_holds_where_the_runs_are_as_the_paper_says(tmp_path):
     write_all(tmp_path)
     found = verdicts(PaperRuns(tmp_path), WidthRatio(0.95, (0.94, 0.96)))
-    # Without an interval, one training decides nothing: orientations. Figures of the strict account rest on three.
+    # Without an interval, one training decides nothing: orientations. Figures of the strict scoring rule rest on three.
     open_ = [one.claim for one in found if one.answer != "holds"]
     assert len(found) == 30 and [claim for claim in open_ if "orientation" not in claim] == [] and len(open_) == 3
 
@@ -74,7 +74,7 @@ def test_one_training(tmp_path, attended, spread, answer):
     assert (found.answer, found.trainings) == (answer, "one training each")
     assert verdict(tmp_path, "attention raises AP (gates").answer == "not measured"
     # The strict precision has no interval.
-    assert verdict(tmp_path, "attention raises precision, strict account (plain").answer == "open"
+    assert verdict(tmp_path, "attention raises precision, strict scoring rule (plain").answer == "open"
 
 
 def test_full_width_against_several_trainings(tmp_path):

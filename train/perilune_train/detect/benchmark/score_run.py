@@ -90,9 +90,9 @@ def _write(out: Path, parts: Sequence[Part], loaded: dict[str, dict[str, DetectS
     about, threshold = entry.about, entry.threshold
     result = score(parts, loaded, entry.detections, threshold)
     mark = "; ".join(dict.fromkeys(check.mark for check in entry.checks if check.mark))
-    for rule, evaluation in result.evaluations.items():
-        write_evaluation(out / rule, evaluation, result.images, [*about, f"labels: selection `{rule}`"])
-        mark_files(out / rule, _PICTURES, mark)
+    for selection, evaluation in result.evaluations.items():
+        write_evaluation(out / selection, evaluation, result.images, [*about, f"labels: selection `{selection}`"])
+        mark_files(out / selection, _PICTURES, mark)
     write_markdown(out / PAGE, page_of(result, about))
     mark_files(out, [PAGE], mark)
     write_metrics(out, result.figures() | entry.entries | {"threshold": threshold, "terrain/mark": mark}, FIGURES)

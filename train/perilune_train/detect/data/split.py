@@ -60,7 +60,7 @@ def load_split(
     Raises UserError on damaged files, on frame sizes unfit for the network and on fewer frames than processes.
 
     `scale` has the smallest and the largest zoom factor that will be applied to frames; the range of ignored craters is
-    extended accordingly. The edge account needs a largest factor of 1 / EDGE.
+    extended accordingly. The edge scoring rule needs a largest factor of 1 / EDGE.
     """
     check_frame_size(dataset)
     table = frame_table(dataset, split)

@@ -51,7 +51,7 @@ class BinFigures:
     ap50_paper_spread: Spread
     """Spread of ap50_paper over the units with selected labels in the bin."""
     precision: float
-    """Precision in the usual account (matching.py)."""
+    """Precision by the usual scoring rule (matching.py)."""
     recall: float
     """Fraction of the selected labels that were found."""
     recall_spread: Spread

@@ -33,7 +33,7 @@ from perilune_train.detect.evaluate.matching import (
     edge_range,
     find_overlaps,
 )
-from perilune_train.detect.evaluate.metrics import figures, figures_of_account, figures_over_ious
+from perilune_train.detect.evaluate.metrics import figures, figures_of_rule, figures_over_ious
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
@@ -59,14 +59,14 @@ class Evaluation:
     matches: Matches
     """Matches at match_iou."""
     at_edge: Matches
-    """Matches at match_iou in the edge account (matching.py)."""
+    """Matches at match_iou by the edge scoring rule (matching.py)."""
     by_iou: list[Matches]
     """Matches at each of COCO_IOUS."""
     bins: list[BinFigures]
     """By radius, altitude, Sun elevation and freshness; only bins that hold labels."""
     spreads: dict[str, Spread]
-    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper in the edge and strict
-    accounts."""
+    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper by the edge and
+    strict scoring rules."""
     resamples: Resamples
     """Resamples of the bootstrap intervals."""
 
@@ -83,7 +83,7 @@ class Evaluation:
         """
         result: Metrics = {
             **figures(self.matches, self.threshold),
-            **figures_of_account(self.at_edge, self.threshold, "edge/"),
+            **figures_of_rule(self.at_edge, self.threshold, "edge/"),
             **figures_over_ious(self.by_iou),
             "threshold": self.threshold,
             "match_iou": self.match_iou,
@@ -128,8 +128,8 @@ def evaluate_detections(
 ) -> Evaluation:
     """Evaluate the detections of all frames.
 
-    The edge account is valid only if `labels` include craters, as ignored ones, well below the range of radii. `seed`
-    is the random seed of the bootstrap only.
+    The edge scoring rule is valid only if `labels` include craters, as ignored ones, well below the range of radii.
+    `seed` is the random seed of the bootstrap only.
     """
     match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
     overlaps = find_overlaps(detections, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))

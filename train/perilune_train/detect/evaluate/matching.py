@@ -7,14 +7,14 @@ Evaluate detections against labels of rendered or real images with:
     curve(matches).ap_paper()                                  # metrics.py
 
 Detections are matched in order of score. Each takes the unmatched selected label of highest IoU, if that is at least
-the given IoU. Only selected labels count in recall. Three accounts differ in which unmatched detections are false
+the given IoU. Only selected labels count in recall. Three scoring rules differ in which unmatched detections are false
 positives:
 
 - Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
   labelled range), if its radius sqrt(w h) / 2 is outside the labelled range, or if its centre is off the image. The
   labels cannot decide whether such a detection is right.
 - Edge (`edge_range`): a detection somewhat below the smallest radius is a false positive too, unless it overlaps a
-  crater, selected or not. In the usual account a detector can report boxes just below the smallest radius everywhere:
+  crater, selected or not. By the usual rule a detector can report boxes just below the smallest radius everywhere:
   some of them match a label and count, and the others are ignored.
 - Strict: every unmatched detection is a false positive.
 
@@ -42,13 +42,13 @@ Rows = NDArray[np.intp]
 FOUND, FALSE, IGNORED = 1, 0, -1
 NO_LABEL, ON_IGNORED = -1, -2
 EDGE = 0.75
-"""The edge account counts false positives down to this fraction of the smallest radius."""
+"""The edge scoring rule counts false positives down to this fraction of the smallest radius."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
 """The IoUs over which COCO averages, bit-identical to COCO's."""
 
 
 def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
-    """Range of radii, pixels, in which the edge account counts unmatched detections as false positives."""
+    """Range of radii, pixels, in which the edge scoring rule counts unmatched detections as false positives."""
     return radius_px[0] * EDGE, radius_px[1]
 
 

@@ -79,7 +79,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         "",
     ]
     rows = [
-        [title, *(spread_cell(figures, spreads, f"{account}{key}") for account in ("", "edge/", "strict/"))]
+        [title, *(spread_cell(figures, spreads, f"{prefix}{key}") for prefix in ("", "edge/", "strict/"))]
         for key, title in _ROWS.items()
     ]
     rows += [

@@ -13,9 +13,9 @@ from perilune_train.records.pictures import save_figure
 from perilune_train.report.paper.claimed import TARGET_AP
 
 _AP_LINES = {
-    "val/ap50_paper": "validation, usual account",
-    "test/ap50_paper": "test, usual account",
-    "test/strict/ap50_paper": "test, strict account",
+    "val/ap50_paper": "validation, usual scoring rule",
+    "test/ap50_paper": "test, usual scoring rule",
+    "test/strict/ap50_paper": "test, strict scoring rule",
 }
 AP_KEY = "val/ap50_paper"
 POSITION_KEY = "val/position_rmse_vector_m"

@@ -30,7 +30,7 @@ DEVIATIONS = (
     "Optimiser (AdamW with warm-up and one cosine for detection), learning rate, batch and epochs of detection, and "
     "the weight of empty cells in the objectness loss (1) are ours; the paper does not state them.",
     "Craters with a radius just outside 2 to 50 px, or with their centre off the frame, are neither positive nor "
-    "negative in training. The usual account ignores detections on them; the strict one counts these as false.",
+    "negative in training. The usual scoring rule ignores detections on them; the strict rule counts them as false.",
     "A cell can place a centre up to half a cell outside itself. There is no class output. The initial objectness is "
     "0.01 in every cell.",
     "Navigation: in the paper the network gives the pose in the landing frame; motion between frames is a second "
@@ -49,7 +49,7 @@ DEVIATIONS = (
 
 def lead(runs: PaperRuns, share: str | None, *, given: bool) -> str:
     """The paragraph; `share` is the equilibrium_share of the headline ground, `given` if the caller named it."""
-    return " ".join([_ground(runs, share, given), _account(runs), _trainings(runs)])
+    return " ".join([_ground(runs, share, given), _scoring(runs), _trainings(runs)])
 
 
 def verdict_note() -> str:
@@ -83,16 +83,16 @@ def _ground(runs: PaperRuns, share: str | None, given: bool) -> str:
     strict = nearest_share(curve, "strict/")
     if strict is not None and strict != share:
         ap = number(curve[strict].get("val/strict/ap50_paper"))
-        text += f" By the strict account it would be {strict} ({ap})."
+        text += f" By the strict scoring rule it would be {strict} ({ap})."
     return text
 
 
-def _account(runs: PaperRuns) -> str:
+def _scoring(runs: PaperRuns) -> str:
     paper = DETECTION["YOLOv3"]
     text = (
-        "**Account.** Labels follow the paper's rule, radii of 2 to 50 px. Headline figures are of the usual account, "
-        "which ignores detections that the labels cannot decide. The strict account counts a detected crater just "
-        "below 2 px as false. The paper must have used the strict one, since it names no ignored detections"
+        "**Scoring.** Labels follow the paper's selection, radii of 2 to 50 px. Headline figures use the usual scoring "
+        "rule, which ignores detections that the labels cannot decide. The strict rule counts a detected crater just "
+        "below 2 px as false. The paper must have used the strict rule, since it names no ignored detections"
     )
     trainings = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
     usual, strict, recall = (numbers(trainings, f"test/{key}") for key in ("precision", "strict/precision", "recall"))
@@ -101,7 +101,7 @@ def _account(runs: PaperRuns) -> str:
             f" (precision {paper['precision']:.3f} at recall {paper['recall']:.3f}; here {usual[0]:.3f} usual and "
             f"{strict[0]:.3f} strict at recall {recall[0]:.3f})"
         )
-    return f"{text}. The usual one is the headline here, since a crater just below 2 px is not a false detection."
+    return f"{text}. The usual rule is the headline here, since a crater just below 2 px is not a false detection."
 
 
 def _trainings(runs: PaperRuns) -> str:

@@ -69,12 +69,12 @@ def navigate_name(navigator: str, reading: str = "pose") -> str:
     return navigator + READINGS[reading]
 
 
-def nearest_share(curve: Mapping[str, Metrics], account: str = "") -> str | None:
+def nearest_share(curve: Mapping[str, Metrics], prefix: str = "") -> str | None:
     """Share of the curve, except `lunar`, at which the AP on validation is nearest to the AP of the paper's YOLOv3.
 
-    `account` is "" (usual) or "strict/". None if the curve has no AP.
+    `prefix` is that of the scoring rule: "" (usual) or "strict/". None if the curve has no AP.
     """
-    ap_of_share = {share: metrics.get(f"val/{account}ap50_paper") for share, metrics in curve.items() if share != USUAL}
+    ap_of_share = {share: metrics.get(f"val/{prefix}ap50_paper") for share, metrics in curve.items() if share != USUAL}
     known = {share: abs(ap - TARGET_AP) for share, ap in ap_of_share.items() if isinstance(ap, int | float)}
     return min(known, key=lambda share: known[share], default=None)
 

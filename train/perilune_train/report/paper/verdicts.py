@@ -37,7 +37,7 @@ def _detection_claims() -> dict[str, tuple[str, str]]:
     plain, attended = DETECTION.values()
     compared = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
     compared |= {
-        f"test/strict/{key}": (f"{names[key]}, strict account", compared[f"test/{key}"][1])
+        f"test/strict/{key}": (f"{names[key]}, strict scoring rule", compared[f"test/{key}"][1])
         for key in ("precision", "ap50_paper")
     }
     small = {"2_3": "AP of small craters, 2 to 3 px", "3_5": "AP of small craters, 3 to 5 px"}
