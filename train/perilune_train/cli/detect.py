@@ -260,9 +260,8 @@ def benchmark(
         check_output(folder, run)
         made = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
     selection, rule, value = made.least("ap50_paper")
-    say(
-        f"AP {value:.3f} by the least favourable scoring rule (labels by {selection}, {rule}); {folder}: {PAGE}, {FIGURES}"
-    )
+    chosen = f"labels by {selection}, {rule}"
+    say(f"AP {value:.3f} by the least favourable scoring rule ({chosen}); {folder}: {PAGE}, {FIGURES}")
 
 
 @app.command("compare")
