@@ -1,4 +1,4 @@
-"""Neighbours among points of a plane, by a grid (compiled by numba)."""
+"""Neighbours among points of a plane, found with a grid (compiled by numba)."""
 
 from typing import NamedTuple
 
@@ -10,20 +10,20 @@ from perilune_train.compiled import compiled
 
 
 class Grid(NamedTuple):
-    """N points in a grid of n x n cells, about as many as points."""
+    """N points in a grid of n x n cells, with about as many cells as points."""
 
     place: Array
     """The points (N, 2)."""
     n: int
     """Number of rows, and of columns."""
     corner: Array
-    """Least coordinates (2,)."""
+    """Smallest coordinates (2,)."""
     side: Array
     """Sides of a cell (2,)."""
     begin: NDArray[np.int64]
-    """Place in `order` of the first point of each cell, row by row, and the number of points (n^2 + 1,)."""
+    """Index in `order` of the first point of each cell, row by row, and the number of points at the end (n^2 + 1,)."""
     order: NDArray[np.int64]
-    """The points in the order of cells (N,)."""
+    """Indices of the points, sorted by cell (N,)."""
 
 
 @compiled
@@ -50,15 +50,16 @@ def grid_of(place: Array) -> Grid:
 
 @compiled
 def _cell(place: float, corner: float, side: float, n: int) -> int:
-    """The cell along an axis, the nearest one for a place beside the grid."""
+    """Index of the cell along an axis; the nearest cell for a coordinate outside the grid."""
     return int(min(max((place - corner) / side, 0.0), n - 1.0))
 
 
 @compiled
 def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each of M places (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
+    """For each of M positions (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
 
-    Returns the place of the first pair of each place, and the number of pairs (M + 1,), then the point of each pair.
+    Returns the index of the first pair of each position, with the number of pairs at the end (M + 1,), then the point
+    of each pair.
     """
     grid = grid_of(others)
     first, other, count = np.zeros(len(place) + 1, np.int64), np.empty(8 * len(place) + 1, np.int64), 0
@@ -81,12 +82,12 @@ def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.
 
 @compiled
 def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
-    """The `count` points nearest to a place, or all if there are fewer, the nearest first."""
+    """The `count` points nearest to a position, nearest first, or all points if there are fewer."""
     count = min(count, len(grid.place))
     nearest_points, squared = np.empty(count, np.int64), np.full(count, np.inf)
     column, row = _cell(x, grid.corner[0], grid.side[0], grid.n), _cell(y, grid.corner[1], grid.side[1], grid.n)
     for ring in range(grid.n):
-        # Points farther out than the ring before are at least this far away.
+        # Points beyond the previous ring are at least this far away.
         if count and squared[count - 1] <= ((ring - 1) * min(grid.side[0], grid.side[1])) ** 2 and ring > 0:
             break
         for down in range(max(row - ring, 0), min(row + ring, grid.n - 1) + 1):
@@ -99,7 +100,7 @@ def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
                     apart = (grid.place[j, 0] - x) ** 2 + (grid.place[j, 1] - y) ** 2
                     if not count or apart >= squared[count - 1]:
                         continue
-                    # Insert in the order of distances.
+                    # Insert in order of distance.
                     at = count - 1
                     while at > 0 and squared[at - 1] > apart:
                         squared[at], nearest_points[at] = squared[at - 1], nearest_points[at - 1]

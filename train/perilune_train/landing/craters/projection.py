@@ -1,4 +1,4 @@
-"""A catalogue as a camera at a pose would see it."""
+"""Craters of a catalogue as a camera at a pose sees them."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ class Projected:
     """The craters of a catalogue in view."""
 
     index: NDArray[np.integer]
-    """Places (N,) in the catalogue."""
+    """Rows (N,) of the catalogue."""
     centre_px: Array
     """Centres of the ellipses (N, 2), which are not the images of the circles' centres."""
     radius_px: Array
@@ -50,9 +50,11 @@ class Projected:
         return self.point_m[:, 2]
 
     def jacobian(self, chosen: NDArray[np.integer] | None = None) -> Array:
-        """Derivatives of centre and logarithm of radius by a step of the pose (K, 3, 6), of all craters or of some.
+        """Derivatives (K, 3, 6) of centre and logarithm of the radius by a step of the pose, of all craters or of
+        `chosen`.
 
-        The ellipse's own offset from the image of the circle's centre changes far more slowly.
+        They neglect the change of the offset between the ellipse's centre and the image of the circle's centre, which
+        changes far more slowly.
         """
         points = self.point_m if chosen is None else self.point_m[chosen]
         return _derivatives(points, self.pose.rotation_camera_from_site, self.camera.fx_px, self.camera.fy_px)
@@ -82,7 +84,7 @@ def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) ->
 def projected(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float = 0.0, least_radius_px: float = 1.0
 ) -> Projected:
-    """Craters of a least radius whose centre is in the image or at most `margin_px` beside it."""
+    """Project craters of at least a radius whose centre is in the image or at most `margin_px` outside it."""
     index, points = _in_view(catalogue, camera, pose, margin_px, least_radius_px)
     rotation = pose.rotation_camera_from_site
     if any(camera.distortion):
@@ -100,14 +102,15 @@ def projected(
 def in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> NDArray[np.integer]:
-    """Places of the craters whose centre is in the image or at most `margin_px` beside it, by radius over depth."""
+    """Rows of the craters whose centre is in the image or at most `margin_px` outside it, and whose radius divided by
+    depth is at least `least_radius_px`."""
     return _in_view(catalogue, camera, pose, margin_px, least_radius_px)[0]
 
 
 def _in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> tuple[NDArray[np.integer], Array]:
-    """As `in_view`, and the centres of the craters (N, 3), O_C."""
+    """The rows as `in_view` returns them, and the centres of these craters (N, 3), O_C."""
     limits = margin_px, least_radius_px
     rotation = pose.rotation_camera_from_site
     return _visible(catalogue.centre_m, catalogue.radius_m, pose.position_m, rotation, _lens(camera), limits)
@@ -129,7 +132,8 @@ def _visible(
     """`_in_view` for circles with centres (N, 3), O_L, and radii (N,); `limits` are the margin and the least radius."""
     fx_px, fy_px, cx_px, cy_px, width_px, height_px = lens
     margin_px, least_px = limits
-    # No branches: which craters pass cannot be predicted. Size first: it alone excludes most craters of a catalogue.
+    # No branches: the processor cannot predict which craters pass. Size comes first, because it alone excludes most
+    # craters of a catalogue.
     index = np.empty(len(radius_m) + 1, np.int64)
     large = 0
     for k in range(len(radius_m)):
@@ -168,11 +172,12 @@ def _boxes(
 ) -> tuple[Array, Array]:
     """Centres and half sizes (K, 2), pixels, of the boxes of circles, for a pinhole.
 
-    From the centres (K, 3), O_C, and places in the catalogue (K,) of the circles, and the normals (N, 3), O_L, and
-    radii (N,) of the catalogue. NaN if the image of a circle is not an ellipse. From the dual conic
-    r^2 (I - n n^T) - c c^T of the circle (Hartley & Zisserman, Multiple View Geometry, 2nd ed., section 8.1): its
-    tangents along the axes of the image are the sides of the box. This is many times as fast as `project_circles`,
-    which also has axes and directions.
+    `points` (K, 3), O_C, are the centres of the circles and `index` (K,) their rows in the catalogue, which has
+    `normals` (N, 3), O_L, and `radius_m` (N,). NaN if the image of a circle is not an ellipse.
+
+    The dual conic of the circle is r^2 (I - n n^T) - c c^T (Hartley & Zisserman, Multiple View Geometry, 2nd ed.,
+    section 8.1); its tangents along the axes of the image are the sides of the box. This is many times as fast as
+    `project_circles`, which also computes axes and directions.
     """
     focal_px, middle_px = lens[:2], lens[2:4]
     centre, half = np.full((len(points), 2), np.nan), np.full((len(points), 2), np.nan)

@@ -1,8 +1,15 @@
-"""Find where a camera is: pairs of craters, without or with a rough knowledge of the position.
+"""Find where a camera is from pairs of craters, with no or only rough knowledge of its position.
 
-Two craters determine shift, heading and altitude of a level camera. Pairs of sightings are looked up among the
-catalogue's pairs by their ratios of size to separation (a 3-dimensional tree), each hit is a hypothesis, and the
-hypothesis is tested on all sightings. An accepted one must explain far more sightings than the best different one.
+Two craters determine position, heading and altitude of a level camera. Steps:
+
+1. `_in_reach` selects the craters that the camera may see from the area.
+2. `_Pairs.of` forms ordered pairs of sightings and of craters.
+3. `_placements` looks up each pair of sightings among the pairs of craters in a tree over their ratios of size to
+separation, their separation and their direction. Each hit gives a placement of the camera.
+4. `_agreed` counts the sightings that agree with a crater under each placement.
+5. `search` returns the best placements that differ, as hypotheses.
+
+The caller accepts a hypothesis only if it explains far more sightings than the second best.
 """
 
 from dataclasses import dataclass, replace
@@ -17,38 +24,38 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _N_PAIRED = 18
-"""Largest sightings that form pairs: larger craters are rarer."""
+"""Number of the largest sightings that form pairs: larger craters are rarer."""
 _N_FIRST, N_TESTED = 24, 60
-"""Largest sightings that test every hypothesis, and those that test the best."""
+"""Number of the largest sightings that test every placement, and of those that test the best placements."""
 _LEAST_SEPARATION = 0.1
 """Smallest separation of a pair, divided by the width of the image."""
 _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
-"""Standard deviation of the logarithm of a size; that of altitude and heading, in the limits of an area; the largest
-distance of two pairs that may be the same, in standard deviations."""
+"""Standard deviation of the logarithm of a size; number of standard deviations that the limits of an area cover in
+altitude and heading; largest distance, in standard deviations, between a pair of sightings and a pair of craters."""
 _TEST_PX, _TEST_SIZE = 4.0, 0.35
-"""A sighting agrees with a crater within this distance and difference of the logarithms of the sizes."""
+"""Largest distance, and largest difference of the logarithms of the sizes, at which a sighting agrees with a crater."""
 _MOST_PAIRED, _MOST_HITS, _MOST_TESTED, _MOST_RETURNED = 800, 150, 1000, 5
-"""Limits on the time: craters that form pairs, the largest first; hypotheses for a pair of sightings; hypotheses that
+"""Limits on the time: craters that form pairs, the largest first; placements for a pair of sightings; placements that
 are tested on more sightings; hypotheses that are returned."""
 
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Where the camera may be."""
+    """The area in which the camera may be."""
 
     centre_m: Array
-    """Middle of the search (2,), metres, O_L."""
+    """Centre of the search (2,), metres, O_L."""
     reach_m: float
-    """Largest distance of the camera from it, over ground."""
+    """Largest distance of the camera from the centre, over ground, metres."""
     altitude_m: tuple[float, float]
-    """Least and largest altitude above the ground."""
+    """Smallest and largest altitude above the ground, metres."""
     heading_rad: float
-    """Largest difference of the heading from that of the assumed attitude; pi if it is unknown."""
+    """Largest difference between the heading and the heading of the assumed attitude, radians; pi if it is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose, and how many sightings agree."""
+    """A pose, and how many sightings agree with it."""
 
     pose: Pose
     """The pose."""
@@ -59,9 +66,10 @@ class Hypothesis:
 def search(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, rotation_camera_from_site: Array, area: Area
 ) -> list[Hypothesis]:
-    """The best hypotheses, the best first, each at least 10 px of ground away from those before; may be empty.
+    """The best hypotheses, best first; may be empty.
 
-    `rotation_camera_from_site` is the assumed attitude: its tilt must be right to about a degree.
+    Each is at least 10 px on the ground away from all better ones. `rotation_camera_from_site` is the assumed attitude:
+    its tilt must be right to about a degree.
     """
     rays = camera.rays(sightings.centre_px) @ rotation_camera_from_site
     offset, size = rays[:, :2] / -rays[:, 2:], sightings.radius_px / camera.fx_px
@@ -96,7 +104,7 @@ def search(
 
 
 def _in_reach(catalogue: Catalogue, camera: Camera, radius_px: Array, area: Area) -> Catalogue:
-    """Craters that the camera may see, of the sizes of these sightings."""
+    """The craters that the camera may see, of the sizes that these sightings may have."""
     low, high = area.altitude_m
     view = np.hypot(camera.width_px, camera.height_px) / 2 / camera.fx_px * high
     near = np.linalg.norm(catalogue.centre_m[:, :2] - area.centre_m, axis=1) < area.reach_m + view
@@ -121,7 +129,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, place: Array, size: Array, least: float, most: float) -> "_Pairs":
-        """Pairs with a separation in limits."""
+        """All ordered pairs whose separation is between two limits."""
         index = KDTree(place).query_pairs(most, output_type="ndarray")
         index = np.concatenate([index, index[:, ::-1]])
         across = place[index[:, 1]] - place[index[:, 0]]
@@ -136,7 +144,8 @@ class _Pairs:
         return _Pairs(self.index[chosen], self.separation[chosen], self.sizes[chosen], self.direction[chosen])
 
     def places(self, log_range: float, heading_rad: float) -> Array:
-        """Places (n, 5) whose distance is that of two pairs in standard deviations; a range has `_SIGMAS` of them."""
+        """Points (n, 5) whose distance is the distance of two pairs in standard deviations; a range has `_SIGMAS` of
+        them."""
         on_circle = np.column_stack([np.cos(self.direction), np.sin(self.direction)])
         across = 2 * np.sin(min(heading_rad, np.pi) / 2)
         ranged = self.separation[:, None] * _SIGMAS / (log_range + 0.01)
@@ -177,7 +186,7 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     known = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
     if not len(known.index):
         return none
-    # In the middle of the range of altitudes, the separations differ by half of it at most.
+    # At the middle of the range of altitudes, separations differ by at most half of the range.
     middle = replace(seen, separation=seen.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
     tree = KDTree(known.places(log_range, area.heading_rad))
@@ -198,7 +207,7 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
 
 
 def _agreed(placements: _Placements, offset: Array, size: Array, local: Catalogue, camera: Camera) -> Array:
-    """Number of sightings (n,) that agree with a crater, by placement."""
+    """Number of sightings (n,) that agree with a crater under each placement."""
     scale = placements.altitude_m
     altitude = float(np.exp(np.log(scale).mean()))
     per_log = _TEST_PX / _TEST_SIZE * altitude / camera.fx_px

@@ -21,15 +21,15 @@ from perilune_train.landing.filter.state import (
 from perilune_train.landing.filter.update import passes_gate, updated
 
 _LEAST_WEIGHT = 0.1
-"""Matches with a smaller weight in a fix are not used."""
+"""Matches with a smaller weight in the fix are not used."""
 _ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
-"""Parts of the error state that displace every sighting."""
+"""Parts of the error state that displace all sightings."""
 
 
 def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
     """Whether a pose of the camera passes the gate.
 
-    `covariance` (6, 6): shift in O_L, metres, then turn from the left in O_C, radians.
+    `covariance` (6, 6) has the shift in O_L, metres, then the turn from the left in O_C, radians.
     """
     innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
     spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
@@ -37,7 +37,7 @@ def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_
 
 
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Shift and turn (6,) from the expected pose, and their derivative (6, 21)."""
+    """Shift and turn (6,) from the expected pose, and their derivative (6, 21) by the error state."""
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
     by_error = np.zeros((6, N_ERRORS))
@@ -55,12 +55,13 @@ def craters_update(
     camera: Camera,
     rotation_camera_from_body: Array,
 ) -> State:
-    """The state after the craters that a fix has matched, with their offsets as part of the state.
+    """Update by the craters that a fix has matched; their offsets over ground are parts of the state.
 
-    Craters that are in view but not matched stay in the state: a crater that is missed in one frame must not bring its
-    error of the catalogue as new information in the next.
-    The measurement is linear about the pose of the fix, which is nearer to the truth than the state (iterated filter,
-    Bell & Cathey 1993, doi 10.1109/9.250476).
+    Craters in view that are not matched stay in the state: if a crater is missed in one frame, its catalogue error must
+    not count as new information in the next.
+
+    The measurement is linearised about the pose of the fix, which is closer to the truth than the state (iterated
+    filter, Bell & Cathey 1993, doi 10.1109/9.250476).
     """
     used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
     sighting, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
@@ -73,7 +74,7 @@ def craters_update(
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
     from_fix = np.concatenate([state.position_m - fix.pose.position_m, turn])
-    # A crater that is shifted one way looks like a camera that is shifted the other way.
+    # Shifting a crater looks like shifting the camera the other way.
     by_offset = -by_pose[:, :, :2]
     pattern = common_pattern(camera.rays(seen.centre_px)[:, :2])
     predicted = (
@@ -85,8 +86,8 @@ def craters_update(
     by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
     innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
-    # Errors of heights in the catalogue shift craters in the image, away from its middle. As parts of the state they
-    # gave the same errors and normalised errors, for a state that is half as large again.
+    # Height errors of the catalogue shift craters in the image, away from its centre. They are added as noise: as parts
+    # of the state they gave equal errors and normalised errors, for a state half as large again.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
     noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
@@ -96,10 +97,11 @@ def craters_update(
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
-    """Covariance of N sightings with the error state (2 N, M) and with one another (2 N, 2 N), without their noise.
+    """Covariance of N sightings with the error state (2 N, M) and with each other (2 N, 2 N), without measurement
+    noise.
 
-    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are their derivatives by the errors `_ALL_SEE` and by the offsets of
-    their craters, whose places in the state are `crater` (N,). The other derivatives are zero.
+    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are the derivatives of the sightings by the errors `_ALL_SEE` and by
+    the offsets of their craters, which are the craters `crater` (N,) of the state. All other derivatives are zero.
     """
     by_error = by_error.reshape(-1, len(_ALL_SEE))
     crossed = by_error @ state.covariance[_ALL_SEE]
@@ -112,7 +114,8 @@ def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offs
 
 @compiled
 def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDArray[np.int64]) -> None:
-    """Add what the offsets of the craters, from rows `first` on, give to the covariance `crossed` of `_crossed`."""
+    """Add the contribution of the craters' offsets to `crossed` of `_crossed`; they begin at rows `first` of the
+    state."""
     for k in range(len(first)):
         east = first[k]
         for axis in range(2):
@@ -123,7 +126,8 @@ def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDA
 
 @compiled
 def _add_own(spread: Array, by_offset: Array, crossed: Array, first: NDArray[np.int64]) -> None:
-    """Add what the offsets of the craters, from rows `first` on, give to the covariance `spread` of `_crossed`."""
+    """Add the contribution of the craters' offsets to `spread` of `_crossed`; they begin at rows `first` of the
+    state."""
     for row in range(len(crossed)):
         for k in range(len(first)):
             east = first[k]

@@ -33,7 +33,7 @@ N_ERRORS = 21
 """Parts of the error state without craters and kept poses."""
 
 _COMMON_SIGMAS_PX = np.array([0.08, 0.08, 0.15, 0.2, 0.2])
-"""Deviations of what sightings share, from the validation scenes of `shipped-nav`."""
+"""Standard deviations of the shared image error, pixels, measured on the validation scenes of `shipped-nav`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class State:
         )  # fmt: skip
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """The state with an estimated error (21 + 2 n + 6 m,) removed, and its new covariance, which is symmetric."""
+        """Remove an estimated error (21 + 2 n + 6 m,) from the state; `covariance` is the new, symmetric covariance."""
         end = N_ERRORS + 2 * len(self.craters)
         past = error[end:].reshape(-1, 6)
         return State(
@@ -103,7 +103,7 @@ class State:
         )
 
     def keeping_pose(self) -> "State":
-        """The state with its present pose added to those of earlier frames."""
+        """The state with its present pose added to the kept poses."""
         pose = [*range(3), *range(6, 9)]
         wider = np.concatenate([np.eye(len(self.covariance)), np.eye(len(self.covariance))[pose]])
         return replace(
@@ -116,7 +116,8 @@ class State:
         )
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
-        """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
+        """The state with the offsets of `craters` (n,) alone; `sigma_m` (n,) are the standard deviations of new
+        ones."""
         row_of = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
         row_of[self.craters] = np.arange(len(self.craters))
         before = row_of[craters]
@@ -133,21 +134,21 @@ class State:
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
-        """Shift and turn (6,) from the kept pose of an earlier frame to a true one, and their covariance (6, 6)."""
+        """Shift and turn (6,) from the kept pose of an earlier frame to the true pose, and their covariance (6, 6)."""
         turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
         start = N_ERRORS + 2 * len(self.craters) + 6 * number
         parts = slice(start, start + 6)
         return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[parts, parts]
 
     def pose_error(self, position_m: Array, rotation_site_from_body: Array) -> Array:
-        """Shift and turn (6,) from the estimate to a true pose."""
+        """Shift and turn (6,) from the estimated to the true pose."""
         turn = rotation_vectors(self.rotation_site_from_body.T @ rotation_site_from_body)
         return np.concatenate([position_m - self.position_m, turn])
 
 
 @compiled
 def _rearranged(covariance: Array, source: NDArray[np.int64]) -> Array:
-    """The covariance (n, n) of n parts, from their places in another one; those with the place -1 are zero."""
+    """A covariance (n, n) whose part i is part `source[i]` of another covariance; parts with -1 are zero."""
     rearranged = np.zeros((len(source), len(source)))
     for i in range(len(source)):
         if source[i] < 0:
@@ -160,16 +161,16 @@ def _rearranged(covariance: Array, source: NDArray[np.int64]) -> Array:
 
 _CROSS = np.zeros((3, 9))
 _CROSS[[0, 0, 1, 1, 2, 2], [5, 7, 2, 6, 1, 3]] = -1, 1, 1, -1, -1, 1
-"""Parts of the matrix of a cross product, row by row, of each axis."""
+"""The matrix of the cross product with each axis, row by row."""
 
 
 def cross_matrices(vectors: Array) -> Array:
-    """Matrices (..., 3, 3) whose products with u are the cross products v x u, of vectors v (..., 3)."""
+    """Matrices (..., 3, 3) whose products with u are the cross products v x u, for vectors v (..., 3)."""
     return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
 def rotation_matrices(turns_rad: Array) -> Array:
-    """Matrices (..., 3, 3) of rotation vectors (..., 3): `matrix_from_rotation_vector` of many."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians: `matrix_from_rotation_vector` for many."""
     angle = np.sqrt((turns_rad**2).sum(axis=-1))[..., None]
     cross = cross_matrices(turns_rad / np.where(angle > 0, angle, 1.0))
     angle = angle[..., None]
@@ -177,10 +178,10 @@ def rotation_matrices(turns_rad: Array) -> Array:
 
 
 def common_pattern(ray: Array) -> Array:
-    """Displacements (n, 2, 5) in the image by what sightings share, at rays (n, 2) on the plane at depth 1.
+    """Derivatives (n, 2, 5) of the image error that all sightings share, at rays (n, 2) on the plane at depth 1.
 
-    A shift, a scale and two parts that grow with the square of the distance from the middle: a pose that is off in
-    position, altitude and tilt displaces craters likewise, and no frame can tell one from the other.
+    A shift, a scale and two terms that grow with the square of the distance from the image centre. Errors of position,
+    altitude and tilt displace craters in the same way, so a single frame cannot tell them apart.
     """
     x, y = ray.T
     zero, ones = np.zeros_like(x), np.ones_like(x)

@@ -1,12 +1,18 @@
 """Flights between two frames: inertial measurements and ranges.
 
-They change and measure 16 parts of the error state alone: the first 15 and the height of the ground (the core). What
-they tell about the others - craters, earlier poses - is a linear function of the errors of the core at the start of the
-stretch. It is gathered and applied once, at the end (compressed filter, Guivant & Nebot 2001, doi 10.1109/70.938382):
-the result is that of the whole filter, and a range costs as much as if there were no craters. Only corrections of
-earlier attitudes differ, by products of two of them: they are added up, and not applied one after the other.
+Inertial measurements and ranges change and measure only 16 parts of the error state: the first 15 and the height of the
+ground (the core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
+errors at the start of the stretch. So the other parts wait (compressed filter, Guivant & Nebot 2001, doi
+10.1109/70.938382):
 
-All flights of a stretch have measurements at the same times. Every operation is done on all of them at once.
+1. `inertial`, `coast` and `range` change the core, its covariance and its derivative by the core at the start.
+2. `range` also keeps its derivative by the core at the start, and its innovation.
+3. `states` applies all kept ranges to the other parts at once.
+
+The result equals that of the whole filter, and a range costs as much as if there were no craters. Only the attitudes of
+earlier frames differ, by products of two corrections: corrections are added up, not applied one after the other.
+
+All flights of a stretch have measurements at the same times, and every operation acts on all of them at once.
 """
 
 from collections.abc import Sequence
@@ -31,14 +37,14 @@ from perilune_train.landing.filter.update import gate
 
 _INERTIAL = FORCE_BIAS.stop
 _HEIGHT = _INERTIAL
-"""Place of the ground's height in the core."""
+"""Index of the ground's height in the core."""
 CORE = np.r_[0:_INERTIAL, GROUND]
-"""Places of the core in the error state."""
+"""Indices of the core in the error state."""
 _GROUND_S = 10.0
-"""Time in which the ground below a lander becomes another, at 10 to 30 m/s over ground."""
+"""Correlation time of the height of the ground below a lander, seconds, at 10 to 30 m/s over ground."""
 _GAP_S = 0.05
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
-"""Standard deviations of the motion while inertial measurements are missing."""
+"""Standard deviations of acceleration and angular rate while inertial measurements are missing."""
 
 
 class Stretch:

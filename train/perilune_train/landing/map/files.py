@@ -1,4 +1,4 @@
-"""Files of a map: one catalogue per scene, and what is stated about them."""
+"""Files of a map: one catalogue per scene, and their stated errors."""
 
 import json
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class SceneMap:
     errors: pd.DataFrame
     """Errors by diameter."""
     picture: NDArray[np.uint8]
-    """Part of the first image with what is mapped."""
+    """Part of the first image with the mapped craters."""
 
 
 def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
@@ -55,8 +55,8 @@ def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
 def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
     """Read the catalogues that `write_maps` wrote, by scene_id.
 
-    Scenes that only one of both has are left out. Raises UserError if map.json or a catalogue is damaged, if both have
-    no scene in common, or if a scene of the dataset has other ground than that of the map.
+    Scenes that only the map or only the dataset has are left out. Raises UserError if map.json or a catalogue is
+    damaged, if map and dataset have no scene in common, or if the ground of a scene differs between them.
     """
     path, expected = folder / SETTINGS, "the folder of a map, from `perilune-train navigate map`"
     try:
@@ -83,7 +83,7 @@ def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
 
 
 def _sigmas(record: dict[str, float]) -> tuple[float, float]:
-    """Stated deviations of position and diameter. Raises ValueError if they are none."""
+    """Stated standard deviations of position and diameter. Raises ValueError if they are not finite and at least 0."""
     values = float(record["position_sigma_m"]), float(record["diameter_sigma_share"])
     if not all(0 <= value < 1e3 for value in values):
         raise ValueError(f"deviations {values}, expected 0 to 1000")

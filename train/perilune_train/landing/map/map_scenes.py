@@ -36,9 +36,10 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, ERRORS = "map.md", "errors.parquet"
 TILING = Tiling(scales=(1.0, 0.5, 0.25, 0.125))
-"""Large craters are found in reduced images; the network knows craters of 2 to 50 px."""
+"""Reduced images show large craters: the network knows craters of 2 to 50 px."""
 _DIAMETER_SIGMA_SHARE = 0.12
-"""Standard deviation of a mapped diameter, divided by it: validation scenes of `shipped-nav`, craters of 3 to 20 m."""
+"""Standard deviation of a mapped diameter, divided by it, on validation scenes of `shipped-nav` with craters of 3 to 20
+m."""
 _LEAST_SIGMA_M = 0.05
 _WINDOW_PX = 1000
 _BOTH, _ONE = (227, 211, 25), (60, 60, 230)
@@ -50,8 +51,8 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
     """Make the catalogue of every scene of a survey; returns their errors by diameter.
 
     Writes <scene_id>.parquet for each scene, map.json (stated errors, Sun), errors.parquet, map.md and a picture to the
-    new folder `out`, or nothing. Raises UserError if a scene has not two frames, or if the detector was fitted to the
-    terrain, unless `allow_overlap`.
+    new folder `out`, or nothing. Raises UserError if a scene does not have two frames, or if the detector was fitted to
+    the terrain, unless `allow_overlap`.
     """
     dataset = open_single(address)
     frames = dataset.table("frames").to_pandas().sort_values("frame_id")
@@ -120,7 +121,7 @@ def _scene_map(
 
 
 def _picture(image: NDArray[np.uint8], view: View, both: Matched) -> NDArray[np.uint8]:
-    """The middle of an image with craters found in both images (cyan) and in this one alone (red)."""
+    """The centre of an image with craters detected in both images (cyan) and in this image alone (red)."""
     first = max((image.shape[0] - _WINDOW_PX) // 2, 0)
     canvas = cv2.cvtColor(image[first : first + _WINDOW_PX, first : first + _WINDOW_PX], cv2.COLOR_GRAY2BGR)
     in_both = np.zeros(len(view.sightings), bool)

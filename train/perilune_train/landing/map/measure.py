@@ -10,16 +10,18 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.catalogue import Catalogue
 
 DIAMETERS_M = (3.0, 5.0, 7.0, 10.0, 20.0, 40.0, 100.0, np.inf)
-"""Limits of the bins."""
+"""Limits of the bins of diameter, metres."""
 _CANDIDATES = 12
 _MOST_APART = 0.8
-"""Largest distance of a mapped crater and the true one, in radii, plus twice the difference of their logarithms."""
+"""Largest distance between a mapped and a true crater, in radii, plus twice the difference of the logarithms of the
+radii."""
 
 
 def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFrame:
-    """One row per bin of the diameter: number, share of true craters, share found, errors.
+    """One row per bin of the diameter: number, share of true craters, share of craters that are mapped, errors.
 
-    `covered_m` is the largest |x| and |y| (2,) of the ground that both images show; craters beyond it are not missed.
+    `covered_m` (2,) is the largest |x| and |y| of the ground that both images show; craters beyond it do not count as
+    missed.
     """
     truth = KDTree(exact.centre_m[:, :2])
     distance_m, index = truth.query(mapped.centre_m[:, :2], min(_CANDIDATES, len(exact)))

@@ -1,4 +1,4 @@
-"""Craters in space, from the craters that a detector finds in two images of known poses."""
+"""Craters in space, from detections in two images of known poses."""
 
 from dataclasses import dataclass, field
 
@@ -13,21 +13,21 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _CLASSES_PX = (30.0, 12.0, 5.0, 0.0)
-"""Smallest radii of the classes, largest first. The heights of one class narrow the search for the next."""
+"""Smallest radii of the classes, pixels, largest first. The heights of one class narrow the search for the next."""
 _RELIEF_M = 30.0
-"""Standard deviation of heights before any crater is matched, metres."""
+"""Standard deviation of heights, metres, before any crater is matched."""
 _LEAST_RELIEF_M = 1.0
 _SIZE_SIGMA = 0.15
 """Standard deviation of the logarithm of the ratio of two radii of one crater."""
 _GATE = 3.0
 """Largest difference of a match, in standard deviations, on each axis."""
 _NEIGHBOURS = 16
-"""Number of matched craters whose heights give that of the ground in between."""
+"""Number of matched craters whose heights give the height of the ground between them."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image of known pose, with what a detector found in it."""
+    """One image of known pose, with its detections."""
 
     camera: Camera
     """Intrinsics, without distortion."""
@@ -43,7 +43,7 @@ class View:
         return np.asarray(towards / -towards[:, 2:])
 
     def place_m(self, height_m: Array) -> Array:
-        """Points (M, 2), O_L, of the rays at given heights (M,)."""
+        """Points (M, 2), O_L, at which the rays have given heights (M,)."""
         return np.asarray(self.pose.position_m[:2] + self.rays[:, :2] * (self.pose.position_m[2] - height_m)[:, None])
 
     def radius_m(self, height_m: Array) -> Array:
@@ -66,10 +66,10 @@ class Ground:
     height_m: Array = field(default_factory=lambda: np.zeros(0))
     """Heights (N,)."""
     sigma_m: float = _RELIEF_M
-    """Standard deviation of a crater's height from `at`."""
+    """Standard deviation of a crater's height from the height of `at`, metres."""
 
     def at(self, place_m: Array, without_nearest: bool = False) -> Array:
-        """Heights (M,) of points (M, 2): the median of the nearest craters; 0 while there are few."""
+        """Heights (M,) of points (M, 2): the median of the nearest craters; 0 while there are too few."""
         if len(self.height_m) <= _NEIGHBOURS:
             return np.full(len(place_m), np.median(self.height_m) if len(self.height_m) else 0.0)
         _, near = KDTree(self.place_m).query(place_m, _NEIGHBOURS + without_nearest)
@@ -78,18 +78,18 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """N craters that are seen in both images."""
+    """N craters seen in both images."""
 
     first: NDArray[np.intp]
-    """Places (N,) in the sightings of the first view."""
+    """Indices (N,) among the sightings of the first view."""
     second: NDArray[np.intp]
-    """Places (N,) in those of the second view."""
+    """Indices (N,) among the sightings of the second view."""
     centre_m: Array
     """Centres (N, 3), O_L."""
     radius_m: Array
     """Radii (N,)."""
     apart_m: Array
-    """What is left between the two rays at that height (N, 2), metres, O_L."""
+    """Horizontal distance (N, 2) between both rays at that height, metres, O_L."""
     score: Array
     """The lower of both scores (N,)."""
 
@@ -97,8 +97,8 @@ class Matched:
 def matched(first: View, second: View) -> Matched:
     """Match the craters of two views and intersect their rays, from the largest craters to the smallest.
 
-    Heights of single small craters are far less accurate than those of the ground around them, so a crater gets the
-    median height of its neighbours.
+    The height of a single small crater is far less accurate than the height of the ground around it, so a crater gets
+    the median height of its neighbours.
     """
     ground, pairs = Ground(), np.zeros((0, 2), np.intp)
     for number, least_px in enumerate(_CLASSES_PX):
@@ -137,14 +137,14 @@ def matched(first: View, second: View) -> Matched:
 
 
 def _spread(values: Array, chosen: NDArray[np.intp], view: View) -> Array:
-    """Values of some sightings as an array for all of them; 0 elsewhere."""
+    """The values of some sightings as an array for all sightings; 0 elsewhere."""
     every = np.zeros(len(view.sightings))
     every[chosen] = values
     return every
 
 
 def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Ground) -> NDArray[np.intp]:
-    """Pairs (N, 2) of sightings that are each other's nearest, on the ground and in size."""
+    """Pairs (N, 2) of sightings that are nearest to each other in position on the ground and in size."""
     if not len(parts[0]) or not len(parts[1]):
         return np.zeros((0, 2), np.intp)
     baseline = second.pose.position_m - first.pose.position_m
@@ -172,10 +172,10 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
 
 
 def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
-    """The ground of matched craters: heights at which their rays pass nearest to each other."""
+    """The ground of matched craters, from the heights at which their rays come closest to each other."""
     start = [view.pose.position_m for view in (first, second)]
     rays = [view.rays[chosen] for view, chosen in zip((first, second), pairs.T, strict=True)]
-    # Along both rays z falls alike, so their distance at a height is linear in it.
+    # Both rays have z = -1, so their distance is a linear function of the height.
     apart = start[1][:2] + rays[1][:, :2] * start[1][2] - start[0][:2] - rays[0][:, :2] * start[0][2]
     by_height = rays[0][:, :2] - rays[1][:, :2]
     height = -(apart * by_height).sum(axis=1) / np.square(by_height).sum(axis=1)

@@ -30,9 +30,9 @@ class Catalogues:
     exact: Mapping[str, Catalogue]
     """Without errors."""
     rough: Mapping[str, Catalogue]
-    """With the stated errors of one made from orbit."""
+    """With the errors that a catalogue made from orbit has."""
     mapped: Mapping[str, Catalogue]
-    """Made by our own detector from images of an orbiter; may be empty."""
+    """Made by the project's own detector from images of an orbiter; may be empty."""
 
 
 def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, Catalogue]) -> Catalogues:

@@ -31,11 +31,11 @@ POSITION = "position_rmse_m"
 def score_landing(
     detector: Path, data: Address, manifests: Address, out: Path, maps: Path | None = None, allow_overlap: bool = False
 ) -> Metrics:
-    """Score fixes, lost in space and the filter with a detector, and return the figures.
+    """Score fixes, lost-in-space fixes and the filter with a detector; returns the figures.
 
-    `maps` has one folder of `navigate map` for each part, by its name; parts without one have no rows of the map.
-    Writes page, figures, the table of all frames and a picture to the new folder `out`, or nothing.
-    Raises UserError if the benchmark is missing or changed, or if the detector was fitted to its terrain, unless
+    `maps` has one folder of `navigate map` for each part, named after it; a part without a folder gets no rows for the
+    map. Writes page, figures, the table of all frames and a picture to the new folder `out`, or nothing. Raises
+    UserError if the benchmark is missing or changed, or if the detector was fitted to its terrain, unless
     `allow_overlap`.
     """
     parts = open_parts("nav", data, manifests)
@@ -79,14 +79,14 @@ def score_landing(
 
 
 def _mapped(part: Part, maps: Path | None) -> Mapping:
-    """The catalogues of a part by our own detector; none if there is no map of it."""
+    """The catalogues that were mapped for a part; empty if there is no map of it."""
     if maps is None or not (maps / part.name).is_dir():
         return {}
     return read_maps(maps / part.name, part.dataset)
 
 
 def _spread(method: str, errors: pd.DataFrame) -> Spread:
-    """Spread of the RMSE of position between scenes; of fixes those that are right."""
+    """Spread of the RMSE of position over scenes; for fixes, over the right ones only."""
     used = errors[errors["error_px"] < WRONG_PX] if method.startswith(("fix", "lost")) else errors
     used = used.dropna(subset=["error_m"])
     rows, squares = np.arange(len(used)), np.square(used["error_m"].to_numpy())

@@ -1,4 +1,4 @@
-"""Poses of single frames from craters: near a prior that is off, and lost in space."""
+"""Poses of single frames from craters: with an inaccurate prior, and lost in space."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -16,15 +16,15 @@ from perilune_train.landing.craters.search import Area
 from perilune_train.landing.methods.seen import SeenDescent
 
 PRIOR_M, PRIOR_DEG = 100.0, 1.0
-"""Standard deviations of the prior on each axis."""
+"""Standard deviations of the prior on each axis, metres and degrees."""
 WRONG_PX = 5.0
-"""A fix that is off by more pixels on the ground is wrong."""
+"""Fixes with a larger error, in pixels on the ground, are wrong."""
 LOST_ABOVE_M, LOST_ALTITUDE_SHARE = 800.0, 0.1
-"""Lost in space: least altitude, and by how much the altitude may be off."""
+"""Lost in space: smallest altitude, metres, and largest relative error of the known altitude."""
 
 
 def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames; their priors are off by 100 m and 1 degree (standard deviations) per axis."""
+    """Errors of the fixes of all frames; priors have errors of 100 m and 1 degree (standard deviations) per axis."""
     rng, sigma = np.random.default_rng(seed), np.repeat([PRIOR_M, np.radians(PRIOR_DEG)], 3)
     rows = []
     for descent in _followed("fixes", descents):
@@ -37,7 +37,7 @@ def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Cat
 
 
 def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames above 800 m, from no more than the altitude within 10 % and a level camera.
+    """Errors of the fixes of all frames above 800 m, if only a level camera and the altitude within 10 % are known.
 
     Position over the whole catalogue and heading are unknown.
     """
@@ -101,7 +101,7 @@ def step_to(pose: Pose, true: Pose) -> Array:
 
 
 def fix_summary(fixes: pd.DataFrame) -> dict[str, float]:
-    """Figures of a method: errors over the right fixes, shares of frames without fix and with a wrong one."""
+    """Figures of a method: errors of the right fixes, and shares of frames without a fix and with a wrong fix."""
     right = fixes[fixes["error_px"] < WRONG_PX]
     return {
         "n_frames": float(len(fixes)),

@@ -1,4 +1,4 @@
-"""The filter over descents: errors at every frame with their stated sizes."""
+"""The filter over descents: errors at every frame with their stated standard deviations."""
 
 import time
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
 from perilune_train.landing.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
-"""Standard deviations of position and velocity at the start, on each axis."""
+"""Standard deviations of position, metres, and velocity, metres per second, at the start, on each axis."""
 BAND = (1.24, 14.45)
-"""Where a sum of six squares lies in 95 % of cases."""
+"""Interval that holds the sum of six squared standard normal numbers in 95 % of cases."""
 
 
 def flights(
@@ -35,7 +35,7 @@ def flights(
 ) -> pd.DataFrame:
     """Errors of the filter, or of the smoother, at every frame of all descents.
 
-    The starts are off, drawn by the place of the descent.
+    The errors of the starts are random; the number of the descent is their seed.
     """
     tables = []
     rotation_camera_from_body, sigmas = mounting_of(dataset), default_sigmas(grade, attitude_deg)
@@ -70,12 +70,12 @@ def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a lander believes of itself at the first frame, and how wrong it is."""
+    """What the filter assumes at the first frame, and its true error."""
 
     grade: InertialGrade
     """Grade of the inertial unit."""
     sigmas: Array
-    """Standard deviations (15,) that the filter starts with, see `start_sigmas`."""
+    """Standard deviations (15,) with which the filter starts, see `start_sigmas`."""
     error: Array
     """Difference (9,) from the true state: position, m, velocity, m/s, both O_L, and attitude, rad, O_B."""
 
@@ -139,7 +139,7 @@ def _true(descent: SeenDescent, frame: int, rotation_camera_from_body: Array) ->
 
 
 def _row(altitude_m: float, status: object, error: Array, covariance: Array) -> dict[str, object]:
-    """One frame, from the step (6,) to the true pose and its covariance (6, 6)."""
+    """One row, from the step (6,) to the true pose and its covariance (6, 6)."""
     return {
         "altitude_m": altitude_m,
         "status": status,
@@ -156,7 +156,7 @@ def _axes(name: str, values: Array) -> dict[str, float]:
 
 
 def flight_summary(flown: pd.DataFrame) -> dict[str, float]:
-    """Figures of the filter over all frames of all descents, none left out."""
+    """Figures of the filter over all frames of all descents."""
     ends = flown.groupby(["scene_id", "trajectory_id"])["error_m"].last()
     inside = flown["squared"].between(*BAND)
     return {

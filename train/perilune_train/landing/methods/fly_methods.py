@@ -47,7 +47,7 @@ def fly_methods(
     frames.
     """
     address, split = evaluated.dataset, evaluated.split
-    # Record the commit at the start: the checkout may change meanwhile.
+    # Record the commit at the start: the checkout may change during the run.
     run_record()
     dataset = open_single(address)
     best = {name: RunFolder(run).best for name, run in (("navigator", navigator), ("detector", detector))}

@@ -1,4 +1,4 @@
-"""The page of all methods: what each knows, its errors, and pictures."""
+"""The page of all methods: what each method knows, its errors, and pictures."""
 
 import math
 from collections.abc import Sequence

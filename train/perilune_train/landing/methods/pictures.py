@@ -68,7 +68,7 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
 def draw_matches(
     path: Path, image: NDArray[np.uint8], descent: SeenDescent, frame: int, catalogue: Catalogue, located: Located
 ) -> None:
-    """Draw a frame, its detections, matched (cyan) and not (red), and the catalogue's craters at the pose (yellow)."""
+    """Draw a frame: matched (cyan) and unmatched (red) detections, and the catalogue's craters at the pose (yellow)."""
     figure = Figure(figsize=(9, 9.4), layout="constrained")
     axis = figure.subplots()
     enlarged = cv2.resize(image, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)

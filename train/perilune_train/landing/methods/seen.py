@@ -1,4 +1,4 @@
-"""Descents with the craters that a detector finds in every frame."""
+"""Descents with the craters that a detector detects in every frame."""
 
 import time
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class SeenDescent:
 
 
 def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
-    """Descents with the craters that the detector of a run finds, and its seconds per frame."""
+    """Descents with the craters that the detector of a run detects, and its seconds per frame."""
     detector, threshold = open_detector(RunFolder(run).best, config_of_run(run)), chosen_threshold(run)
     descents, seconds = [], 0.0
     n_frames = sum(len(trajectory.images) for trajectory in trajectories)

@@ -1,4 +1,4 @@
-"""What one draw changes: the start, the catalogue, the inertial errors, and what goes wrong."""
+"""One draw of a descent: errors of the start and of the inertial unit, and the fault of the scenario."""
 
 from dataclasses import dataclass, replace
 
@@ -33,9 +33,9 @@ def drawn(
     scenario: Scenario,
     rng: np.random.Generator,
 ) -> Draw:
-    """A draw of a descent.
+    """Draw a descent.
 
-    `reference` has inertial measurements whose own errors are small beside those of `grade`; they are taken as the true
+    `reference` has inertial measurements whose errors are small compared with those of `grade`; they count as the true
     motion. Ranges are as recorded. `sigmas` are the stated errors of the start, position, velocity and attitude first.
     """
     start_error = sigmas[:9] * rng.normal(size=9)
@@ -71,7 +71,7 @@ def _none() -> Sightings:
 
 
 def _with_false(seen: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
-    """As many false sightings as there are, of the same sizes and scores, anywhere in the image."""
+    """Add a false sighting for each sighting, of the same sizes and scores, anywhere in the image."""
     places = rng.permutation(len(seen))
     centre = np.concatenate([seen.centre_px, rng.uniform(0, size_px, (len(seen), 2))])
     radius = np.concatenate([seen.radius_px, seen.radius_px[places]])

@@ -43,8 +43,8 @@ from perilune_train.training.runs import RunFolder, load_weights
 PAGE, TABLE = "monte_carlo.md", "draws.parquet"
 PICTURES = ("errors.png", "consistency.png")
 REFERENCE: InertialGrade = "navigation"
-"""Inertial measurements that are taken as the true motion: the errors of this grade are smaller than those of
-`GRADE` by factors of 6 (noise of the specific force) to 1000."""
+"""Grade of the inertial measurements that count as the true motion: its errors are smaller than those of `GRADE` by
+factors of 6 (noise of the specific force) to 1000."""
 GRADE: InertialGrade = "tactical"
 _TOGETHER = 20
 """Number of draws of a descent that are flown together."""
@@ -53,7 +53,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """One descent and what its draws start from."""
+    """One descent and the inputs of its draws."""
 
     descent: SeenDescent
     """The descent with recorded detections."""
@@ -76,7 +76,7 @@ class Job:
     scenario: Scenario
     """What goes wrong."""
     seed: int
-    """Of all draws."""
+    """Random seed of all draws."""
 
 
 def fly_draws(
@@ -124,7 +124,7 @@ def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> 
 
 
 def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Instruments:
-    """Measurements that are taken as the true motion."""
+    """Measurements that count as the true motion."""
     instruments = Instruments.of_trajectory(dataset, ids, REFERENCE)
     if not len(instruments.inertial):
         expected = f"measurements of the grade {REFERENCE} (see the setting dataset.nav.instruments.inertial_grades)"
@@ -133,9 +133,10 @@ def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Inst
 
 
 def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFrame]:
-    """Draws of one descent, flown together.
+    """Fly draws of one descent together.
 
-    Each depends on the seed, the place of the descent and the number of the draw, and on the others by rounding alone.
+    Each draw depends on the seed, the number of the descent and the number of the draw; other draws change it by
+    rounding only.
     """
     site, sigmas = job.sites[number], job.sigmas
     landers, drawn_descents = [], []
@@ -164,7 +165,7 @@ def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFram
 
 
 def all_draws(job: Job, draws: int, workers: int) -> list[pd.DataFrame]:
-    """Tables of all flights, in any order; in this process if there is one worker."""
+    """Tables of all flights, in any order; computed in this process if there is one worker."""
     batches = [
         (number, range(first, min(first + _TOGETHER, draws)))
         for first in range(0, draws, _TOGETHER)
@@ -184,7 +185,7 @@ def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator
     if workers == 1:
         yield from (flown_draws(job, *batch) for batch in batches)
         return
-    # spawn: torch's threads do not survive a fork.
+    # spawn: the threads of torch do not survive a fork.
     with _one_thread(), ProcessPoolExecutor(workers, get_context("spawn"), _begin, (job,)) as pool:
         remaining = iter(batches)
         running = {pool.submit(_of_job, *batch) for batch in islice(remaining, 2 * workers)}
@@ -199,7 +200,8 @@ def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Processes that start inside have one thread for linear algebra: those of several workers slow each other down."""
+    """Give processes that start inside one thread for linear algebra: threads of several workers slow each other
+    down."""
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:

@@ -15,7 +15,7 @@ from perilune_train.records.markdown import number, table
 from perilune_train.records.pictures import save_figure
 
 WRONG_SQUARED = 60.0
-"""Normalised error squared of six parts that a right covariance exceeds in 5e-11 of all cases."""
+"""Normalised error squared of six numbers that a right covariance exceeds in 5e-11 of all cases."""
 _COLUMNS = {
     "position_rmse_m": "position RMSE (m)",
     "position_end_rmse_m": "at the end (m)",
@@ -37,7 +37,7 @@ _QUANTILES = (0.5, 0.95, 1.0)
 
 
 def run_summary(rows: pd.DataFrame) -> dict[str, float]:
-    """Figures over all frames of all draws, none left out. Columns as of draws.parquet."""
+    """Figures over all frames of all draws, from the columns of draws.parquet."""
     flight = rows[["trajectory_id", "draw"]].astype(str).agg("/".join, axis=1)
     flights = rows.assign(seconds=np.nan, flight=flight)
     figures = flight_summary(flights.assign(trajectory_id=flights["flight"]))
