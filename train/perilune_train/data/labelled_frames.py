@@ -40,7 +40,7 @@ class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
     """
 
     def __init__(self, dataset: Dataset, split: str = "train", selection: str = "visible"):
-        """Read frames and labels of a split; `selection` (all, paper, visible) says which labels.
+        """Read frames and labels of a split; `selection` (all, paper, visible) chooses the labels.
 
         Raises UserError on another name, on a split without frames, on several cameras, and on frames that do not fit
         into memory.

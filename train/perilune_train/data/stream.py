@@ -5,7 +5,7 @@ Use:
     stream = FrameStream(open_single("packed"), "train", batch_size=8, seed=0)
     for epoch in range(10):
         stream.set_epoch(epoch)
-        for batch in stream_loader(stream, workers=2):
+        for batch in StreamLoader(stream, workers=2):
             ...  # a list of StreamedFrame, or what `stream.make` returns
             state = stream.state_dict()  # load_state_dict(state) continues after this batch
 
@@ -39,10 +39,10 @@ from perilune_train.data.shares import ALONE, Share
 
 _GROUPS_PER_WINDOW = 8
 _MAX_OPEN_SHARDS = 16
-"""Open shards of a worker. Of those in an object store the footers are kept."""
+"""Largest number of open shards of a worker. For shards in an object store, footers are kept."""
 _NESTED = ("image", "labels")
 COLUMNS = tuple(name for name in SHARDS.names if name not in _NESTED)
-"""Columns of the table frames, by default all are read."""
+"""Columns of the table frames; all are read by default."""
 _STATE = ("batch_size", "seed", "processes", "workers", "frames")
 
 
@@ -99,7 +99,7 @@ class FrameStream(torch_data.IterableDataset):
     """Batches of the frames of a split that belong to one of several processes; see the module.
 
     All processes have the same number of batches, `len(stream)`, of `batch_size` frames each. The last batch of an
-    epoch has what is left: at least one frame, at most batch_size + 1.
+    epoch has the remaining frames: at least one, at most batch_size + 1.
     """
 
     def __init__(
@@ -136,18 +136,18 @@ class FrameStream(torch_data.IterableDataset):
         return -(-(self.n_frames // self.share.processes) // self.batch_size)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch of the next iteration. If it is another one, iteration starts at its first batch."""
+        """Choose the epoch of the next iteration. A new epoch starts at its first batch."""
         if epoch != self.epoch:
             self.epoch, self.batches = epoch, 0
 
     def state_dict(self) -> dict[str, int]:
-        """Return the position of the stream and what the order of frames depends on."""
+        """Return the position in the stream, and the settings that determine the order of frames."""
         return {"epoch": self.epoch, "batches": self.batches, **self._settings()}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continue at a position. Raises UserError if the order of frames would be another one."""
+        """Continue at a position. Raises UserError if a setting that determines the order of frames differs."""
         for name, value in self._settings().items():
-            # Before the first iteration, the number of workers is not known.
+            # The number of workers is unknown before the first iteration.
             if state[name] != value and not (name == "workers" and 0 in (value, state[name])):
                 raise UserError("state of the stream", name, value, f"{state[name]}, as when the state was saved")
         self.epoch, self.batches = state["epoch"], state["batches"]
@@ -159,7 +159,7 @@ class FrameStream(torch_data.IterableDataset):
     def __iter__(self) -> Iterator[Any]:
         """Yield the batches of this worker, or all of the process, from batch `batches` of the epoch on.
 
-        In a worker an error of the user is yielded instead of raised: torch would lose its type (`stream_loader`).
+        In a worker a UserError is yielded instead of raised, because torch would lose its type (`StreamLoader`).
         """
         worker = torch_data.get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker is not None else (0, 1)
@@ -187,7 +187,7 @@ class FrameStream(torch_data.IterableDataset):
             yield self.make([next(frames) for _ in range(sizes[batch])], self.epoch)
 
     def _frames(self, start: int, stop: int, n_done: int) -> Iterator[StreamedFrame]:
-        """Yield the frames at the places [start, stop) of the epoch's order of row groups, after the first `n_done`."""
+        """Yield the frames at positions [start, stop) of the epoch's order of row groups, after the first `n_done`."""
         opened: dict[str, Part] = {}
         with ThreadPoolExecutor(1) as reader:
             pending = []

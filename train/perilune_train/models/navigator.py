@@ -11,7 +11,7 @@ from perilune_train.config import Attention
 from perilune_train.models.darknet import AttentionDarknet53, conv_block
 
 OUTPUTS = 9
-"""3 of the translation and 6 of the continuous rotation (see navigate/geometry.py)."""
+"""3 of the translation and 6 of the continuous rotation (see motion/geometry.py)."""
 State = tuple[Tensor, Tensor]
 """Hidden and cell state of the LSTM, each (2 layers, batch, hidden)."""
 
@@ -155,7 +155,7 @@ class WarpNavigator(nn.Module):
     motion that explains the flow over the ground plane. The LSTM's output is added as a correction.
 
     Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
-    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/network.py, the flow (batch, pairs,
+    pairs) in metres, to the motion (batch, pairs, 9) in the units of motion/network.py, the flow (batch, pairs,
     height / 8, width / 8, 2), pixels, and the LSTM's state.
     """
 

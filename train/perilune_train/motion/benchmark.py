@@ -26,7 +26,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
 HEADLINE = "position_rmse_vector_m"
-"""The least favourable of the RMSEs of position: of the vector's length, not of a component."""
+"""The least favourable RMSE of position: over lengths of the error vector, not over components."""
 _COLUMNS = {
     HEADLINE: "position RMSE, vector (m)",
     "position_rmse_per_component_m": "per component (m)",
@@ -36,7 +36,7 @@ _COLUMNS = {
     "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is right)",
 }
 _OF_BINS = tuple(_COLUMNS)[:3]
-"""The figures that are also given by region, altitude and Sun."""
+"""Figures that are also computed by region, altitude and Sun."""
 _ALTITUDES_M = (200, 500, 1000, 1600)
 _SUNS_DEG = (0, 15, 30, 45, 60, 90)
 

@@ -78,7 +78,7 @@ def evaluate_navigator(run: Path, evaluated: EvaluatedSplit, out: Path) -> Path:
         "dataset/protocol": protocol_of(dataset.info),
         **terrain_check.metrics(),
     }
-    # Mean motions are those of the training set, which this dataset may not have.
+    # Mean motions need the training set, which this dataset may not have.
     classical = baselines([], trajectories)
     motions, covariances = {fusion: motions_of_network, **classical.motions}, classical.covariances
     stated = stated_covariances(run, network, architecture, trajectories)
@@ -99,7 +99,8 @@ def _check_area(path: Path, known: Provenance, dataset: Dataset, split: str) -> 
 def _evaluate_pose(
     network: Any, architecture: dict[str, Any], split: str, trajectories: list[Trajectory], out: Path, details: Metrics
 ) -> None:
-    """Evaluate a pose network beside the mean pose of its training, the only floor that its checkpoint has."""
+    """Evaluate a pose network together with the mean pose of its training, the only floor that its checkpoint
+    contains."""
     scales = Scales(**architecture["scales"])
     poses, seconds = _timed(predict_pose, network, architecture, trajectories)
     mean = np.array(scales.mean_m), np.array(scales.mean_rotation)
@@ -117,7 +118,7 @@ def _evaluate_pose(
 
 
 def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
-    """Which network a checkpoint holds. Raises UserError if it is no navigator's."""
+    """Which network a checkpoint holds. Raises UserError if it does not hold a navigator."""
     fusion = architecture.get("fusion")
     if fusion not in ("warp", "stack"):
         raise UserError(path, "architecture", sorted(map(str, architecture)), "a navigate run's checkpoint")
@@ -144,10 +145,9 @@ def _timed(
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
     """Write compare.md and errors.png into `out`; returns the table.
 
-    Each evaluation has one row for its network, which names a network for poses, and one for each method without
-    training of the first evaluation of a dataset and split. Raises UserError if a folder is no evaluation of
-    navigation, or was evaluated on terrain that its network was trained on, unless `allow_overlap`; then table and
-    picture are marked.
+    Each evaluation gets one row for its network. For each dataset and split, the methods without training get rows from
+    the first evaluation. Raises UserError if a folder is not an evaluation of navigation, or was evaluated on terrain
+    that its network was trained on, unless `allow_overlap`; then table and picture are marked.
     """
     rows, errors, marks, seen = [], {}, [], set()
     for folder in folders:

@@ -67,7 +67,7 @@ def ground_homography(camera_matrix: ArrayLike, position_m: ArrayLike, rotation_
 
 
 def pixel_index_homography(homography: ArrayLike) -> Array:
-    """The same homography (3, 3) in OpenCV's coordinates, which are 0, not 0.5, at the first pixel's centre."""
+    """The homography (3, 3) in OpenCV's coordinates, which are 0 instead of 0.5 at the centre of the first pixel."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     return np.linalg.inv(shift) @ np.asarray(homography) @ shift
 

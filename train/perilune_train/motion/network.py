@@ -25,7 +25,7 @@ Fusion = Literal["warp", "stack"]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """Scales that convert a network's standardised output to a motion, or to a pose (navigate/pose.py).
+    """Scales that convert a network's standardised output to a motion, or to a pose (motion/pose.py).
 
     stack: translation = mean_m + spread_m * y. warp: translation = nominal + spread_m * y. Both: rotation_c2_from_c1 =
     the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the nominal motion has no
@@ -60,7 +60,7 @@ class Scales:
             return cls(translation.mean(0).tolist(), np.maximum(translation.std(0), 1e-3).tolist(), rotation_rad)
         residual = translation - np.concatenate([trajectory.nominal_motion[0] for trajectory in trajectories])
         across, along = np.sqrt(np.mean(residual[:, :2] ** 2)), np.sqrt(np.mean(residual[:, 2] ** 2))
-        # One number for x and y, because a mirrored pair may exchange them.
+        # x and y have one number, because mirroring a pair may exchange them.
         return cls([0.0] * 3, [max(float(value), 1e-3) for value in (across, across, along)], rotation_rad)
 
 
@@ -126,15 +126,15 @@ class Batch:
     """For warp: true flow, pixels (batch, pairs, height / 8, width / 8, 2)."""
 
     def pin_memory(self) -> "Batch":
-        """The same in page-locked memory; a DataLoader calls it."""
+        """The batch in page-locked memory; a DataLoader calls this."""
         return self.each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Batch":
-        """The same on another device; from page-locked memory without waiting."""
+        """The batch on another device; from page-locked memory without waiting."""
         return self.each(lambda part: part.to(device, non_blocking=True))
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Batch":
-        """The same with each tensor changed."""
+        """The batch with each tensor changed."""
         return replace(self, **{name: change(part) for name, part in vars(self).items() if part is not None})
 
 
@@ -167,7 +167,7 @@ def predict(
 ) -> Motion:
     """Motions of a whole trajectory, in one pass of the network in evaluation mode.
 
-    `features` (pairs, channels) are those of the backbone of a stack network, if they are known.
+    `features` (pairs, channels) are the features of a stack network's backbone, if they are already computed.
     """
     shrunk = trajectory.shrunk(architecture["size_px"])
     motion, _ = _predicted(network, architecture, shrunk, range(shrunk.n_pairs), None, features)
@@ -175,7 +175,7 @@ def predict(
 
 
 def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Motion, float]:
-    """Motions of a trajectory, pair by pair with the LSTM's state carried, as in flight; mean seconds per pair.
+    """Motions of a trajectory, pair by pair with the LSTM's state carried, as in flight; and mean seconds per pair.
 
     The time is from frames in memory to the motion, without shrinking the frames.
     """
@@ -202,7 +202,7 @@ def _predicted(
     sequence = pair_sequence(shrunk, pairs.start, len(pairs), warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
     if architecture["fusion"] == "warp":
-        # The fit of the motion is for the camera of these frames, which may differ from that of the training.
+        # Fit the motion with the camera of these frames, which may differ from the camera of the training.
         network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     batch = Collate(scales, architecture["fusion"])([sequence]).to(next(network.parameters()).device)
     with torch.no_grad():
@@ -217,7 +217,8 @@ def _predicted(
 
 
 def network_output(network: nn.Module, batch: Batch, state: State | None = None) -> tuple[Tensor, Tensor | None, State]:
-    """Outputs (batch, pairs, 9), of a warp network the flow (batch, pairs, height / 8, width / 8, 2), and the state."""
+    """Outputs (batch, pairs, 9); for warp also the flow (batch, pairs, height / 8, width / 8, 2); and the LSTM's
+    state."""
     if isinstance(network, WarpNavigator):
         return network(batch.first, batch.second, batch.altitude_m, state)
     output, state = network(batch.first, batch.second, state)

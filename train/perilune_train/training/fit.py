@@ -33,7 +33,8 @@ from perilune_train.training.runs import (
 
 _STEPS_BETWEEN_CHECKS = 20
 _EARLY_STEPS, _DIVERGED, _LEAST_LOSS = 10, 1e3, 1e-3
-"""First steps, of which each is checked; a loss of so many times the first one, or of this value, has diverged."""
+"""Number of first steps that are all checked; a loss above this multiple of the first loss, or of the smallest loss,
+has diverged."""
 _PROCESSES = "processes"
 """Key of the number of processes in last.ckpt. It must not change on resume: it determines the batches of a step."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
@@ -135,7 +136,7 @@ class KeepLast(Callback):
         between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
         if self.minutes is None or trainer.is_last_batch or between:
             return
-        # Several processes use the clock of the first. Asking it makes them wait, so do it rarely.
+        # Several processes follow the clock of the first. Asking for it makes them wait, so do it rarely.
         if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_CHECKS == 0:
             due = time.monotonic() - self.saved >= 60 * self.minutes
             if trainer.strategy.broadcast(due):
@@ -147,8 +148,8 @@ class KeepLast(Callback):
             self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        # Loaders raise it between two batches, when the state is whole. Several processes cannot save, since the
-        # others may still train, and before the first batch of an epoch the state of the last epoch is saved already.
+        # Loaders raise it between two batches, when the state is complete. Several processes cannot save, since the
+        # others may still train, and before the first batch of an epoch the state of the last epoch is already saved.
         done = trainer.fit_loop.epoch_loop.batch_progress.current
         between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
         if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
@@ -167,7 +168,7 @@ class FewerThreadsIfCrowded(Callback):
     """Adapt the number of threads on a CPU to other work on the machine (see `FairThreads`)."""
 
     def __init__(self, enabled: bool):
-        # Steps of validation cost less than those of training, so each has its own trials of speed.
+        # Validation steps cost less than training steps, so each has its own trials of speed.
         self.training, self.validation = FairThreads(enabled), FairThreads(enabled)
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
@@ -216,7 +217,7 @@ class Bar(Callback):
 
 
 def machines(devices: int, num_nodes: int) -> tuple[int, int]:
-    """Processes on each machine and number of machines: torchrun's values from the environment, else the arguments."""
+    """Processes on each machine and number of machines: from torchrun's environment, else from the arguments."""
     if torch.distributed.is_torchelastic_launched():
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return local, int(os.environ["WORLD_SIZE"]) // local
@@ -316,7 +317,7 @@ def fit(
     warn_if_crowded()
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Deterministic algorithms would also fill all memory that is about to be overwritten.
+    # Deterministic algorithms would otherwise also fill all memory that is about to be overwritten.
     setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -65,7 +65,7 @@ class RunFolder:
 
     @property
     def damaged(self) -> Path | None:
-        """The weights or the metrics, if they are an empty or truncated file; None if they are whole or missing."""
+        """The weights or the metrics if that file is empty or truncated; None if both are complete or missing."""
         if self.best.is_file() and not (half_is_whole if self.best.suffix == SUFFIX else is_whole)(self.best):
             return self.best
         if self.metrics.is_file() and not has_metrics(self.root):

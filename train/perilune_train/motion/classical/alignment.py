@@ -1,9 +1,15 @@
-"""Direct alignment of two frames: the motion, tilt and heights with which the second looks like the first.
+"""Direct alignment of two frames: the motion, tilt and heights of the ground that make the second look like the first.
 
-Gauss-Newton over all pixels (Lucas & Kanade 1981; with free heights of the ground as in direct odometry, Engel et al.
-2018, doi 10.1109/TPAMI.2017.2658577), on local contrast, with Tukey's weights (Beaton & Tukey 1974, doi
-10.1080/00401706.1974.10489171). The unknowns, in this order: turn (3) and shift (3) of the points of frame 2, tilt of
-frame 1 (2), heights at the nodes (25).
+Unknowns, in this order: turn (3) and shift (3) of the points of frame 2, tilt of frame 1 (2), heights at the nodes of a
+grid over the ground (25). Steps for each level of an image pyramid, coarsest first:
+
+1. Project the pixels of frame 1 onto the ground and into frame 2 (`_Residuals.normal_equations`).
+2. Compare local contrast (contrast.py), with Tukey's weights (Beaton & Tukey 1974, doi
+10.1080/00401706.1974.10489171).
+3. Take a Gauss-Newton step, with the prior of motion, tilt and heights (`align`).
+
+Lucas & Kanade 1981; with free heights as in direct odometry, Engel et al. 2018, doi 10.1109/TPAMI.2017.2658577. Along a
+trajectory each pair starts from KLT's motion and the heights of the previous pair (`aligned_trajectory`).
 """
 
 from dataclasses import dataclass
@@ -23,9 +29,10 @@ from perilune_train.motion.data.trajectories import Trajectory
 
 _TUKEY = 4.685
 _DEPENDENT_PIXELS = 6.0
-"""Errors of neighbouring pixels are alike: so many pixels count as one. Chosen on training and validation scenes."""
+"""Number of pixels that count as one, because errors of neighbouring pixels are correlated. Chosen on training and
+validation scenes."""
 _TILT_SIGMA_RAD = float(np.radians(0.5))
-"""Standard deviation of the tilt around a level attitude, on each axis."""
+"""Standard deviation of the tilt about a level attitude, on each axis, radians."""
 _ITERATIONS = 8
 _SMALL_STEP = 1e-5
 """Step of turn, and of shift divided by altitude, below which the iteration ends."""
@@ -37,7 +44,7 @@ _LEVELS = 2
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known of a pair of frames before they are aligned."""
+    """Prior knowledge of a pair of frames."""
 
     motion: ExpectedMotion
     """Expected motion."""
@@ -49,7 +56,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The unknowns of a pair."""
+    """The unknowns of a pair of frames."""
 
     translation_m: Array
     """Motion (3,), O_C of frame 1."""
@@ -68,7 +75,7 @@ class State:
         return State(translation, rotation, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
 
     def offset(self, prior: Prior) -> Array:
-        """Difference of all unknowns (n_unknown,) to the prior."""
+        """Difference (n_unknown,) of all unknowns from the prior."""
         turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.motion.rotation_c2_from_c1.T)
         shift = self.rotation_c2_from_c1 @ (prior.motion.translation_m - self.translation_m)
         return np.concatenate([turn, shift, self.tilt_rad, self.height_m - prior.heights.mean_m])
@@ -140,9 +147,10 @@ class _Residuals:
         return (scaled.T @ jacobian).astype(np.float64), (scaled.T @ error).astype(np.float64)
 
     def _jacobian(self, points: Array, moved: Array, along: Array, by_moved: Array, by_first: Array) -> Array:
-        """Derivatives (n, n_unknown) of the differences, from those by the points of frame 2 and of frame 1 (n, 3)."""
+        """Derivatives (n, n_unknown) of the differences, from their derivatives by the points of frame 2 and of frame 1
+        (n, 3)."""
         jacobian: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
-        # By a turn w from the left a point X moves by w x X, and the value by w . (X x derivative).
+        # A turn w from the left moves a point X by w x X, so it changes the value by w . (X x derivative).
         jacobian[:, :3], jacobian[:, 3:6] = np.cross(moved, by_moved), by_moved
         tilted = self._rays @ _across(self._prior.plane.down_c).T.astype(np.float32)
         jacobian[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
@@ -151,23 +159,23 @@ class _Residuals:
 
 
 def _by_point(by_u: Array, by_v: Array, points: Array, camera: Camera) -> Array:
-    """Derivatives (n, 3) by points (n, 3), O_C, from those by image coordinates."""
+    """Derivatives (n, 3) by points (n, 3), O_C, from the derivatives by image coordinates."""
     x, y, z = points.T
     by_x, by_y = by_u * np.float32(camera.fx_px) / z, by_v * np.float32(camera.fy_px) / z
     return np.stack([by_x, by_y, -(by_x * x + by_y * y) / z], axis=1)
 
 
 def _across(down_c: Array) -> Array:
-    """Two unit vectors (2, 3) at right angles to a direction and to each other."""
+    """Two unit vectors (2, 3) perpendicular to a direction and to each other."""
     first = np.cross(down_c, np.eye(3)[np.argmin(np.abs(down_c))])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(down_c, first)])
 
 
 def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
-    """Motions of a whole trajectory, from images and, where it is given, a gyroscope.
+    """Motions of a whole trajectory, from images and, if given, a gyroscope.
 
-    The altitude is the true one at the first frame, then updated with the estimated motions.
+    The altitude is true at the first frame and then updated by the estimated motions.
     """
     nominal_translation, rotation = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
@@ -185,7 +193,7 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
             ExpectedMotion(nominal_translation[i], rotation[i], turn_sigma[i]),
             GroundPlane(down, altitude_m),
         )
-        # KLT must know the gyroscope's rotation too: its shift balances an error of its own rotation.
+        # KLT must know the gyroscope's rotation too: its shift compensates errors of its own rotation.
         tracked = klt_motion(camera, grey[i], grey[i + 1], expected, plane)
         prior = Prior(expected, plane, heights)
         start = State(tracked.translation_m, tracked.rotation_c2_from_c1, np.zeros(2), heights.mean_m)

@@ -1,4 +1,4 @@
-"""What the classical methods know of a pair of frames, and what they return for a trajectory."""
+"""Prior knowledge of the classical methods about a pair of frames, and their result for a trajectory."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from perilune_train.motion.data.trajectories import Motion
 
 @dataclass(frozen=True, slots=True)
 class ExpectedMotion:
-    """What is known of the motion between two frames before the images are compared."""
+    """Prior knowledge of the motion between two frames."""
 
     translation_m: Array
     """Motion (3,), metres, O_C of frame 1."""
@@ -35,4 +35,5 @@ class EstimatedMotion:
     motion: Motion
     """translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
     covariance: Array
-    """Of each rotation (turn from the left, radians) and shift (metres, O_C of the later frame): (n - 1, 6, 6)."""
+    """Covariances (n - 1, 6, 6) of rotation (turn from the left, radians) and shift (metres, O_C of the later
+    frame)."""

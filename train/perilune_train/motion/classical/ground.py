@@ -13,9 +13,9 @@ N_NODES = N_SIDE**2
 _HEIGHT_SHARE = 0.01
 """Standard deviation of the heights, divided by altitude."""
 _LENGTH_SHARE = 0.35
-"""Length over which heights are alike, divided by the width of the ground in view."""
+"""Correlation length of the heights, divided by the width of the ground in view."""
 _NEW_SHARE = 0.03
-"""How far the heights tend to those of a plane from one frame to the next: finer relief comes into view."""
+"""Share by which heights tend towards a plane from one frame to the next: finer relief comes into view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def unknown_heights(camera: Camera, down_c: Array, altitude_m: float) -> Heights
 
 
 def ground_points(camera: Camera, pixels: Array, down_c: Array, altitude_m: float) -> Array:
-    """Points (n, 3), O_C, in which the rays of pixels (n, 2) meet the ground plane."""
+    """Points (n, 3), O_C, at which the rays of pixels (n, 2) meet the ground plane."""
     rays = camera.rays(pixels)
     return rays * (altitude_m / (rays @ down_c))[:, None]
 
@@ -60,9 +60,10 @@ def carried(
     altitudes_m: tuple[float, float],
     motion: tuple[Array, Array],
 ) -> Heights:
-    """Heights at the nodes of frame 2 from those at the nodes of frame 1, by regression with the prior's covariance.
+    """Heights at the nodes of frame 2 from the heights at the nodes of frame 1, by regression with the prior
+    covariance.
 
-    `downs_c` and `altitudes_m` are those of both frames, `motion` is translation_m and rotation_c2_from_c1.
+    `downs_c` and `altitudes_m` belong to frames 1 and 2; `motion` is translation_m and rotation_c2_from_c1.
     """
     translation, rotation = motion
     nodes = node_pixels(camera)

@@ -1,9 +1,11 @@
 """The classical baseline: corners tracked from frame to frame, and a robust motion fit over the ground plane.
 
-The second frame is first warped onto the first by the nominal motion, so that the tracker (Lucas & Kanade 1981,
-pyramids after Bouguet 2001, as in OpenCV) only has to find a small residual at the same scale. The points of frame 1
-are projected onto the ground plane at the estimated altitude. The motion is fitted to them by Gauss-Newton on the
-reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171).
+1. Warp frame 2 onto frame 1 by the expected motion, so that only a small residual at one scale is left.
+2. Find corners in frame 1, track them into frame 2 and back, and drop tracks that do not return (`_tracks`). Lucas &
+Kanade 1981, with pyramids after Bouguet 2001, as in OpenCV.
+3. Project the corners of frame 1 onto the ground plane at the estimated altitude.
+4. Fit the motion by Gauss-Newton on the reprojection error, with Tukey's weights and a weak prior (`_fit`). Beaton
+& Tukey 1974, doi 10.1080/00401706.1974.10489171.
 """
 
 from dataclasses import dataclass
@@ -26,12 +28,12 @@ from perilune_train.motion.geometry import (
 _N_CORNERS = 600
 _WINDOW_PX = 11
 _CONSISTENCY_PX = 0.5
-"""Largest distance, pixels, between a track's start and its end after tracking back."""
+"""Largest distance, pixels, between the start of a track and its end after tracking back."""
 _TUKEY = 4.685
 NOMINAL_TURN_SIGMA_RAD = float(np.radians(0.5))
 SHIFT_SHARE = 0.02
-"""Standard deviations of a weak prior around the nominal motion: of rotation, and of shift divided by altitude. Few or
-crowded corners cannot separate tilt from sideways shift, which look alike from above."""
+"""Standard deviations of a weak prior about the nominal motion: of the rotation, radians, and of the shift divided by
+altitude. Few or clustered corners cannot separate tilt from sideways shift, which look alike from above."""
 _ITERATIONS = 15
 _MIN_TRACKS = 8
 _MEDIAN_OF_SIGMA = 1.1774
@@ -47,18 +49,18 @@ class Tracked:
     rotation_c2_from_c1: Array
     """Rotation (3, 3)."""
     covariance: Array
-    """Of the turn from the left (radians) and the shift (metres, O_C of frame 2), (6, 6): the Cramer-Rao bound of the
-    tracks used, if their errors are independent and the ground is the plane. The size of the errors is that of the
-    residuals."""
+    """Covariance (6, 6) of the turn from the left (radians) and the shift (metres, O_C of frame 2): the Cramer-Rao
+    bound of the tracks, if their errors are independent and the ground is a plane. Residuals give the size of the
+    errors."""
     n_tracks: int
     """Number of consistent tracks."""
 
 
 def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
-    """Motions of a whole trajectory, from images and, where it is given, a gyroscope.
+    """Motions of a whole trajectory, from images and, if given, a gyroscope.
 
-    One pair gives the translation only relative to the altitude. The altitude is the true one at the first frame, then
-    updated with the estimated motions; the attitude is assumed level.
+    One pair gives the translation only relative to the altitude. The altitude is true at the first frame and then
+    updated by the estimated motions; the attitude is assumed to be level.
     """
     nominal_translation, rotation = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
@@ -78,7 +80,8 @@ def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) 
 
 
 def stretched(images: np.ndarray) -> np.ndarray:
-    """Frames (n, height, width) of one mean and contrast, 8 bits: OpenCV rejects flat windows by a fixed threshold."""
+    """Frames (n, height, width) with equal mean and contrast, 8 bits: OpenCV rejects flat windows by a fixed
+    threshold."""
     return np.clip(110 + 45 * normalised(images), 0, 255).astype(np.uint8)
 
 
@@ -106,7 +109,7 @@ def klt_motion(
 
 
 def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tuple[Array, Array]:
-    """Corresponding points (N, 2) of both images, in image coordinates."""
+    """Corresponding points (N, 2) of both frames, in image coordinates."""
     size = image_1.shape[::-1]
     warp = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP}
     index_homography = pixel_index_homography(homography)
@@ -130,7 +133,7 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
 
 
 def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMotion) -> Tracked:
-    """Fit the motion that maps points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
+    """Fit the motion that maps points (N, 3), O_C of frame 1, to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
     translation_m, rotation = expected.translation_m, expected.rotation_c2_from_c1

@@ -10,7 +10,7 @@ from perilune_train.motion.data.sequences import Jitter, Sequence, pair_sequence
 from perilune_train.motion.data.trajectories import Trajectory
 
 Key = tuple[int, int, int, int]
-"""Epoch, place in its order, number of a trajectory and first pair of a sequence."""
+"""Epoch, position in its order, number of a trajectory, and first pair of a sequence."""
 
 
 class TrainingSequences(torch_data.Dataset):
@@ -38,7 +38,7 @@ class TrainingSequences(torch_data.Dataset):
 
     @property
     def fewest(self) -> int:
-        """Number of sequences of the process that has fewest."""
+        """Number of sequences of the process that has the fewest."""
         processes = self.share.processes
         return min(sum(self.counts[process::processes]) for process in range(processes))
 

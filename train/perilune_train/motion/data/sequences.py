@@ -55,15 +55,17 @@ def pair_sequence(
     rng: np.random.Generator | None = None,
     jitter: Jitter | None = None,
 ) -> Sequence:
-    """The pairs start to start + n_pairs - 1 of a trajectory; augmented if a generator is given.
+    """Pairs start to start + n_pairs - 1 of a trajectory; augmented if a generator is given.
 
     Augmentation applies one of the eight symmetries of the square image to the whole sequence (four if the image is not
     square). With `jitter` it also moves each second camera at random, so that a pair has new residuals in every epoch:
-    the second frame is resampled over the ground plane to what the moved camera would see. The plane is that of the
-    nominal altitude and attitude. The result is exact for a pure rotation, or if the ground is flat and the true
-    altitude and attitude are nominal. For true poses off nominal by 8 m and 0.3 degrees and a jitter of 0.3 times that,
-    the jitter moves points by 1.2 px and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of
-    128 px over 50 degrees at 200 to 1500 m; see tests/train/motion/test_data.py.
+    the second frame is resampled over the ground plane to the view of the moved camera. The plane has the nominal
+    altitude and attitude.
+
+    The result is exact for a pure rotation, or if the ground is flat and the true altitude and attitude are nominal.
+    For true poses off nominal by 8 m and 0.3 degrees and a jitter of 0.3 times that, the jitter moves points by 1.2 px
+    and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of 128 px over 50 degrees at 200 to
+    1500 m; see tests/train/motion/test_data.py.
     """
     span = slice(start, start + n_pairs)
     translation, rotation = (values[span] for values in trajectory.motion)
@@ -78,7 +80,7 @@ def pair_sequence(
             turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
             true = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
             translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
-            # From the moved camera's image 2 over the plane to image 1, then to the original image 2.
+            # Image 2 of the moved camera, over the plane, to image 1, then to the original image 2.
             moved = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
             change = true @ np.linalg.inv(moved)
         if warp:

@@ -20,9 +20,10 @@ _EXTENT_TOLERANCE = 1e-3
 
 
 class Stream:
-    """The server of a run. Raises UserError if it does not answer or does not fit a navigation dataset.
+    """The image server of a run.
 
-    A scene whose terrain is that of the dataset's validation or test split is refused when it is first rendered.
+    Raises UserError if it does not answer or does not fit a navigation dataset. A scene on terrain of the dataset's
+    validation or test split is refused when it is first rendered.
     """
 
     def __init__(self, settings: StreamConfig, dataset: Dataset):
@@ -59,7 +60,7 @@ class Stream:
             return [[number, *astuple(use)] for number, use in self._uses.items()]
 
     def load_state_dict(self, state: list[list]) -> None:
-        """Take over what an interrupted run rendered."""
+        """Restore the record of an interrupted run."""
         with self._lock:
             self._uses |= {number: TerrainUse(*use) for number, *use in state}
 
@@ -70,10 +71,11 @@ class Stream:
     def rendered(
         self, client: SceneClient, scene: int, following: int | None, part: Trajectory, velocity: Array, index: int
     ) -> Trajectory:
-        """The same poses (n) with images of a scene; `velocity` (n, 3) blurs them, `index` sets their noise.
+        """The poses of `part` (n) with images of a scene; `velocity` (n, 3) sets their motion blur, `index` their
+        noise.
 
-        The server is asked to generate the `following` scene meanwhile. Raises UserError if the server fails or the
-        terrain is held out.
+        Meanwhile the server generates the `following` scene. Raises UserError if the server fails or the terrain is
+        held out.
         """
         self._record(client, scene)
         if following is not None:
@@ -89,7 +91,7 @@ class Stream:
     def _record(self, client: SceneClient, scene: int) -> None:
         """Record the terrain of a scene before its first frame in this process.
 
-        Raises UserError if it is held out, or not that which the run used before.
+        Raises UserError if it is held out, or differs from the terrain that the run used before.
         """
         if scene in self._known:
             return

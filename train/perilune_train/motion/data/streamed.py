@@ -1,8 +1,9 @@
 """Training sequences over new ground, rendered by an image server while the network trains.
 
-Such a sequence has the poses of a part of a training trajectory, turned about the vertical through the site by a random
-angle, over a scene of the server. Attitudes stay: a descent from another azimuth has the same axes of the camera. So
-positions, motions and attitudes have the distribution of the training trajectories, but for the azimuth, which is any.
+A rendered sequence has poses of a training trajectory, rotated about the vertical through the site by a random angle,
+over a scene of the server. Attitudes relative to the path stay, since a descent from another azimuth has equal camera
+axes. So positions, motions and attitudes are distributed as in the training trajectories, except for the azimuth, which
+is uniform.
 """
 
 from collections.abc import Iterator
@@ -21,15 +22,15 @@ from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import Trajectory
 
 _AHEAD = 8
-"""Largest number of rendered sequences that wait in memory."""
+"""Largest number of rendered sequences waiting in memory."""
 _INDICES = 2**30
 
 
 class StreamedSequences(TrainingSequences):
-    """Training sequences, a share of which is rendered by a server; otherwise those of the trajectories.
+    """Training sequences of which a share is rendered by a server; the others come from the trajectories.
 
-    Everything is derived from the seeds and a sequence's epoch and place: whether it is rendered, over which scene,
-    from which poses and with which noise. `size_px` is the width to which frames are shrunk. Close it at the end.
+    The seeds and the epoch and position of a sequence determine whether it is rendered, over which scene, from which
+    poses and with which noise. `size_px` is the width to which frames are shrunk. Call `close` at the end.
     """
 
     def __init__(self, stream: Stream, size_px: int, *arguments: Any, **named: Any):
@@ -41,16 +42,17 @@ class StreamedSequences(TrainingSequences):
         return self._ahead.take(key) if self.is_rendered(key) else super().__getitem__(key)
 
     def close(self) -> None:
-        """End the thread that asks the server."""
+        """Stop the thread that asks the server."""
         self._ahead.close()
 
     def is_rendered(self, key: Key) -> bool:
-        """Whether a sequence is rendered: a share of all, evenly spread over the order of an epoch."""
+        """Whether a sequence is rendered; rendered ones are evenly spread over the order of an epoch."""
         share = self.stream.settings.share
         return floor((key[1] + 1) * share) > floor(key[1] * share)
 
     def scene_of(self, key: Key) -> int:
-        """Number of the server's scene under a rendered sequence, from 1: each for `pairs_per_scene` pairs in turn."""
+        """Number of the server's scene under a rendered sequence, from 1; each scene serves `pairs_per_scene` pairs in
+        turn."""
         settings = self.stream.settings
         before = key[0] * floor(sum(self.counts) * settings.share) + floor(key[1] * settings.share)
         return 1 + before * self.n_pairs // settings.pairs_per_scene % settings.n_scenes
@@ -73,7 +75,7 @@ class StreamedSequences(TrainingSequences):
         return part, self.stream.velocities_mps(whole.ids)[frames] @ turn.T, index
 
     def _following(self, key: Key) -> Iterator[Key]:
-        """The rendered sequences of this process from one on, in the order of training, without end."""
+        """The rendered sequences of this process from `key` on, in training order, without end."""
         epoch, keys = key[0], self.keys(key[0])
         keys = keys[keys.index(key) :]
         while True:

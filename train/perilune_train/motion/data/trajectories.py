@@ -99,8 +99,8 @@ class Trajectory:
 def own_trajectories(split: str, count: int, share: Share) -> list[int]:
     """Numbers of the trajectories of a split, among 0 .. count - 1, whose frames a process needs.
 
-    Those of train and val are divided among the processes; with fewer in val than processes, some validate the same
-    one. Only the first process evaluates test.
+    Trajectories of train and val are divided among the processes; if val has fewer than processes, some validate the
+    same one. Only the first process evaluates test.
     """
     if split == "test":
         return list(range(count)) if share.process == 0 else []

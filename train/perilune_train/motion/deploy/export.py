@@ -28,7 +28,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 ONNX, METADATA, README = "navigator.onnx", "navigator.json", "README.md"
 LARGEST_DIFFERENCE = 1e-5
-"""Largest difference from torch, divided by the largest value of the same output, or by 1 if that is larger."""
+"""Largest difference from torch, divided by the larger of 1 and the largest value of that output."""
 _OPSET = 17
 _PAIRS = 12
 
@@ -47,7 +47,7 @@ class Pairs:
     """Nominal altitudes (n,), metres."""
 
     def inputs(self, pair: int, fusion: Fusion) -> list[Tensor]:
-        """The inputs of one pair without the state."""
+        """The inputs of one pair, without the state."""
         rows = slice(pair, pair + 1)
         known = [self.nominal_translation_m[rows], self.altitude_m[rows]] if fusion == "warp" else []
         return [self.first[rows], self.second[rows], *known]
@@ -56,9 +56,9 @@ class Pairs:
 def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> float:
     """Export a run's navigator to the new folder `out`; returns its largest relative difference from torch.
 
-    Writes navigator.onnx, navigator.json (metadata) and README.md. ONNX Runtime, pair by pair with the state carried,
-    is compared with torch over the whole sequence at once, on the first validation descent of the dataset, or on noise.
-    With a dataset the graph is for its camera. Raises UserError, and writes nothing, if they differ.
+    Writes navigator.onnx, navigator.json (metadata) and README.md. ONNX Runtime runs pair by pair and carries the
+    state; torch runs over the whole sequence at once. Both are compared on the first validation descent of the dataset,
+    or on noise. With a dataset, the graph is for its camera. Raises UserError, and writes nothing, if they differ.
     """
     for name in ("onnx", "onnxruntime"):
         package(name)
@@ -167,7 +167,7 @@ def _largest_difference(
 def _at_once(
     flight: FlightNavigator, network: nn.Module, pairs: Pairs, fusion: Fusion, focal: float
 ) -> tuple[Tensor, Tensor]:
-    """Translations (n, 3) and rotations (n, 3, 3) of all pairs in one pass of the network itself."""
+    """Translations (n, 3) and rotations (n, 3, 3) of all pairs in one pass of the torch network."""
     if fusion == "warp":
         network.focal_over_width = focal  # type: ignore[assignment]
         output, _, _ = network(pairs.first[None], pairs.second[None], pairs.altitude_m[None])

@@ -14,7 +14,7 @@ from perilune_train.motion.data.trajectories import Motion, Trajectory
 from perilune_train.motion.geometry import mean_rotation
 
 GYROSCOPE: InertialGrade = "tactical"
-"""The grade whose rotations `klt_gyroscope` and `alignment_gyroscope` use."""
+"""Grade of the inertial unit whose rotations `klt_gyroscope` and `alignment_gyroscope` use."""
 
 CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
 """Methods that read the images, in the order of the tables."""
@@ -22,7 +22,7 @@ CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
 
 @dataclass(frozen=True, slots=True)
 class MethodMotions:
-    """Motions of trajectories by each method, and their covariances by those methods that state them."""
+    """Motions of trajectories by each method, and their covariances where a method states them."""
 
     motions: dict[str, list[Motion]]
     """Motions of each trajectory, by method."""
@@ -31,8 +31,9 @@ class MethodMotions:
 
 
 def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotions:
-    """Estimate by all methods. Without training trajectories there are no mean motions, without gyroscope no method
-    that uses one.
+    """Estimate the motions of test trajectories by all methods.
+
+    Without training trajectories there are no mean motions; without a gyroscope, no methods that use one.
     """
     with progress_bar() as progress:
         task = progress.add_task("classical methods", total=len(test), unit="trajectories", note="")
@@ -62,7 +63,7 @@ def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:
-    """The training set's mean motion at each step; that of its last step for all later steps."""
+    """The training set's mean motion at each step; beyond its last step, the mean motion at its last step."""
     translations, rotations = [], []
     longest = max(trajectory.n_pairs for trajectory in training)
     for step in range(trajectory.n_pairs):

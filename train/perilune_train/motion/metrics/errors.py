@@ -79,7 +79,7 @@ def pose_errors(trajectories: list[Trajectory], poses: list[Pose]) -> pd.DataFra
 
 
 def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
-    """`summary` of poses, with the medians of the lengths of both errors, and the position by altitude."""
+    """`summary` for poses, with the medians of the lengths of both errors, and the errors of position by altitude."""
     figures = summary(errors)
     figures["position_error_median_m"] = float(errors["position_error_m"].median())
     figures["orientation_error_median_deg"] = float(errors["orientation_error_deg"].median())
@@ -93,9 +93,10 @@ def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
 
 
 def normalised_errors(trajectory: Trajectory, motion: Motion, covariance: Array) -> Array:
-    """Squared errors of rotation and shift together, divided by their covariance (n - 1, 6, 6): 6 in the mean if right.
+    """Normalised errors squared of rotation and shift together, by their covariance (n - 1, 6, 6); 6 in the mean if it
+    is right.
 
-    (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.)
+    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.
     """
     error = signed_errors(trajectory, motion)
     return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])

@@ -1,4 +1,4 @@
-"""What a pose network must beat: mean poses of the training set, and ridge regression on the frozen features."""
+"""Baselines that a pose network must beat: mean poses of the training set, and ridge regression on frozen features."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ FLOORS = {
     "mean_pose_at_frame": "mean pose of the training at that frame, without images",
     "ridge": "ridge regression on the frozen features",
 }
-"""Methods beside a pose network, with their names in tables."""
+"""Names in tables of the methods that a pose network is compared with."""
 _PENALTIES = np.logspace(-6, 2, 17)
 """Penalties of the ridge regression, in units of the mean squared length of a standardised feature vector."""
 
@@ -30,12 +30,12 @@ def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, 
 
 
 def constant_pose(position_m: Array, rotation: Array, n_pairs: int) -> Pose:
-    """The same pose for every pair."""
+    """One pose, repeated for every pair."""
     return np.tile(position_m, (n_pairs, 1)), np.tile(rotation, (n_pairs, 1, 1))
 
 
 def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
-    """Mean pose of the training set at each frame; at its last frame for all later ones."""
+    """Mean pose of the training set at each frame; beyond its last frame, the mean pose at its last frame."""
     last, positions, rotations = max(trajectory.n_pairs for trajectory in training) - 1, [], []
     for step in np.minimum(np.arange(n_pairs), last):
         known = [trajectory.pose for trajectory in training if trajectory.n_pairs > step]
@@ -55,9 +55,9 @@ class Known:
 
 
 def ridge_poses(training: Known, validation: Known, features: list[Array]) -> list[Pose]:
-    """Poses from features (pairs, inputs) of each test trajectory by ridge regression fitted to the training pairs.
+    """Poses by ridge regression, fitted to the training pairs, from features (pairs, inputs) of each test trajectory.
 
-    Features are standardised. The penalty is the one of the lowest squared error of position on validation.
+    Features are standardised. The penalty is the one with the lowest squared error of position on validation.
     """
     position_m, rotation = (
         np.concatenate([trajectory.pose[i] for trajectory in training.trajectories]) for i in range(2)
@@ -83,7 +83,7 @@ class _Ridge:
         self.mean, spread = features.mean(0), features.std(0)
         self.scale = np.maximum(np.maximum(spread, 0.1 * spread.mean()), 1e-12)
         self.centre, standard = targets.mean(0), self._standardised(features)
-        # With more features than pairs the matrix of inner products is the smaller one.
+        # With more features than pairs, the matrix of inner products is the smaller one.
         self.known = standard if features.shape[1] > len(features) else None
         gram = standard @ standard.T if self.known is not None else standard.T @ standard
         self.values, self.vectors = np.linalg.eigh(gram.astype(np.float64))

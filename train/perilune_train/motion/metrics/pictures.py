@@ -67,8 +67,7 @@ def draw_trajectory(
 def draw_pose_errors(path: Path, errors: dict[str, pd.DataFrame], network: str) -> None:
     """Draw errors of the position in O_L along the test trajectories, by component, and their distribution.
 
-    Lines are root mean squares over the trajectories at each step; thin ones are single trajectories of the method
-    `network`.
+    Thick lines are root mean squares over the trajectories at each step, thin lines single trajectories of `network`.
     """
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 2).ravel()

@@ -41,7 +41,7 @@ def write_evaluation(
 
     Writes navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png, errors.png and
     metrics.json: <split>/<figure> for the method `network`, <method>/<figure> for another network,
-    baseline/<method>/... for the others, and `details`, which have the mark of the terrain check.
+    baseline/<method>/... for the others, and `details`, which include the mark of the terrain check.
     """
     errors = {
         method: motion_errors(trajectories, motions, estimates.covariances.get(method))
@@ -67,7 +67,7 @@ def write_pose_evaluation(
     """Write the errors of a pose network and its floors on the trajectories of a split; returns the page.
 
     Writes pose.md, errors.png and the tables and metrics of `write_evaluation`, with evaluation/worse_than: the floor
-    with the lowest RMSE of position, if the network loses to it.
+    with the lowest RMSE of position, if it is not higher than the network's.
     """
     errors = {method: pose_errors(trajectories, entries) for method, entries in poses.items()}
     rows = {method: pose_summary(table) for method, table in errors.items()}
@@ -84,7 +84,7 @@ def write_pose_evaluation(
 
 
 def worse_than_floor(network: str, rows: Mapping[str, Mapping[str, float]]) -> str:
-    """The floor of the lowest RMSE of position if the method `network` is not better; otherwise empty."""
+    """The floor with the lowest RMSE of position if `network` is not better; otherwise empty."""
     key = "position_rmse_per_component_m"
     best = min((method for method in rows if method != network), key=lambda method: rows[method][key], default=network)
     return best if best != network and rows[best][key] <= rows[network][key] else ""
@@ -106,7 +106,7 @@ def _pose_page(network: str, split: str, metrics: Metrics, methods: list[str], w
 
 def _with_interval(metrics: Metrics, key: str) -> str:
     value, spread = metrics.get(key), read_spread(metrics, key)
-    # Values of single trajectories would fill the table.
+    # Values of all single trajectories would fill the table.
     return spread.text(float(value)) if spread.interval and isinstance(value, int | float) else number(value)
 
 

@@ -56,9 +56,9 @@ def navigate_run(
 ) -> list[RunFolder]:
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
 
-    Resumes interrupted runs of the same settings, dataset and detector, and leaves finished ones unchanged.
+    Resumes interrupted runs with equal settings, dataset and detector, and leaves finished ones unchanged.
 
-    `detector` is the default checkpoint for the stack network's backbone, used if it exists and has the same
+    `detector` is the default checkpoint for the stack network's backbone: it is used if it exists and has the same
     architecture; `settings.detector` must have it. Raises UserError on bad data, a checkpoint of another architecture,
     or a detector that was fitted to terrain of the test split (unless `allow_overlap`).
 
@@ -95,14 +95,14 @@ def _run(
     start = _start_of_warp(settings) if "warp" in fusions else None
     of_start = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
     terrain = {"warp": provenance.joined(of_start), "stack": provenance.joined(inherited)}
-    # One check for both, because the table of the warp run includes the metrics of stack.
+    # Both runs share one check, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"].joined(of_start), opened, "test", allow_overlap)
     share = own_share(1, 1)
     stream = Stream(settings.stream, opened) if settings.stream is not None else None
     trajectories = load_trajectories(opened, share)
     seconds: dict[Fusion, float] = {}
     tasks: dict[Fusion, NavigationTask] = {}
-    # Train all before any is evaluated, so that the other processes do not wait for the first.
+    # Train all networks before evaluating any, so that the other processes do not wait for the first.
     for fusion, run in folders.items():
         if states[fusion] != "finished":
             start_run(run, "navigate", settings, inputs[fusion], states[fusion])
@@ -139,9 +139,9 @@ def _run(
 def _evaluate_motions(
     folders: dict[Fusion, RunFolder], trajectories: list[Trajectory], common: dict[Fusion, Metrics]
 ) -> None:
-    """Evaluate networks for motion beside the methods without training; write the tables of the trained ones.
+    """Evaluate networks for motion together with the methods without training; write tables for the trained networks.
 
-    `common` has the entries of each trained run's metrics that need no evaluation.
+    `common` has the metrics of each trained run that need no evaluation.
     """
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
@@ -189,7 +189,7 @@ def _warp_task(
     stream: Stream | None,
     start: dict[str, Any] | None,
 ) -> NavigationTask:
-    """Training of warp from random weights, or from the content of a checkpoint."""
+    """Training of warp, from random weights or from a checkpoint."""
     lightning.seed_everything(settings.seed, verbose=False)
     if start is None:
         return NavigationTask(settings, "warp", trajectories, share, stream)
@@ -223,7 +223,7 @@ def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
 def _detector_backbone(
     settings: NavigateConfig, default: Path | None
 ) -> tuple[dict[str, Tensor] | None, str, list[Provenance]]:
-    """A detector's backbone weights, their source and the records of its terrain.
+    """A detector's backbone weights, their source, and the records of its terrain.
 
     If no detector has the same architecture: None, the reason, and no record.
     """

@@ -1,4 +1,4 @@
-"""The evaluation of a run that learned the pose in O_L, beside its floors."""
+"""Evaluation of a run that learned the pose in O_L, together with its floors."""
 
 import time
 from typing import Any
@@ -60,10 +60,10 @@ def evaluate_pose_run(
 def _ridge(
     task: NavigationTask, backbone: dict[str, Tensor], test: list[Trajectory], device: torch.device
 ) -> list[Pose]:
-    """Poses by ridge regression on the features of the backbone as the detector gave it."""
+    """Poses by ridge regression on the features of the detector's backbone, before training."""
     frozen: Any = build(task.architecture)
     frozen.backbone.load_state_dict(backbone, strict=False)
-    # The coarse stage stored its features at this scale.
+    # Scale features as the coarse stage did when it stored them.
     for name in ("feature_mean", "feature_spread"):
         getattr(frozen, name).copy_(getattr(task.network, name))
     frozen.to(device, memory_format=torch.channels_last)
@@ -80,7 +80,7 @@ def _ridge(
     validation = [task.validation_trajectories[number] for number in task.validated]
     known = {}
     for split, split_trajectories in (("train", training), ("val", validation)):
-        # Features of views come after those of the trajectories.
+        # Features of views follow the features of the trajectories.
         stored = [
             split_features[: sum(t.n_pairs for t in split_trajectories)].cpu().numpy()
             for split_features in task.stored.get(split, [])

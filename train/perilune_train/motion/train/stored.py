@@ -1,4 +1,4 @@
-"""Features of a frozen backbone, computed once: a coarse epoch then trains the recurrent layers only."""
+"""Features of a frozen backbone, computed once: a coarse epoch then trains only the recurrent layers."""
 
 from collections.abc import Sequence
 
@@ -20,11 +20,10 @@ def stored_features(
     bf16: bool,
     views: Sequence[Trajectory] = (),
 ) -> list[Tensor]:
-    """Averages (pairs, inputs), float32, of the frozen backbone's features of all pairs of each trajectory.
+    """Averages (pairs, inputs), float32, of the frozen backbone's features over all pairs of each trajectory.
 
-    Those of `views`, further versions of the trajectories in the same order (`other_views`), come after them. The
-    backbone is in evaluation mode, and each frame has one warp, so the features are those of every coarse epoch. They
-    stay on the device.
+    Features of `views`, further versions of the trajectories in equal order (`other_views`), follow. The backbone is in
+    evaluation mode and each frame has one warp, so all coarse epochs have equal features. They stay on the device.
     """
     modes = [(module, module.training) for module in network.backbone.modules()]
     network.backbone.eval()

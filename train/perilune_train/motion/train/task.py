@@ -41,7 +41,7 @@ from perilune_train.training.runs import choose_bf16, choose_device
 _OF_STACK = ("target", "pool", "stages", "dropout", "sequence_pairs")
 """Settings in the architecture of a stack network."""
 _VALIDATIONS = 10
-"""About so many validations of a coarse stage on stored features, whose epochs take a second or less."""
+"""Approximate number of validations of a coarse stage on stored features, whose epochs take a second or less."""
 _WARM_STEPS = 50
 
 
@@ -69,8 +69,9 @@ def learning_rate_factor(
 def axis_weights(scales: Scales, target: Target) -> Tensor:
     """Weights (3,) of the standardised errors of the axes in the loss.
 
-    Positions spread over hundreds of metres along the descent and over a few across it. Equal weights then leave the
-    first inaccurate, and errors in metres the second. The weights are the geometric mean of both.
+    Positions spread over hundreds of metres along the descent and over a few metres across it. Equal weights of
+    standardised errors would leave the first inaccurate, equal weights of errors in metres the second. The weights are
+    the geometric mean of both.
     """
     if target == "motion":
         return torch.ones(3)
@@ -159,7 +160,7 @@ class NavigationTask(lightning.LightningModule):
         self.sequences = self._sequences()
 
     def close(self) -> None:
-        """End what runs beside the training."""
+        """Stop the thread that renders sequences."""
         if isinstance(self.sequences, StreamedSequences):
             self.sequences.close()
 
@@ -296,10 +297,10 @@ class NavigationTask(lightning.LightningModule):
         return loss
 
     def _stack_step(self, places: Tensor, batch_idx: int) -> Tensor:
-        """The step of a stack network on the sequences at some places (see `Windows`)."""
+        """A training step of a stack network on the sequences at `places` (see `Windows`)."""
         assert self.windows is not None
         if self.own.dropout:
-            # A resumed run has the same dropout.
+            # Seed the dropout, so that a resumed run draws the same.
             seeds = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
             torch.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]))
         pairs = self.windows.pairs(places)
@@ -343,7 +344,7 @@ class NavigationTask(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         steps = -(-len(self.train_dataloader()) // self.own.accumulate)
-        # The two loss weights must change by about 1 during the run, whatever the learning rate of the network is.
+        # The two loss weights must change by about 1 during the run, whatever the learning rate of the network.
         rate, factor = self.own.learning_rate, self.own.backbone_factor
         slower = {f"backbone.{name}" for name in self.pretrained} if factor < 1 else set()
         named = list(self.network.named_parameters())
@@ -356,7 +357,7 @@ class NavigationTask(lightning.LightningModule):
             groups.append({"params": own_values, "lr": factor * rate, "weight_decay": 1e-3})
         optimizer = torch.optim.AdamW(
             groups,
-            # One pass over memory: ten times as fast on a CPU, where it is half of a step on stored features.
+            # Fused: one pass over memory, ten times as fast on a CPU, where it is half of a step on stored features.
             fused=True,
         )
         settings = self.own

@@ -1,7 +1,7 @@
-"""Training sequences of a stack network on the training device: frames, features and truths gathered by their places.
+"""Training sequences of a stack network on the training device, gathered from frames, features and truths by index.
 
-Nothing is prepared for a step but the places of its sequences, so that a GPU waits for nothing. With views
-(navigate/train/views.py), version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
+Only the indices of a step's sequences are prepared, so that a GPU does not wait. With views (motion/train/views.py),
+version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from perilune_train.motion.pose import normalised_frames, warped_frames
 from perilune_train.motion.train.views import view_homographies
 
 _LARGEST_SHARE = 0.25
-"""Share of the free memory of a GPU that frames may take; more stay in the memory of the machine."""
+"""Share of a GPU's free memory that frames may take; larger sets stay in the memory of the machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +34,13 @@ class OutputUnits:
 
 
 class WindowPlaces(TrainingSequences):
-    """The places of training sequences: number of the trajectory and first pair.
+    """Indices of training sequences: number of the trajectory and first pair.
 
-    With `views`, each sequence is of a version of its trajectory that is drawn at random.
+    With `views`, each sequence uses a random version of its trajectory.
     """
 
     views: int = 0
-    """Number of versions beside the trajectories themselves."""
+    """Number of versions in addition to the trajectories themselves."""
 
     def __getitem__(self, key: Key) -> tuple[int, int]:  # type: ignore[override]
         epoch, place, number, start = key
@@ -51,15 +51,15 @@ class WindowPlaces(TrainingSequences):
 
 
 def collated(places: list[tuple[int, int]]) -> Tensor:
-    """Places as a tensor (batch, 2)."""
+    """Indices as a tensor (batch, 2)."""
     return torch.tensor(places)
 
 
 class Windows:
-    """Sequences of `n_pairs` consecutive pairs of some of the trajectories, which `numbers` has, and of their views.
+    """Sequences of `n_pairs` consecutive pairs of the trajectories `numbers`, and of their views.
 
-    `views` are further versions of all trajectories, as `other_views` gives them. `places` (batch, 2) are number of the
-    trajectory and first pair, on the device.
+    `views` are further versions of all trajectories, from `other_views`. `places` (batch, 2), on the device, are number
+    of the trajectory and first pair.
     """
 
     def __init__(
