@@ -126,7 +126,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
                 "ap50_paper: run `perilune-train detect evaluate` again",
             )
         if "images/name" in metrics:
-            # An evaluation on real images; its keys have no split as prefix.
+            # An evaluation on real images has keys without a split.
             split, figures, selection = "images", metrics, f"from {metrics.get('min_size_px')} px"
             entries: list[object] = [metrics.get("images/name"), split, None, selection, metrics.get("scales")]
         else:
@@ -140,7 +140,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         cells = [for_markdown(name), *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        # AP of the whole curve, not of the saved points.
+        # AP of the whole curve; the file has fewer points.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]
@@ -169,7 +169,7 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
 
 
 def read_curve(path: Path) -> Curve:
-    """Read the curve of an evaluation. Raises UserError if it is missing or another table."""
+    """Read the curve of an evaluation. Raises UserError if the table is missing or has other columns."""
     columns = read_table(path, RUN_TABLE, {"score": "number", "precision": "number", "recall": "number"})
     return Curve(*(columns.numbers(name) for name in ("score", "precision", "recall")))
 

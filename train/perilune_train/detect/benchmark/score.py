@@ -114,7 +114,8 @@ def score(
     detections_by_part: Mapping[str, list[Detections]],
     threshold: float,
 ) -> Score:
-    """Score detections, by part one entry for each frame; `loaded` is from `load_parts`."""
+    """Score detections, by part of the benchmark with one entry for each frame; `loaded` is the result of
+    `load_parts`."""
     evaluations, regions = {}, {}
     splits = loaded[SELECTIONS[0]]
     facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})

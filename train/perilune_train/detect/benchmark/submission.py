@@ -19,15 +19,16 @@ COLUMNS: dict[str, Kind] = {
     "y1_px": "number",
     "score": "number",
 }
-"""Columns of a submission. A box holds the whole ellipse, also off the image; pixel 0 is from 0 to 1."""
+"""Columns of a submission. A box contains the whole ellipse, also off the image; the first pixel extends from 0 to
+1."""
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 
 
 def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[Detections]]:
-    """Detections by dataset, one entry for each of its frames; `frames` holds the frame_ids of each dataset.
+    """Read detections by dataset, one entry for each frame; `frames` has the frame_ids of each dataset.
 
     Frames without rows have no detections. Raises UserError if the file cannot be read, lacks a column, names another
-    dataset or frame, or holds a number that is not finite, a box without area, or a score outside 0 to 1.
+    dataset or frame, or contains a number that is not finite, a box without area, or a score outside 0 to 1.
     """
     table = read_table(path, DETECTIONS, COLUMNS)
     _check_numbers(table)
@@ -45,7 +46,7 @@ def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[
 
 
 def _known(texts: Texts, names: list[str]) -> np.ndarray:
-    """Place in `names` of each row's text; -1 for others."""
+    """Index in `names` of each row's text; -1 for other texts."""
     number_of = {name: k for k, name in enumerate(names)}
     return np.array([*(number_of.get(word, -1) for word in texts.words), -1], np.int64)[texts.codes]
 
@@ -58,7 +59,7 @@ def _check_numbers(table: Columns) -> None:
 
 
 def _of_dataset(table: Columns, rows: np.ndarray, at: np.ndarray, n_frames: int) -> list[Detections]:
-    """Detections of each frame, best first, of rows (n,) and their frames (n,)."""
+    """Detections of each frame, best first; `rows` (n,) are the rows of a dataset and `at` (n,) their frames."""
     boxes = np.column_stack([table.numbers(name)[rows] for name in _BOX]).reshape(-1, 4)
     scores = table.numbers("score")[rows]
     order = np.lexsort((-scores, at))

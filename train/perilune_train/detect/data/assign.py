@@ -1,6 +1,13 @@
 """Assignment of predictors to labels.
 
-The number of positive predictors depends on the labels. A GPU would make the process wait for that number, so that the
+For each scale:
+
+1. `matching_anchors` compares the sizes of anchors and labels.
+2. Predictors in the cell of a label's centre, and in its nearest neighbours, become positive.
+3. Predictors whose cells touch the middle of an ignored label become ignored (`_cells_touched`).
+4. All other predictors are negative.
+
+The number of positive predictors depends on the labels. On a GPU the process would have to wait for that number, so the
 loader assigns on the CPU, and the loss only gathers.
 """
 
@@ -50,11 +57,11 @@ class Assignment:
         return (counts.scatter_reduce(0, flat, self.counted.float(), "amax") > 0).view_as(self.ignored)
 
     def pin_memory(self) -> "Assignment":
-        """The same in page-locked memory; a DataLoader calls it."""
+        """The assignment in page-locked memory; a DataLoader calls this."""
         return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Assignment":
-        """The same on another device; from page-locked memory without waiting."""
+        """The assignment on another device; from page-locked memory without waiting."""
         return self._each(lambda part: part.to(device, non_blocking=True))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Assignment":
@@ -75,8 +82,8 @@ Targets = list[Assignment]
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float | None) -> Tensor:
     """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
 
-    True for every anchor whose width and height are within the factor `ratio`, and always for the one of highest IoU
-    (all boxes centred on one point). Without `ratio` only for that one.
+    True for every anchor whose width and height are within the factor `ratio`, and always for the anchor of highest IoU
+    (all boxes centred on one point). Without `ratio`, only for the latter.
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors

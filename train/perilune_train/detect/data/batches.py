@@ -96,10 +96,10 @@ class Collate:
 def training_loader(
     split: DetectSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> torch_data.DataLoader:
-    """Training batches of a share, in every epoch in its order; the first one, `epoch`, from batch `start` on.
+    """Training batches of a share, in every epoch in its order; the first epoch, `epoch`, starts at batch `start`.
 
-    `anchors` (scales, 3, 2) are those of the network. All processes have the same number of batches: each frame is seen
-    once in an epoch, except at most processes - 1 frames, different ones in each epoch.
+    `anchors` (scales, 3, 2) are the anchors of the network. All processes have the same number of batches: each frame
+    is seen once in an epoch, except at most processes - 1 frames, which differ from epoch to epoch.
     """
     frames = TrainingFrames(split, config)
     fewest = split.n_frames // split.share.processes

@@ -57,16 +57,16 @@ def unlabelled_craters(
     The columns are box (x0, y0, x1, y1), radius and ellipse (centre x and y, semi-axes, all in pixels, and direction in
     radians).
 
-    A crater of 1.9 px looks like one of 2.1 px. If the first were background, training would lower the scores of both,
-    and a detection of the first would be a false positive. So two kinds of crater are ignored, as COCO ignores objects
-    outside its area range: craters within a factor of sqrt(2) of the range (others cannot reach an IoU of 0.5 with a
-    box in the range) and craters with their centre off the image. If frames will be enlarged or shrunk (`scale`, see
-    load_split), smaller and larger ones are ignored too. `frame` is a row of the table, `labelled` the ids of the
-    craters that have a label in it.
+    A crater of 1.9 px looks like a crater of 2.1 px. If the first were background, training would lower the scores of
+    both, and a detection of the first would be a false positive. So two kinds of crater are ignored, as COCO ignores
+    objects outside its area range: craters within a factor of sqrt(2) of the range (others cannot reach an IoU of 0.5
+    with a box in the range) and craters with their centre off the image. If frames will be enlarged or shrunk by the
+    factors `scale`, smaller and larger craters are ignored too. `frame` is a row of the table frames, `labelled` are
+    the ids of the craters that have a label in it.
     """
     low, high = radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
     rotation = matrix_from_quaternion(frame["rotation_wxyz"])
-    # First select by size: a scene has a hundred thousand craters, and the other checks cost more.
+    # Select by size first: a scene has a hundred thousand craters, and the other checks cost more.
     rows = _right_size(craters, camera, rotation[2], frame["position_m"], (low, high))
     centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation)
     radius_m = craters.diameter_m[rows] / 2

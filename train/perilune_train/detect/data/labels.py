@@ -43,7 +43,8 @@ class FrameLabels:
     depth_ratio: Array | None = None
     """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
     crowd: NDArray[np.bool_] | None = None
-    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if none is."""
+    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if there is no such
+    label."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +100,8 @@ def read_split_labels(
 ) -> tuple[SplitLabels, Array]:
     """Labels and ignored craters of the share's frames, and sizes (S, 2) of the selected labels of all frames.
 
-    `table` has all frames of the split (`frame_table`). Only the craters and labels of one scene are in memory at a
-    time, beside the result. Raises UserError if a part cannot be read or keys are broken.
+    `table` has all frames of the split (`frame_table`). Memory holds the result and the craters and labels of one scene
+    at a time. Raises UserError if a part cannot be read or keys are broken.
     """
     rows = dataset.table("frames", FRAME_COLUMNS)
     check = KeyCheck(dataset, rows)
@@ -121,7 +122,7 @@ def read_split_labels(
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
                 raise UserError(dataset.store, "labels: frame_id", found, expected)
             craters = read_craters(dataset, str(scene_id))
-            # Labels of another split have the place -1.
+            # Labels of another split have the index -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
             labels, bounds = labels.take(order), np.searchsorted(frame[order], [*places, places[-1] + 1])
             scene_labels = _SceneLabels.of(labels, craters, limits.selection)

@@ -1,8 +1,8 @@
-"""Training frames and their assignments on the GPU, for batches without work of the processor.
+"""Training frames and their assignments on the GPU, so that batches need no work of the processor.
 
 A GPU trains a detector faster than a process can prepare its batches. Without augmentation a frame is the same in every
 epoch, so frames and assignments are moved to the GPU once, and a batch is gathered there. All batches of one size have
-the same shapes, which a captured step needs (`detect/train/captured.py`).
+equal shapes, which a captured step needs (`detect/train/captured.py`).
 """
 
 from dataclasses import dataclass
@@ -29,14 +29,14 @@ _PORTION = 256
 
 @dataclass(frozen=True)
 class ResidentScale:
-    """Assignments of all F frames for one scale, K rows each; frames with fewer are filled up."""
+    """Assignments of all F frames for one scale, K rows each; frames with fewer rows are padded."""
 
     places: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
     boxes: Tensor
     """Box of its label: x0, y0, x1, y1 in pixels (F, K, 4)."""
     counted: Tensor
-    """False for the rows that fill up (F, K)."""
+    """False for rows of padding (F, K)."""
     ignored: Tensor
     """Predictors that are neither positive nor negative (F, 3, h, w), bool."""
 
@@ -97,7 +97,7 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
         places += list(part.places[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
     counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
-    # A box with an area, since the loss is computed for all rows.
+    # Pad with a box that has an area, since the loss is computed for all rows.
     filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
     return ResidentScale(
         pad_sequence(places, batch_first=True).to(device),
@@ -120,7 +120,7 @@ def fits(split: DetectSplit, device: torch.device) -> bool:
 
 
 class _Numbers(torch_data.Dataset):
-    """The number of a frame in place of the frame."""
+    """A data set whose items are the numbers of the frames."""
 
     def __getitem__(self, key: tuple[int, int]) -> int:
         return key[1]

@@ -39,7 +39,7 @@ class DetectSplit:
         return len(self.labels)
 
     def first(self, count: int) -> "DetectSplit":
-        """A split of the first `count` frames of this one, which is whole."""
+        """The first `count` frames of this split, as a split of its own."""
         frames = FrameStore(self.frames.table.iloc[:count], self.frames.images[:count])
         labels = self.labels[:count]
         boxes = np.concatenate([part.boxes[part.selected] for part in labels])
@@ -74,7 +74,7 @@ def load_split(
 
 
 def check_frame_size(dataset: Dataset) -> None:
-    """Raise UserError if the sides of the frames are no multiples of the network's coarsest stride."""
+    """Raise UserError if a side of the frames is not a multiple of the network's coarsest stride."""
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
         if size % COARSEST_STRIDE:
@@ -84,7 +84,7 @@ def check_frame_size(dataset: Dataset) -> None:
 
 
 def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
-    """Smallest and largest selected radius, pixels; limits that the selection does not set are those of the labels."""
+    """Smallest and largest selected radius, pixels; a limit that the selection does not set is that of all labels."""
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()
         least, largest = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))

@@ -52,7 +52,7 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
         if len(sizes) >= _SAMPLED_FRAMES:
             break
     stream = FrameStream(dataset, "train", config.batch_size, config.seed, share, FrameContent(_COLUMNS))
-    # A resumed run checks it before there is a loader.
+    # A resumed run compares the number of workers before it creates a loader.
     stream.workers = max(config.workers, 1)
     return StreamedSplit(stream, radius_px, np.concatenate(sizes))
 
@@ -60,9 +60,9 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
 def streamed_loader(
     split: StreamedSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> StreamLoader:
-    """Training batches of a stream, in every epoch in its order; the first one, `epoch`, from batch `start` on.
+    """Training batches of a stream, in every epoch in its order; the first epoch, `epoch`, starts at batch `start`.
 
-    `anchors` (scales, 3, 2) are those of the network.
+    `anchors` (scales, 3, 2) are the anchors of the network.
     """
     stream = split.stream
     stream.make = _Batches(_Labels(stream.dataset, config, split.radius_px), collate_of(config, anchors))

@@ -55,7 +55,7 @@ def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float)
     found_boxes, found_scores = engine(images)
     if found_boxes.shape != boxes.shape or found_scores.shape != scores.shape:
         return float("inf"), float("inf")
-    # Always compare some boxes, also if the network detects nothing in these frames.
+    # Always compare some boxes, even if the network detects nothing in these frames.
     best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
     counts = scores >= np.minimum(best, min_score)
     apart = np.abs(found_boxes - boxes)[counts]
@@ -95,7 +95,7 @@ class Trained:
 
 
 def load_trained(root: Path) -> Trained:
-    """Load a finished run's network, settings and threshold. Raises UserError if it is not one."""
+    """Load a finished run's network, settings and threshold. Raises UserError if the folder is not a finished run."""
     config, threshold, best = config_of_run(root), chosen_threshold(root), RunFolder(root).best
     return Trained(load_detector(best), config, threshold, best)
 
@@ -133,7 +133,8 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """Terrain record of the exported network, with the terrain of the int8 calibration, and the check of the latter."""
+    """Terrain record of the exported network, including the terrain of the int8 calibration, and the check of the
+    latter."""
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None
@@ -147,7 +148,7 @@ class ExportedFiles:
     """Files to export."""
 
     formats: tuple[str, ...] = FORMATS
-    """Formats, of `FORMATS`."""
+    """Names of the formats, from `FORMATS`."""
     size_px: int = 256
     """Width and height of the network's input, pixels."""
     int8: bool = False

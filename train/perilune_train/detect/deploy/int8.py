@@ -41,7 +41,7 @@ class Int8Verdict:
     ap50_paper_int8: float
     """AP of the int8 network, with its other parts in `precision`."""
     float_s: float
-    """Median time of one image before quantisation, in `precision`, seconds."""
+    """Median time of one image before quantisation, seconds, in `precision`."""
     int8_s: float
     """Median time of one image in int8, seconds."""
     precision: EnginePrecision

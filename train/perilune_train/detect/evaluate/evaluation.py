@@ -2,11 +2,11 @@
 
 Use it for rendered datasets and real images alike:
 
-    evaluation = evaluate_detections(found, labels, facts, Criteria(threshold, radius_px=(2.0, 50.0)))
+    evaluation = evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px=(2.0, 50.0)))
     figures = evaluation.figures()                       # flat keys, for metrics.json
     write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
 
-`found` is a list of Detections, `labels` a list of FrameLabels (real images: all selected and labelled, with the
+`detections` is a list of Detections, `labels` a list of FrameLabels (real images: all selected and labelled, with the
 ellipses inscribed in the boxes) and `facts` a FrameFacts (`unknown_facts` if nothing is known). Each has one entry per
 frame.
 """
@@ -128,8 +128,8 @@ def evaluate_detections(
 ) -> Evaluation:
     """Evaluate the detections of all frames.
 
-    The edge scoring rule is valid only if `labels` include craters, as ignored ones, well below the range of radii.
-    `seed` is the random seed of the bootstrap only.
+    The edge scoring rule is valid only if `labels` include, as ignored ones, craters well below the range of radii.
+    `seed` is the random seed of the bootstrap.
     """
     match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
     overlaps = find_overlaps(detections, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))

@@ -90,11 +90,11 @@ class Matches:
     """Frame of each selected label (L,)."""
 
     def strict(self) -> "Matches":
-        """The same matches with every ignored detection counted as a false positive."""
+        """The matches with every ignored detection counted as a false positive."""
         return replace(self, outcome=np.where(self.outcome == IGNORED, FALSE, self.outcome).astype(np.int8))
 
     def of_frames(self, chosen: Flags) -> "Matches":
-        """The matches in the frames that are True in `chosen` (N,)."""
+        """The matches in the frames for which `chosen` (N,) is True."""
         kept = chosen[self.frame]
         return Matches(
             self.scores[kept],
@@ -215,7 +215,7 @@ def match_split(
 
 
 def joined(parts: Sequence[Matches]) -> Matches:
-    """The matches in the frames of several processes, which each took every n-th frame; sorted by frame.
+    """Join the matches of several processes, which each had every n-th frame; sorted by frame.
 
     Rows of labels (`label`) are not unique in the result.
     """

@@ -92,7 +92,8 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
 
 
 def figures(matches: Matches, threshold: float) -> dict[str, float]:
-    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key, and the same under "strict/"."""
+    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key; with the prefix "strict/" by the strict
+    rule."""
     return figures_of_rule(matches, threshold, "") | figures_of_rule(matches.strict(), threshold, "strict/")
 
 

@@ -50,11 +50,11 @@ class ImageSettings:
     """How to read and evaluate labelled images."""
 
     tiling: Tiling
-    """How to cut images."""
+    """How to cut images into tiles."""
     min_size_px: float = 8.0
     """Minimum size of a crater to find, sqrt(w h), pixels."""
     threshold: float | None = None
-    """Score threshold; None for that of the run."""
+    """Score threshold; None for the threshold of the run."""
     nodata: float | None = None
     """Value of pixels without data."""
     request: Request = field(default_factory=Request)
@@ -62,7 +62,7 @@ class ImageSettings:
 
 
 class _Pictures(Sequence[NDArray[np.uint8]]):
-    """Pictures that are read when they are needed: together they may not fit into memory."""
+    """Pictures that are read when needed: all of them may not fit into memory."""
 
     def __init__(self, images: Sequence[LabelledImage], nodata: float | None):
         self._images, self._nodata, self._told = images, nodata, set[int]()
@@ -152,7 +152,7 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
 def evaluate_detections_in_images(
     image_set: ImageSet, detections: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
-    """Evaluate the detections of all images; clips their boxes at the image's edge if those of labels are clipped."""
+    """Evaluate the detections of all images; boxes are clipped at the image edge if the boxes of labels are clipped."""
     sizes = np.array([[image.width_px, image.height_px] for image in image_set.images])
     if image_set.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)

@@ -26,7 +26,8 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 _LARGEST_PRJ = 2**16
 _CORNERS = 32
 _GRID = 17
-"""Number of sample points per side, to test whether an image is on its map; a full disc's corners are not."""
+"""Number of sample points per side that test whether an image is on its map: the corners of a full disc are off the
+map."""
 _DECIMALS = 8
 """Decimals of degrees: 0.3 mm on the ground."""
 
@@ -45,7 +46,7 @@ class Georeference:
     def lon_lat_deg(self, pixels: Array) -> Array:
         """East longitude and latitude (N, 2), degrees, of pixel coordinates (N, 2); infinite off the map.
 
-        Raises UserError if the projection is not one of the Moon.
+        Raises UserError if the projection is not on the Moon.
         """
         from pyproj.exceptions import ProjError
 
@@ -68,7 +69,7 @@ def _lon_lat_from_map(projection: str) -> Any:
 def read_georeference(path: Path) -> Georeference | None:
     """Read the georeference of an image; None if its transform or projection is missing. Needs rasterio.
 
-    Raises UserError if it is not one of the Moon.
+    Raises UserError if the projection is not on the Moon.
     """
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
@@ -83,7 +84,7 @@ def read_georeference(path: Path) -> Georeference | None:
             raise UserError(beside, "georeference", error, "a projection as text (.prj)") from None
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
-    # A georeference places the stored pixels, and detections are in pixels of the upright picture.
+    # A georeference refers to the stored pixels, detections to the pixels of the upright picture.
     stored, place = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
     a, b, c, d, e, f = (place[:, :2] @ stored + place * [0, 0, 1]).ravel().tolist()
     size = picture_size(path)

@@ -102,7 +102,8 @@ def _of_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
 
 
 def _split(by_split: dict[str, Path], paths: list[Path], request: Request, source: Path) -> tuple[Path, str]:
-    """One of several splits, and a text that names it; "" if there is only one part without a split's name."""
+    """Choose one of several splits; returns its path and a text that names it, "" for a single part without a split's
+    name."""
     named = {split: path for split, path in by_split.items() if split}
     if len(paths) == 1 and not (named and request.split):
         return paths[0], ""
@@ -114,18 +115,18 @@ def _split(by_split: dict[str, Path], paths: list[Path], request: Request, sourc
 
 
 def _split_of(name: str) -> str:
-    """train, val or test for the name of a folder or the ending of a file's; "" for others."""
+    """train, val or test from the name of a folder or the ending of a file name; "" for other names."""
     return next((split for split, names in yolo.SPLIT_KEYS.items() if name.lower().rstrip("0123456789") in names), "")
 
 
 def _coco_files(folder: Path) -> list[Path]:
-    """The JSON files of a folder, or of its folder annotations, that hold COCO; not those of LabelMe."""
+    """The JSON files of a folder, or of its folder annotations, that contain COCO annotations, not LabelMe."""
     for parent in (folder, folder / "annotations"):
         paths = sorted(parent.glob("*.json")) if parent.is_dir() else []
         stems = {path.stem for path in pictures_of(parent)} if paths else set()
         candidates = [path for path in paths if path.stem not in stems and not path.name.startswith(".")]
         candidates = [path for path in candidates if '"shapes"' not in (head := _head(path)) and "{" in head]
-        # Beside them COCO has files of captions and key points.
+        # COCO's own downloads also contain files of captions and key points.
         candidates = [path for path in candidates if path.stem.startswith("instances")] or candidates
         if len(candidates) == 1:
             return candidates if is_coco(read_content(candidates[0])) else []
@@ -152,7 +153,7 @@ def _of_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
 
 
 def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFile:
-    """Pictures with the texts that the layout of YOLO gives them; without a text a picture has no objects."""
+    """Pictures with their YOLO label files; a picture without a file has no objects."""
     root = source.resolve().parent if source.is_file() else source.resolve()
     entries, n_absent = [], 0
     for picture in pictures:
@@ -175,7 +176,7 @@ def _numbers_as_names(entries: Sequence[Entry]) -> dict[str, str]:
 
 
 def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
-    """Images with a label file each, beside them or in another folder."""
+    """Images that have a label file each, next to them or in another folder."""
     images = pictures_of(folder)
     root = folder
     if not images:
@@ -234,7 +235,7 @@ def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: i
 
 
 def _reader_of_texts(paths: list[Path]) -> tuple[Callable[[Path, Path], list[LabelledObject]], bool]:
-    """The reader of YOLO or of tables, by the first text that is not empty, and whether boxes are clipped."""
+    """Choose the reader of YOLO or of tables by the first text that is not empty; also whether boxes are clipped."""
     first = next((text for path in paths if (text := read_text(path, "boxes")).strip()), "")
     if yolo.is_yolo(first):
         return yolo.read_yolo_text, True
@@ -247,7 +248,7 @@ def _table_objects(path: Path, picture: Path) -> list[LabelledObject]:
 
 
 def _names_beside(folder: Path) -> dict[str, str]:
-    """Names of YOLO's classes from classes.txt, as labelImg writes it; {} without one."""
+    """Names of YOLO's classes from classes.txt, as labelImg writes it; {} if there is none."""
     for path in (folder / "classes.txt", folder / "labels" / "classes.txt"):
         if path.is_file():
             lines = [line.strip() for line in read_text(path, "names").splitlines()]

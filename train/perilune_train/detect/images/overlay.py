@@ -10,13 +10,13 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.records.pictures import save_image
 
 MOST_DRAWN = 1000
-"""Maximum number of craters in an overlay. Lines of more than that hide the ground."""
+"""Maximum number of craters in an overlay: more lines would hide the ground."""
 _LARGEST_PX = 4096
 _SMALLEST_PX = 1600
 _LINE_OPACITY = 0.8
-"""Lines are one pixel wide, the least that OpenCV draws; the ground shows through them."""
+"""Lines are one pixel wide, OpenCV's minimum, so that the ground shows through."""
 _DARKEST = 80
-"""First entry of the colour map that is used, of 256: the darker ones cannot be seen on grey."""
+"""First of the 256 entries of the colour map that is used: darker ones are invisible on grey."""
 _STRIP_SHARE = 0.02
 """Height of the strip below the image, as a share of the image's longer side."""
 
@@ -32,7 +32,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, 
     size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
-    # The strongest are drawn last, above the others.
+    # Draw the strongest last, on top of the others.
     drawn = np.argsort(detections.scores, kind="stable")[-MOST_DRAWN:]
     lines = canvas.copy()
     for k, colour in zip(drawn, _colours(detections.scores[drawn], threshold), strict=True):

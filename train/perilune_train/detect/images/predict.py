@@ -36,9 +36,9 @@ class PredictSettings:
     """How to find craters in images."""
 
     tiling: Tiling
-    """How to cut images."""
+    """How to cut images into tiles."""
     threshold: float | None = None
-    """Minimum score; None for that of the run."""
+    """Minimum score; None for the threshold of the run."""
     min_size_px: float = 0.0
     """Minimum size of a crater, sqrt(w h), pixels."""
     nodata: float | None = None
@@ -120,7 +120,7 @@ def of_size(detections: Detections, min_size_px: float) -> Detections:
 
 
 def strongest(detections: Detections, top: int | None) -> Detections:
-    """The `top` detections of the highest scores, in their order; all if None."""
+    """The `top` detections with the highest scores, in their order; all if None."""
     if top is None or len(detections.scores) <= top:
         return detections
     best = np.sort(np.argsort(-detections.scores, kind="stable")[:top])
@@ -128,7 +128,7 @@ def strongest(detections: Detections, top: int | None) -> Detections:
 
 
 def expanded(sources: list[Path]) -> list[Path]:
-    """The images that are given, and those of given folders. Raises UserError on a folder without images."""
+    """The given images and the images of given folders. Raises UserError on a folder without images."""
     paths = []
     for path in sources:
         if not path.is_dir():

@@ -54,7 +54,7 @@ def load_detector(path: Path) -> YOLOv3:
 
 
 def check_detector(content: Mapping[str, Any], path: Path) -> None:
-    """Raise UserError unless the content of a checkpoint is a detector's; builds nothing that takes memory."""
+    """Raise UserError unless a checkpoint contains a detector; builds nothing that takes memory."""
     architecture = content["architecture"]
     if set(architecture) != set(DetectorArchitecture.model_fields):
         raise UserError(path, "architecture", sorted(map(str, architecture)), "a detect run's checkpoint")

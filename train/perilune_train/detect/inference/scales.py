@@ -17,23 +17,23 @@ from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
 _REACH = 4
-"""Pixels beyond a slice that its cubic interpolation needs."""
+"""Number of pixels beyond a slice that cubic interpolation needs."""
 
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Resize an image (height, width); returns the same object if the size is the same."""
+    """Resize an image (height, width); returns the input if it has this size."""
     if image.shape == (height_px, width_px):
         return image
-    # When shrinking, area averaging avoids aliased noise, which looks like craters.
+    # Area averaging, when shrinking, avoids aliased noise, which looks like craters.
     how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
 
 
 class Enlarged:
-    """An image (height, width) as if enlarged, of which only the pixels of a slice are computed.
+    """An image (height, width) as if enlarged; only the pixels of a slice are computed.
 
-    For images that do not fit into memory when they are enlarged. Values differ from those of `resized` by rounding,
-    since OpenCV interpolates here at 32 places between two pixels.
+    For images that do not fit into memory when enlarged. Values differ from those of `resized` by rounding, since
+    OpenCV interpolates here at 32 positions between two pixels.
     """
 
     def __init__(self, image: NDArray[np.uint8], width_px: int, height_px: int):
@@ -57,7 +57,7 @@ class Enlarged:
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:
-    """Height and width, pixels, that the network accepts and that are nearest to `factor` times those of a frame."""
+    """Height and width, pixels, that the network accepts, nearest to `factor` times those of a frame."""
     if factor == 1:
         return height_px, width_px
     height, width = (max(1, round(side * factor / COARSEST_STRIDE)) for side in (height_px, width_px))

@@ -30,7 +30,7 @@ tolerance both could drop it."""
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
-    """Tile starts along a side: evenly spaced, the first at 0, the last tile ending at the side's end."""
+    """Starts of the tiles along a side: evenly spaced, the first at 0, the last tile ending at the end of the side."""
     if length_px <= tile_px:
         return np.zeros(1, np.intp)
     count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
@@ -40,7 +40,7 @@ def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.int
 def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
     """Pad an image at right and bottom with reflected pixels.
 
-    Only sides that are shorter than a tile and no multiple of 32 are padded.
+    Only sides that are shorter than a tile and not a multiple of 32 are padded.
     """
     more = [max(0, min(tile_px, -(-side // COARSEST_STRIDE) * COARSEST_STRIDE) - side) for side in image.shape]
     return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
@@ -107,7 +107,7 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 def _detect_tiles(
     detector: Detector, image: NDArray[np.uint8] | Enlarged, tiling: Tiling, advance: Callable[[int], object]
 ) -> Iterator[Detections]:
-    """Detections of each tile of an image, in pixels of the image, without boxes that another tile keeps."""
+    """Detections of each tile, in pixels of the whole image, without boxes that another tile keeps."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
     places = [(int(top), int(left)) for top in tops for left in lefts]
     tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)

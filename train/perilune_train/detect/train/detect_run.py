@@ -56,7 +56,7 @@ def run_detect(
 ) -> runs.RunFolder:
     """Train and evaluate a detector; all output is in the returned folder.
 
-    Resumes an interrupted run of the same settings and dataset, and leaves a finished one unchanged; `overwrite`
+    Resumes an interrupted run with equal settings and dataset, and leaves a finished one unchanged; `overwrite`
     replaces both.
 
     Raises UserError if the existing run has other settings or another dataset; if its last state is damaged; if the
@@ -152,7 +152,7 @@ def evaluate(
 ) -> Metrics:
     """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only.
 
-    `sizes_px` (S, 2) are those of the training labels.
+    `sizes_px` (S, 2) are the sizes of the training labels.
     """
     detector = open_detector(run.best, config)
     found_val, _ = detect_split(detector, splits["val"], "val")
@@ -195,7 +195,7 @@ def anchor_sizes(network: YOLOv3) -> np.ndarray:
 
 
 def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
-    """State how well a network's anchors fit labels of these sizes (N, 2): the best recall that training can reach."""
+    """State how well a network's anchors fit label sizes (N, 2), and so the best recall that training can reach."""
     recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
     return (
         f"anchors: best possible recall {recall:.4f}, the fraction of training labels with an anchor within a factor "

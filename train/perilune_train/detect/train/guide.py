@@ -9,9 +9,10 @@ from perilune_train.detect.data.assign import Targets
 GUIDED = ("B_11", "B_22", "B_38")
 """The last gates of the stages of stride 2, 4 and 8."""
 _REACHES, _LEVELS = (1.0, 1.1, 1.2, 1.3, 1.4), (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
-"""Outer radii of crater and rings, divided by the crater's, and 1 - G of the paper's mask G inside each and beyond."""
+"""Outer radii of crater and rings, divided by the crater's radius, and 1 - G of the paper's mask G inside each and
+beyond."""
 _WINDOWS = (4.0, 16.0)
-"""Largest reaches, pixels of the map, of the craters that are painted together."""
+"""Largest radii, pixels of the map, of craters that are painted together."""
 _TINY = 1e-6
 
 
@@ -20,7 +21,7 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
     """1 - G (frames, 1, height, width): 1 in craters, steps down to 0.2 in rings around them, 0 elsewhere.
 
     Craters are ellipses in the boxes, pixels, of all labels that predictors of any scale learn. A pixel of the map is
-    `stride` pixels wide; the value is that at its middle.
+    `stride` pixels wide; values are taken at pixel centres.
     """
     boxes = torch.cat([painted.boxes for painted in targets]).float()
     frame = torch.cat([painted.places[0] for painted in targets])
@@ -29,7 +30,7 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
     rows = torch.cat([rows[:, :1], rows[:, 1:] / stride], 1)
     painted = torch.zeros(frames, height, width, device=boxes.device)
     reach = (rows[:, 3:] - rows[:, 1:3]).amax(1) / 2 * _REACHES[-1]
-    # Most craters are small, so windows save nearly all of the work; a training step waits for it.
+    # Most craters are small, so small windows save nearly all of the work; a training step waits for it.
     smaller = torch.zeros_like(reach, dtype=torch.bool)
     for largest in (*_WINDOWS, float("inf")):
         fitting = (reach <= largest) & ~smaller

@@ -1,4 +1,10 @@
-"""Complete IoU with the paper's circular prior, and the detection loss."""
+"""Complete IoU with the paper's circular prior, and the detection loss.
+
+For each scale, `detection_loss` gathers the positive predictors, decodes their boxes, and computes:
+
+L_ciou   the complete IoU loss of these boxes with their labels
+L_obj    the binary cross-entropy of the objectness of positive and negative predictors; ignored ones do not count
+"""
 
 import math
 from typing import Literal
@@ -69,11 +75,11 @@ def detection_loss(
         counted = None if assignment.counted is None else assignment.counted.float()
         n_labels = max(len(labels), 1) if counted is None else counted.sum().clamp(min=1)
         sums = settings.reduction == "sums"
-        # What the sums over the predictors of this scale are divided by.
+        # Divisors of the sums over the predictors of this scale.
         of_boxes, of_scores = (
             (len(raw), len(raw)) if sums else (n_labels * total * stride, raw[..., 4].numel() * total * stride)
         )
-        # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
+        # An empty sum keeps the graph, so that a batch of empty frames stays differentiable.
         losses = ciou_loss(boxes, labels, settings.aspect)
         box = box + (losses if counted is None else losses * counted).sum() / of_boxes
         positive = assignment.positive

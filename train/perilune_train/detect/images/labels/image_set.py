@@ -1,4 +1,4 @@
-"""Labelled images, and how the objects of a label file become them."""
+"""Labelled images, and how the objects of a label file become such images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ class LabelledImage:
     not_ignored: NDArray[np.bool_]
     """False for a box that its source marks as ignored (M,)."""
     crowd: NDArray[np.bool_] | None = None
-    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if none is."""
+    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if there is no such box."""
 
     @property
     def sizes_px(self) -> Array:
@@ -69,9 +69,9 @@ class LabelledObject:
     box: Box
     """x0, y0, x1, y1, pixels."""
     category: str = ""
-    """Identity of its category, a key of `LabelFile.categories`."""
+    """Id of its category, a key of `LabelFile.categories`."""
     ignored: bool = False
-    """Whether its source marks it as one that does not count (`ignore`, `difficult`)."""
+    """Whether its source marks it as not counting (`ignore`, `difficult`)."""
     crowd: bool = False
     """Whether it is a region of many objects (`iscrowd`)."""
 
@@ -97,11 +97,11 @@ class LabelFile:
     """What the readers of all formats return."""
 
     source: Path
-    """Named in messages about categories."""
+    """Path in messages about categories."""
     entries: list[Entry]
     """Pictures."""
     categories: Mapping[str, str] = field(default_factory=dict)
-    """Name of each category, by its identity in the file."""
+    """Name of each category, by its id in the file."""
     clip: bool = True
     """Whether boxes end at the edges of the picture."""
     notes: tuple[str, ...] = ()
@@ -138,17 +138,18 @@ def image_set(label_file: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
 def choose_categories(
     categories: Mapping[str, str], wanted: Sequence[str], source: Path
 ) -> tuple[set[str] | None, str]:
-    """The identities of the categories that are craters, and a text that names them.
+    """The ids of the categories that are craters, and a text that names them.
 
-    Without `wanted` these are all named crater or craters, in upper or lower case: there may be several, since exports
-    of Roboflow also have a placeholder category. With fewer than two categories every object is a crater: None.
+    Without `wanted`, these are all categories named crater or craters, in upper or lower case; there may be several,
+    since exports of Roboflow also have a placeholder category. With fewer than two categories every object is a crater:
+    None.
     """
     names = {key: " ".join(name.split()) for key, name in categories.items()}
     asked = [name.strip().lower() for name in wanted]
     if not asked and len(names) < 2:
         odd = [name for name in names.values() if name.lower() not in (*_CRATER_NAMES, "")]
         return None, "".join(f"every object is taken as a crater; their category is {name}" for name in odd)
-    # With names only, as in Pascal VOC, a name is its own identity.
+    # With names only, as in Pascal VOC, a name is its own id.
     described = {key: name if name == key else f"{name} ({key})" for key, name in names.items()}
     known = ", ".join(names.values())
     for name, original in zip(asked, wanted, strict=True):
