@@ -103,7 +103,7 @@ def explain_detector(
 
 
 def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int) -> YOLOv3:
-    """A network of the same form with random weights; its batch statistics are measured on `images` (N, h, w)."""
+    """A network of equal architecture with random weights; its batch statistics are measured on `images` (N, h, w)."""
     trained, config = detector.network, detector.config
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

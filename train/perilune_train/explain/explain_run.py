@@ -114,7 +114,7 @@ def _run(
 
 @dataclass(frozen=True)
 class _Part:
-    """What an explain run found on one network."""
+    """Results of an explain run for one network."""
 
     task: str
     """detect or navigate."""

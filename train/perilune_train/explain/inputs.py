@@ -16,8 +16,7 @@ from perilune_train.explain.correlation.homography import true_homography
 from perilune_train.motion.data import trajectories as navigation
 
 RUN_PAIRS = 8
-"""Consecutive pairs of a run, which starts from the initial state of the LSTM, as in training; fewer over short
-descents."""
+"""Largest number of consecutive pairs of a run. Each run starts from the initial state of the LSTM, as in training."""
 
 
 def ground_truth_mask(

@@ -25,15 +25,15 @@ BINS = {
 }
 """Label and edges of the bins of each property of a crater."""
 OUTSIDE = "outside"
-"""Name of the bin of values in no other bin; not drawn."""
+"""Name of the bin for values outside all other bins; it is not drawn."""
 MOST_ROWS = 6
-"""Gates that are drawn as bars, one row of panels each; more are drawn as a heat map."""
+"""Largest number of gates that are drawn as bars, one row of panels each; more are drawn as a heat map."""
 
 
 def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
     """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present.
 
-    The bin 3-5 has values above 3 and up to 5; "outside" has those in no bin.
+    The bin 3-5 has values above 3 and up to 5; "outside" has the values outside all bins.
     """
     parts, keys = [], [name for name in ("map", "version") if name in table]
     for name, (label, edges) in BINS.items():

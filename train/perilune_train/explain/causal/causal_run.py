@@ -1,4 +1,4 @@
-"""One causal run: what single craters do to masks, detections and poses, from frames rendered without them."""
+"""One causal run: the effect of single craters on masks, detections and poses, from frames rendered without them."""
 
 import json
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ class CausalInputs:
 
 
 def causal_folder(named: NamedRun) -> RunFolder:
-    """The folder that `causal_run` writes; a command holds it (`training.begin.held`)."""
+    """The folder that `causal_run` writes; a command locks it (`training.begin.held`)."""
     return named.folder("explain", "-causal")
 
 
@@ -96,7 +96,7 @@ def causal_run(
     """Measure what removed craters change in masks, detections and poses; writes runs/explain/<name>-causal.
 
     `checkpoint` has the weights of the detector. `gate` is the gate of the headline, chosen on other frames. A finished
-    run of the same inputs stays unchanged.
+    run with equal inputs stays unchanged.
 
     Raises UserError if the existing run has other settings or inputs; if an input is missing or invalid; or if the
     network was fitted to terrain of the frames (unless `allow_overlap`).
@@ -229,7 +229,7 @@ def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:
 
 
 def _tested(tables: dict[str, pd.DataFrame], gate: str, rng: np.random.Generator) -> dict[str, Tested]:
-    """Claims with their p, by the prefix of their keys in metrics.json."""
+    """Claims with their p values, by the prefix of their keys in metrics.json."""
     tested = {
         "gate": reaction_claim(tables["mask_effects"], tables["gate_effects"], gate),
         "found": detection_claim(tables["detection_effects"], rng),

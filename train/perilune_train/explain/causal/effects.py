@@ -33,7 +33,8 @@ from perilune_train.motion.network import predict, target_of
 from perilune_train.motion.pose import predict_pose
 
 REACH = 1.4
-"""Semi-axes of the region around a crater, divided by the crater's: the outermost ring of the paper's mask G."""
+"""Semi-axes of the region around a crater, divided by the crater's semi-axes: the outermost ring of the paper's mask
+G."""
 _INPAINT_RADIUS_PX = 3
 _TRIES = 200
 _MIN_IOU = 0.5
@@ -50,7 +51,7 @@ def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, flo
 
 
 def empty_shift(crater: pd.Series, occupied: NDArray[np.bool_], rng: np.random.Generator) -> tuple[float, float] | None:
-    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if none is found.
+    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if there is none.
 
     `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free.
     """
@@ -75,10 +76,11 @@ def inpainted(image: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> NDArray[np
 def filled_frames(
     pairs: CraterPairs, occupied: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[tuple[float, float] | None]]:
-    """Frames with the removed craters inpainted, frames with placebo regions inpainted, and the shifts of these.
+    """Frames with the removed craters inpainted, frames with placebo regions inpainted, and the shifts of these
+    regions.
 
-    Shapes (N, height, width) and one shift for each row of `pairs.craters`. `occupied` (N, height, width) are pixels in
-    or near labelled craters.
+    Both are (N, height, width); there is one shift for each row of `pairs.craters`. `occupied` (N, height, width) are
+    pixels in or near labelled craters.
     """
     shape = pairs.factual.shape[1:]
     without, placebo = (np.zeros(pairs.factual.shape, bool) for _ in range(2))
@@ -106,8 +108,8 @@ def mask_effects(
     """Change of every gate in the region of every crater, in standard deviations of the gate.
 
     `masks` has the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean over
-    the region of the factual mask minus that of the other version: above 0 the gate is stronger with the crater.
-    Columns: those of `pairs.craters`, map, version, change; NaN for a placebo without free ground.
+    the region of the factual mask minus the mean of the other version's mask: above 0 the gate is stronger with the
+    crater. Columns: those of `pairs.craters`, map, version, change; NaN for a placebo without free ground.
     """
     shape, rows = pairs.factual.shape[1:], []
     for (_, crater), shift in zip(pairs.craters.iterrows(), shifts, strict=True):

@@ -49,7 +49,7 @@ def scene_interval(
 
 
 def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
-    """Draw the mean change of every gate in each version, with intervals where there are any."""
+    """Draw the mean change of every gate in each version, with intervals if they exist."""
     blocks = list(dict.fromkeys(gates["map"]))
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     axis = figure.subplots()

@@ -21,7 +21,8 @@ def true_homography(
     position_2_m: Array,
     rotation_2_camera_from_site: Array,
 ) -> Array:
-    """Homography (3, 3) from image coordinates, pixels, of frame 1 to those of frame 2, of the true poses.
+    """Homography (3, 3) from image coordinates, pixels, of frame 1 to image coordinates of frame 2, from the true
+    poses.
 
     Takes positions (3,) in metres, O_L, and rotations (3, 3). The plane is the mean ground, z = 0 of O_L. The paper
     speaks of "the affine transformation matrix defined by groundtruth pose" without a definition. Deviation: a

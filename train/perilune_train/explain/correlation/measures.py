@@ -34,7 +34,7 @@ PCC1_SIGN = (
 
 @dataclass(frozen=True, slots=True)
 class FrameTargets:
-    """What the maps of N frames are correlated with, and the names of the frames."""
+    """Maps that the maps of N frames are correlated with, and the names of the frames."""
 
     truth: Maps
     """The paper's masks G (N, height, width): 1 on background, 0 in craters."""

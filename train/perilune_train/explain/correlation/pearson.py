@@ -100,7 +100,7 @@ def is_constant(values: ArrayLike) -> bool:
 
 
 def _without(rows: Array, basis: Sequence[Array]) -> Array:
-    """Rows (N, P) without their components along the basis; twice, against rounding."""
+    """Rows (N, P) without their components along the basis; subtracted twice, because of rounding."""
     for _ in range(2):
         for basis_rows in basis:
             rows = rows - dot_rows(rows, basis_rows)[:, None] * basis_rows

@@ -13,7 +13,7 @@ from perilune_train.explain.correlation.pearson import is_constant
 MEASURES = ("auc", "relevance_mass", "pointing")
 """Measures in which gates are tested against nulls."""
 TOLERANCE_PX = 3
-"""Distance to a crater's pixel within which the top pixel of a map is a hit, pixels."""
+"""Distance, pixels, from a crater's pixel within which the top pixel of a map is a hit."""
 
 
 def localisation(
@@ -67,7 +67,7 @@ def localised(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> di
 
 
 def within(craters: NDArray[np.bool_], distance_px: float) -> NDArray[np.bool_]:
-    """Pixels (height, width) whose centre is at most a distance from that of a crater's pixel."""
+    """Pixels (height, width) whose centre is within a distance of the centre of a crater's pixel."""
     if not craters.any():
         return craters
     distance = cv2.distanceTransform((~craters).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

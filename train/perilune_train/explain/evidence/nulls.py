@@ -1,7 +1,7 @@
-"""Null maps: what a correlation is without a trained network that looks at craters.
+"""Null maps: how large a correlation is without a trained network that looks at craters.
 
-A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if to the gates of stage k, and
-"<null>/<gate>" if to one gate.
+A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if to the gates of stage k, and "<null>/<gate>"
+if to one gate.
 """
 
 from collections.abc import Sequence
@@ -60,7 +60,7 @@ def pair_nulls(
 
 
 def renamed(null: str, masks: Masks) -> Masks:
-    """The same masks with the names "<null>/<gate>"."""
+    """The masks with the names "<null>/<gate>"."""
     return {f"{null}/{gate}": gate_masks for gate, gate_masks in masks.items()}
 
 

@@ -1,4 +1,4 @@
-"""Performance of a network on single images: what an intervention changes."""
+"""Performance of a network on single images, which interventions change."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,9 +56,9 @@ class MotionPerformance:
     truth_m: Values
     """True translations, O_C of the earlier frame, or positions, O_L, (runs, pairs, 3), metres."""
     mean_m: Values
-    """Their mean over the training set (3,), metres."""
+    """Mean of the truth over the training set (3,), metres."""
     spread_m: Values
-    """Their standard deviation over the training set (3,), metres."""
+    """Standard deviation of the truth over the training set (3,), metres."""
     size_px: int
     """Width of the network's frames."""
 

@@ -60,7 +60,7 @@ def cascade(
     order = range(count, 0, -1) if direction == "top_down" else range(1, count + 1)
     for step, stage in enumerate(order, start=1):
         with torch.random.fork_rng(devices=[]):
-            # Each stage has its own seed, so that both directions draw the same weights for it.
+            # Each stage has its own seed, so that both directions draw equal weights for it.
             torch.manual_seed(int(np.random.SeedSequence([rng_seed, stage]).generate_state(1)[0]))
             for part in _parts(changed, stage):
                 _reset(part)
@@ -105,7 +105,7 @@ def similarity(trained: Masks, other: Masks, step: str = "") -> pd.DataFrame:
         a, b = _small(trained_maps), _small(other[name])
         ranks = [np.stack([rankdata(values) for values in maps.reshape(len(maps), -1)]) for maps in (a, b)]
         spearman = pearson_rows(*ranks)
-        # Ranks of rounding errors are not constant.
+        # Ranks of rounding errors would not be constant.
         spearman[[is_constant(x) or is_constant(y) for x, y in zip(a, b, strict=True)]] = np.nan
         ssim = np.array([_ssim(x, y) for x, y in zip(a, b, strict=True)])
         rows.append({"map": name, "step": step, "spearman": _mean(spearman), "ssim": _mean(ssim)})

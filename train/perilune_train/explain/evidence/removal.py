@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 Which = Literal["most", "least"]
 Filling = Literal["inpaint", "mean"]
 Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
-"""One value (N,) for each image (N, height, width), NaN if undefined."""
+"""One value (N,) for each image (N, height, width); NaN if undefined."""
 CONTROLS = ("random", "shifted")
 _FILLINGS: tuple[Filling, ...] = ("inpaint", "mean")
 BLOCK_PX = 8
-"""Side of the blocks that are removed, so that inpainting cannot restore single pixels."""
+"""Side of the removed blocks, pixels: inpainting cannot restore them as it restores single pixels."""
 _BINS = 10
 _INPAINT_RADIUS_PX = 3
 _WINDOW_PX = 31
@@ -58,9 +58,9 @@ def random_like(
 
 
 def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX) -> NDArray[np.bool_]:
-    """The chosen blocks flipped, turned and shifted circularly at random, so that their shape is the same elsewhere.
+    """The chosen blocks flipped, rotated and shifted circularly at random: an equal shape at another position.
 
-    Images that are not square are turned by 0 or 180 degrees.
+    Images that are not square are rotated by 0 or 180 degrees.
     """
     blocks = block_means(chosen, block_px) > 0.5
     height, width = blocks.shape
@@ -141,7 +141,7 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     """
     change = effects["before"] - effects["after"]
     harm = effects.assign(harm=change if higher_is_better else -change)
-    # A pivot table would leave out maps, and removals, without any value.
+    # A pivot table would leave out maps and removals without any value.
     means = harm.groupby(["map", "how", "which"])["harm"].mean()
     table = effects[["map", "how"]].drop_duplicates(ignore_index=True)
     pairs = list(zip(table["map"], table["how"], strict=True))

@@ -19,7 +19,7 @@ BEATS = "beats every null"
 PAIRWISE = ("pcc2",)
 """Measures whose value for a frame is a mean over its pairs with the other frames."""
 _FLIPS = 4096
-"""Sign flips; all of them with up to 12 units."""
+"""Number of sign flips; with up to 12 units, all flips."""
 _GROUP = ["task", "kind", "map", "measure"]
 
 

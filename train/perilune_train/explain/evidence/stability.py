@@ -34,7 +34,7 @@ def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) 
 
 
 def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
-    """Images (..., height, width) moved dx pixels to the right and dy down; edge pixels fill what becomes free."""
+    """Images (..., height, width) moved dx pixels to the right and dy down; edge pixels fill the gap."""
     height, width = images.shape[-2:]
     rows = np.clip(np.arange(height) - dy, 0, height - 1)
     columns = np.clip(np.arange(width) - dx, 0, width - 1)
@@ -78,7 +78,7 @@ def stability(
             return shifted(frames, dx, dy).reshape(values.shape)
 
         after = {name: moved(gate_masks, -dx, -dy) for name, gate_masks in masks_of(moved(images)).items()}
-        # A pixel is in both images if its place was not filled in, there and back.
+        # A pixel is in both images if no shift filled it in.
         inside = np.zeros((images.shape[1] // stacked, images.shape[2]), bool)
         height, width = inside.shape
         inside[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)] = True

@@ -1,4 +1,4 @@
-"""Sheets of attention masks beside their images."""
+"""Sheets of attention masks with their images."""
 
 from collections.abc import Sequence
 from pathlib import Path

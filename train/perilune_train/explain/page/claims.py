@@ -14,7 +14,7 @@ from perilune_train.explain.evidence.tables import Evidence
 from perilune_train.records.spread import MIN_UNITS
 
 LEAST_DEVIATION = 0.02
-"""A gate whose mask has a smaller standard deviation over pixels and images is called constant."""
+"""Smallest standard deviation over pixels and images of a mask that does not count as constant."""
 _REMOVES = "removing the 20 %"
 STILL_FROM = 37
 """The paper: PCC4 is above PCC3 up to B_36, below from B_37."""
@@ -23,7 +23,7 @@ DEEP_ALIKE = 0.75
 LOCALISATION = {"auc": "ROC-AUC", "relevance_mass": "relevance mass", "pointing": "pointing game"}
 """Measures of localisation and their names."""
 HARM_RATIO = 3.0
-"""Removing attended pixels should hurt this many times as much as the stronger control."""
+"""Removing attended pixels should do at least this many times as much harm as the stronger control."""
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,17 @@ class Claim:
     """One statement; all fields are texts for a table."""
 
     claim: str
-    """What is claimed, and by whom."""
+    """The statement, and who makes it."""
     figure: str
     """The measured figure."""
     interval: str
     """Its 95 % interval over scenes, or why there is none."""
     nulls: str
-    """The same figure of the nulls or controls."""
+    """The figure of the nulls or controls."""
     verdict: str
     """holds, does not hold, or undecided, with the reason."""
     picture: str
-    """File that shows it."""
+    """File name of the picture that shows it."""
 
     def plain(self) -> dict[str, str]:
         """The fields as plain data."""
@@ -60,7 +60,7 @@ def row_of(evidence: Evidence, measure: str, name: str) -> pd.Series:
 
 
 def interval_text(row: pd.Series) -> str:
-    """The interval of a row of the summary and its units, or that there is none."""
+    """The interval and the units of a row of the summary, or that there is no interval."""
     if math.isfinite(row["low"]) and math.isfinite(row["high"]):
         return f"{row['low']:.2f} to {row['high']:.2f} ({row['n_units']} units: {row['unit']})"
     return f"none: {row['n_units']} units ({row['unit']})"
@@ -181,7 +181,7 @@ def beating_gates(evidence: Evidence, measure: str, stages: str = "123") -> list
 
 
 def deep_alike(evidence: Evidence) -> Claim:
-    """The paper's claim that deep masks of two frames are alike."""
+    """Whether deep masks of two frames are alike, as the paper claims."""
     gates = [gate for gate in DEEP_GATES if gate in set(evidence.summary["map"])]
     rows = [row_of(evidence, "pcc2", gate) for gate in gates]
     values = [float(row["value"]) for row in rows]
@@ -252,7 +252,7 @@ def _paired(evidence: Evidence, measure: str, gate: str, name: str) -> tuple[flo
 
 
 def motion(evidence: Evidence, *, moving: bool) -> Claim:
-    """PCC4 - PCC3 of the gates up to B_36, or of those from B_37 on, beside the nulls of the same gates."""
+    """Sign of PCC4 - PCC3 of the gates up to B_36, or from B_37 on, with the nulls of these gates."""
     rows = evidence.summary[(evidence.summary["measure"] == "pcc4_minus_pcc3") & (evidence.summary["kind"] == "gate")]
     number = rows["map"].str[2:].astype(int)
     rows = rows[number < STILL_FROM] if moving else rows[number >= STILL_FROM]

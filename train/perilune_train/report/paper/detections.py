@@ -1,4 +1,4 @@
-"""Detections that a finished detect run wrote for its test split: sizes, and pictures as in the paper."""
+"""Detections that a finished detect run wrote for its test split: sizes, and pictures like the paper's."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +37,7 @@ class Detected:
 def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
     """Read a run's detections. Raises UserError if they are missing, damaged or of other frames.
 
-    `trained` is the folder of the network's run, by default `run`; it has the settings and the threshold.
+    `trained` is the folder of the network's training, by default `run`; it has the settings and the threshold.
     """
     trained = trained or run
     split = load_split(open_single(dataset), "test", config_of_run(trained).labels)
@@ -77,7 +77,7 @@ class WidthRatio:
 
 
 def width_ratio(detected: Detected) -> WidthRatio | None:
-    """Width of the large craters that were found, relative to the truth; None if none was found."""
+    """Width of the detected large craters, relative to the truth; None if none was detected."""
     split = detected.split
     height, width = split.frames.images.shape[1:]
     sizes = np.tile((width, height), (len(split), 1))
@@ -107,7 +107,7 @@ def width_ratio(detected: Detected) -> WidthRatio | None:
 def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
     """Draw the frames with the smallest and with the largest labels: truth red, detections cyan, as in the paper.
 
-    Both frames have at least a quarter of the most labels that a frame has.
+    Both frames have at least a quarter of the largest number of labels in a frame.
     """
     split = next(iter(by_network.values())).split
     counts = np.array([int(labels.selected.sum()) for labels in split.labels])

@@ -30,7 +30,8 @@ _CORRELATIONS = {
 
 
 def gate_verdicts(explained: Metrics) -> list[Verdict]:
-    """Claims on gates: each holds if it is true of all of its gates, does not hold if of none, and is open otherwise.
+    """Claims on gates: a claim holds if it is true of all of its gates, does not hold if of none, and is open
+    otherwise.
 
     A gate's figure has no interval, so over fewer than `MIN_UNITS` scenes every claim is open.
     """
@@ -88,7 +89,7 @@ def _judged(
 
 
 def gate_table(explained: Metrics) -> list[str]:
-    """Ranges of PCC1 to PCC4 over all gates, with those of each null, as lines of Markdown."""
+    """Ranges of PCC1 to PCC4 over all gates, with the ranges of each null, as lines of Markdown."""
     rows = []
     for measure, title in _CORRELATIONS.items():
         names = [key.removeprefix(f"{measure}/") for key in explained if key.startswith(f"{measure}/B_")]

@@ -50,10 +50,9 @@ _READINGS = {
 def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline_share: str | None = None) -> Path:
     """Write paper.md, paper.json and pictures into the folder of the experiment's runs; returns the page.
 
-    `dataset` is the detection dataset of the headline ground. `about` are lines that say how the experiment was made
-    and what was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the
-    curve with the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is
-    finished.
+    `dataset` is the detection dataset of the headline ground. `about` are lines on how the experiment was run and what
+    was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the curve with
+    the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is finished.
     """
     runs = PaperRuns(root)
     if not root.is_dir():
@@ -148,7 +147,7 @@ def _elsewhere(runs: PaperRuns) -> bool:
 
 
 def _starts(runs: PaperRuns) -> str:
-    """A sentence on the weights that the headline rows, and those after transfer, start from; empty if unknown."""
+    """A sentence on the initial weights of the headline rows and of the rows after transfer; empty if unknown."""
     found = []
     for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "those after transfer")):
         starts = {

@@ -1,4 +1,4 @@
-"""Seconds that training takes on this machine, from a few steps on random frames."""
+"""Training time on this machine, from a few steps on random frames."""
 
 import time
 
@@ -48,7 +48,7 @@ def navigate_seconds(config: NavigateConfig) -> float:
 
 
 def _timed(step, device: str) -> float:
-    """Seconds of a step, after a first one; the fastest of a few."""
+    """Seconds of a step: the fastest of a few, after a first one."""
     step()
     seconds = []
     for _ in range(_STEPS):

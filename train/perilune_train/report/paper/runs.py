@@ -42,7 +42,8 @@ NAMES = {
 SEEDS = (0, 1, 2)
 """Random seeds of the trainings at half width."""
 HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
-"""Grounds, and the headline ground after transfer and with more epochs: the first part of a run's name."""
+"""Grounds, and two variants of the headline ground (after transfer, with more epochs): the first part of a run's
+name."""
 SPARSE_SHARE = "0.1"
 """equilibrium_share of the sparse ground."""
 CURVE = "curve"
@@ -50,7 +51,7 @@ CURVE = "curve"
 NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
 """First part of the names of the navigate runs, by the paper's names; their folders end in -stack."""
 READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
-"""End of the names of the navigate runs: pose in O_L, with attitude noise, motion between frames."""
+"""Endings of the names of the navigate runs: pose in O_L, pose with attitude noise, motion between frames."""
 EXPLAINED = "attention"
 """Name of the explain run."""
 CAUSES = "paper-causes.json"
@@ -81,7 +82,7 @@ def nearest_share(curve: Mapping[str, Metrics], prefix: str = "") -> str | None:
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """Folders and metrics of the experiment's runs. Methods raise UserError on damaged metrics only."""
+    """Folders and metrics of the experiment's runs. Methods raise UserError only on damaged metrics."""
 
     root: Path
     """The folder that holds all of them, such as runs/paper."""
@@ -115,8 +116,8 @@ class PaperRuns:
     def curve(self, headline: str | None = None) -> dict[str, Metrics]:
         """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
 
-        Runs on the sparse, the headline and our usual ground are points too if their networks are as large, and train
-        for as many epochs, as in the runs of the curve. `headline` is the share of the headline ground.
+        Runs on the sparse, the headline and our usual ground also count as points if network size and epochs equal
+        those of the curve's runs. `headline` is the share of the headline ground.
         """
         name_of_share = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
         read = {share: finished(self.detector(name)) for share, name in name_of_share.items()}

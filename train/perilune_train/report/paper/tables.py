@@ -40,13 +40,13 @@ _GROUNDS = {
 }
 _HALF = "headline at half width"
 _PLAIN_ONLY = (_GROUNDS[LONG], _GROUNDS[TRANSFER])
-"""Where gates from identity are not planned."""
+"""Grounds for which no training with identity gates is planned."""
 _IDENTITY_ONLY = (_GROUNDS[USUAL],)
-"""Where plain CBAM is not planned."""
+"""Grounds for which no training with plain CBAM is planned."""
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 _NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
-"""Columns of Table III, with decimals."""
+"""Columns of Table III, with their number of decimals."""
 FLOORS = {
     "mean_pose": "mean pose of the training",
     "mean_pose_at_frame": "mean pose of the training at that frame",
@@ -55,7 +55,7 @@ FLOORS = {
     "mean_at_step": "mean motion of the training at that step",
     "nominal": "nominal motion",
 }
-"""What a navigator must beat: methods without images, and linear regression on the features that it starts from."""
+"""Baselines of a navigator: methods without images, and linear regression on its initial features."""
 _METHODS = {"klt": "KLT tracks, without training", "alignment": "direct alignment, without training"}
 
 
@@ -111,7 +111,7 @@ def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]
 
 
 def table_3(runs: PaperRuns, reading: str) -> list[str]:
-    """Table III in one reading as lines of Markdown, with the RMSE of the vector's length beside the components'."""
+    """Table III in one reading as lines of Markdown, with the RMSE of the vector's length next to the components'."""
     rows = []
     navigation = runs.navigation(reading)
     for network, claimed in NAVIGATION.items():
@@ -137,7 +137,7 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
 
 
 def floor(metrics: Metrics) -> str | None:
-    """The best of the `FLOORS` of a navigate run by the RMSE of position; None if it has none."""
+    """The best of the `FLOORS` of a navigate run by the RMSE of position; None if there is none."""
     errors = {name: metrics.get(f"baseline/{name}/{_POSITION}") for name in FLOORS}
     known = {name: value for name, value in errors.items() if isinstance(value, int | float)}
     return min(known, key=lambda name: known[name], default=None)
@@ -185,7 +185,7 @@ def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
 
 
 def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
-    """A figure with its interval; of several trainings, the mean with the range; a dash if undefined."""
+    """A figure with its interval; for several trainings, mean and range; a dash if undefined."""
     known = numbers(trainings, key)
     if not known:
         return "-"

@@ -13,7 +13,7 @@ from perilune_train.report.paper.tables import FLOORS, lost_to, numbers, values
 
 ONE = "one training each"
 _CONSTANT_DEG = 1e-4
-"""Without attitude noise the orientation is constant, and a mean has an error below this."""
+"""Without attitude noise the orientation is constant, and its mean has an error below this limit, degrees."""
 GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from identity"}
 """Detectors with attention."""
 
@@ -32,7 +32,7 @@ def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
 
 
 def _detection_claims() -> dict[str, tuple[str, str]]:
-    """Name and the paper's figures of each claim, by the key of metrics.json."""
+    """Name of each claim and the paper's figures, by the key of metrics.json."""
     names = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
     plain, attended = DETECTION.values()
     compared = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
@@ -45,7 +45,7 @@ def _detection_claims() -> dict[str, tuple[str, str]]:
 
 
 def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) -> Verdict:
-    """Compare at half width if there are several trainings, and name the one training at full width beside them."""
+    """Compare at half width if there are several trainings, and add the single training at full width."""
     full, half = runs.detections(), runs.halves()
     counts = [len(numbers(half[network], key)) for network in (gates, "yolov3")]
     pair = full[gates], full["yolov3"]
@@ -112,7 +112,7 @@ def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
 
 
 def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
-    """Whether the mean pose or motion already knows the orientation; without a mean, whether all networks do."""
+    """Whether the mean pose or motion already predicts the orientation; without a mean, whether all networks do."""
     means = [f"baseline/{name}/{key.removeprefix('test/')}" for name in ("mean", "mean_pose")]
     known = [value for mean in means for value in numbers(trained, mean)] or numbers(trained, key)
     return max(known) < _CONSTANT_DEG
