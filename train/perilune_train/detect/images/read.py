@@ -53,8 +53,6 @@ class _Picture:
 
     path: Path
     """The file."""
-    kind: str
-    """PNG, TIFF, JPEG or the name of a raster's format."""
     width_px: int
     """Width as decoded, pixels."""
     height_px: int
@@ -269,7 +267,7 @@ def _by_pillow(path: Path, opened: Any, tags: dict[int, Any]) -> _Picture:
     inverted = deep_tiff and tags.get(_PHOTOMETRIC_TAG) == _WHITE_IS_ZERO
     # Pillow gives the upright size of a TIFF, and turns its pixels when it loads them.
     size = opened.width, opened.height
-    return _Picture(path, kind, *size, orientation, kind == "TIFF", inverted, _nodata(tags), strips)
+    return _Picture(path, *size, orientation, kind == "TIFF", inverted, _nodata(tags), strips)
 
 
 def _deep_colours(path: Path) -> NDArray:
@@ -309,7 +307,6 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
 
         yield _Picture(
             path,
-            _KINDS.get(driver, driver),
             width,
             height,
             tiff_orientation(tags),
