@@ -1,4 +1,4 @@
-"""A split of a dataset with its crater labels, for a loop of one's own in PyTorch: `dataset.torch(split="train")`.
+"""A split of a dataset with its crater labels, for your own loop in PyTorch: `dataset.torch(split="train")`.
 
     frames = LabelledFrames(open_single("data/small/detect"), "train", "visible")
     loader = DataLoader(frames, batch_size=8, shuffle=True, collate_fn=frames.collate)

@@ -166,7 +166,7 @@ class FrameStream(torch_data.IterableDataset):
         if worker is not None:
             self.epoch, self.batches = self._begun.tolist()
         try:
-            # The loader asks worker 0 first, also on resuming.
+            # The loader asks worker 0 first, also when it resumes.
             yield from self._batches((self.batches + number) % workers, workers)
         except UserError as error:
             if worker is None:

@@ -1,4 +1,4 @@
-"""The datasets of the locked benchmark, and whether they are those of the shared manifests."""
+"""The datasets of the locked benchmark, checked against the shared manifests."""
 
 from dataclasses import dataclass
 
@@ -45,7 +45,7 @@ def part_names(kind: str) -> list[str]:
 def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
     """Open the datasets of a kind below `data` that belong to the benchmark; compare them with the shared manifests.
 
-    Raises UserError if there is none, or if a scene or a frame is not that of its manifest.
+    Raises UserError if there is none, or if a scene or a frame differs from its manifest.
     """
     store, locked = open_store(data), open_store(manifests)
     parts = []

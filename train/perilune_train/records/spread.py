@@ -50,7 +50,7 @@ class Resamples:
 
 @dataclass(frozen=True)
 class Spread:
-    """Spread of one metric between units."""
+    """Spread of one metric among units."""
 
     unit: str
     """scene, trajectory or image."""
