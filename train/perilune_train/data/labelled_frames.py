@@ -54,10 +54,10 @@ class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
         self.frames = load_frames(dataset, split)
         labels = read_labels(dataset, ["crater_id", *_BOX_COLUMNS, *ELLIPSE_COLUMNS], split)
         labels = labels[selected(labels, SELECTIONS[selection])]
-        places = {frame_id: row_of_label for row_of_label, frame_id in enumerate(self.frames.table["frame_id"])}
-        row_of_label = labels["frame_id"].map(places).to_numpy(np.int64)
+        row_of_frame = {frame_id: row_of_label for row_of_label, frame_id in enumerate(self.frames.table["frame_id"])}
+        row_of_label = labels["frame_id"].map(row_of_frame).to_numpy(np.int64)
         order = np.argsort(row_of_label, kind="stable")
-        self._bounds = np.searchsorted(row_of_label[order], np.arange(len(places) + 1))
+        self._bounds = np.searchsorted(row_of_label[order], np.arange(len(row_of_frame) + 1))
         self._crater_id = labels["crater_id"].to_numpy(np.int64)[order]
         self._boxes = labels[_BOX_COLUMNS].to_numpy(np.float32)[order]
         self._ellipses = labels[ELLIPSE_COLUMNS].to_numpy(np.float32)[order]

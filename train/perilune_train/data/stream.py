@@ -204,9 +204,9 @@ class FrameStream(torch_data.IterableDataset):
         ends = np.cumsum(self._groups.n_frames[order])
         first, last = np.searchsorted(ends, [start, stop - 1], side="right")
         for window in range(first, last + 1, _GROUPS_PER_WINDOW):
-            places = range(window, min(window + _GROUPS_PER_WINDOW, last + 1))
-            sizes = self._groups.n_frames[order[places]]
-            groups = np.repeat(order[places], sizes)
+            window_groups = range(window, min(window + _GROUPS_PER_WINDOW, last + 1))
+            sizes = self._groups.n_frames[order[window_groups]]
+            groups = np.repeat(order[window_groups], sizes)
             rows = np.concatenate([np.arange(size) for size in sizes])
             position = np.arange(len(rows)) + ends[window] - sizes[0]
             chosen = np.flatnonzero((position >= start) & (position < stop))

@@ -88,13 +88,15 @@ def _run(
     state = state_of(run, "explain", settings, inputs, named.overwrite)
     if state == "finished":
         return run
-    flown = None if navigator is None else open_navigation(navigator.checkpoint, navigator.dataset, settings)
+    navigation_inputs = (
+        None if navigator is None else open_navigation(navigator.checkpoint, navigator.dataset, settings)
+    )
     marks, metrics = terrain_marks(networks, allow_overlap)
-    seen = None if detector is None else open_detection(detector.checkpoint, detector.dataset, settings)
+    detection_inputs = None if detector is None else open_detection(detector.checkpoint, detector.dataset, settings)
     start_run(run, "explain", settings, inputs, state)
 
-    parts = [] if seen is None else [_explain_detector(run, settings, seen)]
-    parts += [] if flown is None else [_explain_navigator(run, settings, flown)]
+    parts = [] if detection_inputs is None else [_explain_detector(run, settings, detection_inputs)]
+    parts += [] if navigation_inputs is None else [_explain_navigator(run, settings, navigation_inputs)]
     claims = [claim for part in parts for claim in part.claims]
     _write_tables(run, {part.task: part.evidence for part in parts})
     write_text(run.root / "claims.json", json.dumps([claim.plain() for claim in claims], indent=2) + "\n")

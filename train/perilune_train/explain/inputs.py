@@ -138,8 +138,8 @@ def first_descent(split: DetectSplit) -> list[int]:
 def consecutive_pairs(descents: Sequence[navigation.Trajectory], count: int) -> Pairs:
     """At most `count` pairs of descents in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes."""
     length = min(RUN_PAIRS, *(descent.n_pairs for descent in descents))
-    places = [(descent, start) for descent in descents for start in range(0, descent.n_pairs - length + 1, length)]
-    return _pairs_of([(*places[i], length) for i in evenly_spaced(len(places), max(1, count // length))])
+    runs = [(descent, start) for descent in descents for start in range(0, descent.n_pairs - length + 1, length)]
+    return _pairs_of([(*runs[i], length) for i in evenly_spaced(len(runs), max(1, count // length))])
 
 
 def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:

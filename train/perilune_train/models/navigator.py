@@ -105,8 +105,8 @@ class StackNavigator(nn.Module):
 
     def stacked(self, first: Tensor, second: Tensor) -> Tensor:
         """The backbone's input (batch * pairs, in_channels, 2 height, width): the earlier frame above."""
-        both = torch.cat([first, second], dim=2).flatten(0, 1)
-        return both[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
+        pair = torch.cat([first, second], dim=2).flatten(0, 1)
+        return pair[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
 
     def pooled(self, first: Tensor, second: Tensor) -> Tensor:
         """The backbone's last features, averaged over the pair or over each cell (batch, pairs, inputs)."""

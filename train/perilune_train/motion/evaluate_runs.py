@@ -149,7 +149,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     the first evaluation. Raises UserError if a folder is not an evaluation of navigation, or was evaluated on terrain
     that its network was trained on, unless `allow_overlap`; then table and picture are marked.
     """
-    rows, errors, marks, seen = [], {}, [], set()
+    rows, errors, marks, listed = [], {}, [], set()
     for folder in folders:
         metrics = read_metrics(folder)
         method, split = metrics.get("evaluation/method"), metrics.get("evaluation/split")
@@ -169,9 +169,9 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         run_errors = _read_errors(folder / ERRORS_FILE)
         errors[name] = run_errors[run_errors["method"] == method]
         for other in ("klt", "nominal", "mean_at_step", "mean", *FLOORS):
-            if (target, *where[:-1]) not in seen and f"baseline/{other}/position_rmse_vector_m" in metrics:
+            if (target, *where[:-1]) not in listed and f"baseline/{other}/position_rmse_vector_m" in metrics:
                 rows.append([other, *where[:-1], "-", *_cells(metrics, f"baseline/{other}")])
-        seen.add((target, *where[:-1]))
+        listed.add((target, *where[:-1]))
     head = ["run (network) or method", "dataset", "split", "protocol", "pairs", "terrain", *_COLUMNS.values()]
     text = "\n".join(table(head, rows)) + "\n"
     note = "In brackets: 95 % intervals, or the value of each unit if there are fewer than five."

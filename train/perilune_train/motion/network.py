@@ -120,8 +120,6 @@ class Batch:
     """True translations in the network's units, see Scales (batch, pairs, 3)."""
     angles: Tensor
     """True rotations as Euler angles, divided by `rotation_rad` of Scales (batch, pairs, 3)."""
-    place: Tensor
-    """Number of the trajectory and first pair of each sequence (batch, 2)."""
     flow_px: Tensor | None
     """For warp: true flow, pixels (batch, pairs, height / 8, width / 8, 2)."""
 
@@ -157,7 +155,6 @@ class Collate:
             stacked([sequence.altitude_m for sequence in sequences]),
             (stacked([sequence.translation_m for sequence in sequences]) - reference) / unit,
             euler_from_rotation(rotation) / self.scales.rotation_rad,
-            torch.tensor([sequence.place for sequence in sequences]),
             stacked(flows) if flows else None,
         )
 

@@ -36,7 +36,7 @@ class BatchLabels:
 class Assignment:
     """Positive predictors of one scale with their labels, and ignored predictors."""
 
-    places: Tensor
+    predictors: Tensor
     """Frame, anchor, row and column of each positive predictor (4, P)."""
     boxes: Tensor
     """Box of its label: x0, y0, x1, y1 in pixels (P, 4)."""
@@ -50,9 +50,9 @@ class Assignment:
         """The positive predictors (N, 3, h, w), bool."""
         if self.counted is None:
             mask = torch.zeros_like(self.ignored)
-            mask[tuple(self.places)] = True
+            mask[tuple(self.predictors)] = True
             return mask
-        flat = flat_places(self.places, self.ignored.shape)
+        flat = flat_predictors(self.predictors, self.ignored.shape)
         counts = torch.zeros(self.ignored.numel(), device=flat.device)
         return (counts.scatter_reduce(0, flat, self.counted.float(), "amax") > 0).view_as(self.ignored)
 
@@ -68,9 +68,9 @@ class Assignment:
         return Assignment(**{name: change(part) for name, part in vars(self).items() if part is not None})
 
 
-def flat_places(places: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Indices (P,) into a flattened tensor (N, 3, h, w) of places (4, P): frame, anchor, row and column."""
-    frame, anchor, row, column = places
+def flat_predictors(predictors: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Indices (P,) into a flattened tensor (N, 3, h, w) of predictors (4, P): frame, anchor, row and column."""
+    frame, anchor, row, column = predictors
     _, anchors, height, width = shape
     return ((frame * anchors + anchor) * height + row) * width + column
 
@@ -140,8 +140,8 @@ def assign(
         label, anchor = label.repeat(len(steps)), anchor.repeat(len(steps))
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
-        places = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
-        assignment = Assignment(places, labels.boxes[label], ignored)
+        predictors = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
+        assignment = Assignment(predictors, labels.boxes[label], ignored)
         result.append(replace(assignment, ignored=ignored & ~assignment.positive))
     return result
 
@@ -161,7 +161,7 @@ def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shap
     cells = at.floor()[..., None] + offsets
     limit = at.new_tensor([shape[3], shape[2]])[:, None]
     near = ((cells + 0.5 - at[..., None]).abs() < reach[..., None]) & (cells >= 0) & (cells < limit)
-    which, row, column = (near[:, 1, :, None] & near[:, 0, None, :]).nonzero(as_tuple=True)
+    box, row, column = (near[:, 1, :, None] & near[:, 0, None, :]).nonzero(as_tuple=True)
     cells = cells.long()
-    touched[frame[which], anchor[which], cells[which, 1, row], cells[which, 0, column]] = True
+    touched[frame[box], anchor[box], cells[box, 1, row], cells[box, 0, column]] = True
     return touched

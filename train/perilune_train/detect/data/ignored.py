@@ -77,10 +77,10 @@ def unlabelled_craters(
     near = np.flatnonzero(near)
     shapes = project_circles(camera, centre[near], craters.normal[rows[near]] @ rotation.T, radius_m[near])
     box, radius = shapes.bounding_boxes(), shapes.radius_px()
-    seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
-    seen &= (radius >= low) & (radius <= high)
+    in_view = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
+    in_view &= (radius >= low) & (radius <= high)
     ellipse = [shapes.cx_px, shapes.cy_px, shapes.a_px, shapes.b_px, shapes.theta_rad]
-    return np.column_stack([box, radius, *ellipse])[seen]
+    return np.column_stack([box, radius, *ellipse])[in_view]
 
 
 def _right_size(

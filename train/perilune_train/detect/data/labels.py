@@ -78,14 +78,14 @@ class SplitLabels(Sequence[FrameLabels]):
         return len(self.bounds) - 1
 
     @overload
-    def __getitem__(self, place: int) -> FrameLabels: ...
+    def __getitem__(self, index: int) -> FrameLabels: ...
     @overload
-    def __getitem__(self, place: slice) -> list[FrameLabels]: ...
-    def __getitem__(self, place: int | slice) -> FrameLabels | list[FrameLabels]:
-        if isinstance(place, slice):
-            return [self[i] for i in range(*place.indices(len(self)))]
-        place = range(len(self))[place]
-        rows = slice(self.bounds[place], self.bounds[place + 1])
+    def __getitem__(self, index: slice) -> list[FrameLabels]: ...
+    def __getitem__(self, index: int | slice) -> FrameLabels | list[FrameLabels]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        index = range(len(self))[index]
+        rows = slice(self.bounds[index], self.bounds[index + 1])
         shape = self.shape[rows]
         return FrameLabels(
             shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[rows], self.labelled[rows], self.depth_ratio[rows]
@@ -105,18 +105,18 @@ def read_split_labels(
     """
     rows = dataset.table("frames", FRAME_COLUMNS)
     check = KeyCheck(dataset, rows)
-    place_of_row = (
+    frame_of_row = (
         pc.index_in(rows["frame_id"], pa.array(table["frame_id"].tolist(), rows["frame_id"].type))
         .fill_null(-1)
         .to_numpy()
     )
     names = list(dict.fromkeys([*_KEYS, *_THRESHOLDED, *_SHAPE]))
-    frames, sizes, own_places = _Joined(), [], share.of(len(table))
+    frames, sizes, share_frames = _Joined(), [], share.of(len(table))
     with dataset.parts_kept_open():
-        for scene_id, places in table.groupby("scene_id").indices.items():
+        for scene_id, scene_frames in table.groupby("scene_id").indices.items():
             labels = dataset.table("labels", names, scene_id=str(scene_id))
-            frame = place_of_row[check.add_labels(labels)]
-            wrong = (frame >= 0) & ~np.isin(frame, places)
+            frame = frame_of_row[check.add_labels(labels)]
+            wrong = (frame >= 0) & ~np.isin(frame, scene_frames)
             if wrong.any():
                 found = labels["frame_id"][int(wrong.argmax())].as_py()
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
@@ -124,12 +124,12 @@ def read_split_labels(
             craters = read_craters(dataset, str(scene_id))
             # Labels of another split have the index -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
-            labels, bounds = labels.take(order), np.searchsorted(frame[order], [*places, places[-1] + 1])
+            labels, bounds = labels.take(order), np.searchsorted(frame[order], [*scene_frames, scene_frames[-1] + 1])
             scene_labels = _SceneLabels.of(labels, craters, limits.selection)
             sizes.append((scene_labels.shape[:, 2:4] - scene_labels.shape[:, :2])[scene_labels.selected])
-            for place, start, stop in zip(places, bounds, bounds[1:], strict=False):
-                if place in own_places:
-                    part, row = slice(start, stop), table.iloc[place].to_dict()
+            for frame_index, start, stop in zip(scene_frames, bounds, bounds[1:], strict=False):
+                if frame_index in share_frames:
+                    part, row = slice(start, stop), table.iloc[frame_index].to_dict()
                     ids = scene_labels.crater_id[part]
                     ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, ids)
                     frames.add(

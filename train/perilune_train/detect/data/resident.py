@@ -31,7 +31,7 @@ _PORTION = 256
 class ResidentScale:
     """Assignments of all F frames for one scale, K rows each; frames with fewer rows are padded."""
 
-    places: Tensor
+    predictors: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
     boxes: Tensor
     """Box of its label: x0, y0, x1, y1 in pixels (F, K, 4)."""
@@ -42,9 +42,9 @@ class ResidentScale:
 
     def batch(self, numbers: Tensor) -> Assignment:
         """The assignment of a batch of frames (B,)."""
-        places, boxes = self.places[numbers], self.boxes[numbers]
-        frame = torch.arange(len(numbers), device=numbers.device)[:, None].expand(places.shape[:2])
-        rows = torch.cat([frame[..., None], places], -1).flatten(0, 1).T
+        predictors, boxes = self.predictors[numbers], self.boxes[numbers]
+        frame = torch.arange(len(numbers), device=numbers.device)[:, None].expand(predictors.shape[:2])
+        rows = torch.cat([frame[..., None], predictors], -1).flatten(0, 1).T
         return Assignment(rows, boxes.flatten(0, 1), self.ignored[numbers], self.counted[numbers].flatten())
 
 
@@ -90,17 +90,17 @@ class ResidentFrames:
 
 def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
     """Assignments of portions of the frames as arrays of constant length."""
-    places, boxes = [], []
+    predictors, boxes = [], []
     for part in parts:
-        order = torch.argsort(part.places[0], stable=True)
-        counts = torch.bincount(part.places[0], minlength=len(part.ignored)).tolist()
-        places += list(part.places[1:, order].T.split(counts))
+        order = torch.argsort(part.predictors[0], stable=True)
+        counts = torch.bincount(part.predictors[0], minlength=len(part.ignored)).tolist()
+        predictors += list(part.predictors[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
     counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
     # Pad with a box that has an area, since the loss is computed for all rows.
     filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
     return ResidentScale(
-        pad_sequence(places, batch_first=True).to(device),
+        pad_sequence(predictors, batch_first=True).to(device),
         (filled + filled.new_tensor([0, 0, 1, 1])).to(device),
         counted.to(device),
         torch.cat([part.ignored for part in parts]).to(device),

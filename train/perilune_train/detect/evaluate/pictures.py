@@ -84,14 +84,14 @@ def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) ->
     used: set[int] = set()
     chosen: dict[str, list[int]] = {}
     for name, order in orders.items():
-        seen: list[int] = []
+        picked: list[int] = []
         for others_too in (False, True):
             for index in order.tolist():
-                fresh = others_too or groups[index] not in [groups[other] for other in seen]
-                if len(seen) < count and index not in used and fresh:
-                    seen.append(index)
+                fresh = others_too or groups[index] not in [groups[other] for other in picked]
+                if len(picked) < count and index not in used and fresh:
+                    picked.append(index)
                     used.add(index)
-        chosen[name] = seen
+        chosen[name] = picked
     return {name: chosen[name] for name in ("best", "typical", "worst")}
 
 
@@ -102,9 +102,9 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
     f1 = evaluation.frame_f1()
     columns = 2 * count
     figure = Figure(figsize=(5 * columns, 5.2 * 3 + 0.5), layout="constrained")
-    places = {"best": 0, "typical": 1, "worst": 2}
+    row_of_name = {"best": 0, "typical": 1, "worst": 2}
     for name, index in rows:
-        panel = places[name] * columns + 2 * chosen[name].index(index)
+        panel = row_of_name[name] * columns + 2 * chosen[name].index(index)
         plain, drawn = (figure.add_subplot(3, columns, panel + k) for k in (1, 2))
         for axes in (plain, drawn):
             image = images[index]

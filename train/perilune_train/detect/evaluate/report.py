@@ -93,8 +93,8 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     lines += ["## Errors of detected craters", ""]
     errors = evaluation.errors
     rows = [
-        [name, *(number(errors[f"{key}_{ending}{which}"]) for ending in ("px", "relative"))]
-        for name, key, which in (
+        [name, *(number(errors[f"{key}_{ending}{statistic}"]) for ending in ("px", "relative"))]
+        for name, key, statistic in (
             ("centre, median", "centre_error", "_median"),
             ("centre, 95th percentile", "centre_error", "_p95"),
             ("radius, median", "radius_error", "_median"),

@@ -123,15 +123,15 @@ def features(name: str, detections: Detections, reference: Georeference) -> list
     angle = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     pixels = np.concatenate([centre[:, None], centre[:, None] + half[:, None] * ring], axis=1)
-    places = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
-    on_map = np.isfinite(places).all(axis=(1, 2))
-    places, centre, half, scores = places[on_map], centre[on_map], half[on_map], detections.scores[on_map]
-    places[:, 1:, 0] -= 360 * np.round((places[:, 1:, 0] - places[:, :1, 0]) / 360)
+    lon_lat_deg = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    on_map = np.isfinite(lon_lat_deg).all(axis=(1, 2))
+    lon_lat_deg, centre, half, scores = lon_lat_deg[on_map], centre[on_map], half[on_map], detections.scores[on_map]
+    lon_lat_deg[:, 1:, 0] -= 360 * np.round((lon_lat_deg[:, 1:, 0] - lon_lat_deg[:, :1, 0]) / 360)
     quarter = _CORNERS // 4
     sphere = Geod(a=MOON_RADIUS_M, b=MOON_RADIUS_M)
-    ends = ((places[:, 1 + k], places[:, 1 + k + 2 * quarter]) for k in (0, quarter))
+    ends = ((lon_lat_deg[:, 1 + k], lon_lat_deg[:, 1 + k + 2 * quarter]) for k in (0, quarter))
     along, across = (sphere.inv(*start.T, *end.T)[2] for start, end in ends)
-    rows = zip(places, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
+    rows = zip(lon_lat_deg, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
     return [
         {
             "type": "Feature",

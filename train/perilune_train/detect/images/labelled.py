@@ -180,9 +180,9 @@ def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
     images = pictures_of(folder)
     root = folder
     if not images:
-        places = [folder / name for name in _PICTURE_FOLDERS if (folder / name).is_dir()]
-        root = places[0] if places else folder
-        images = pictures_of(root, recursive=True) if places else []
+        picture_folders = [folder / name for name in _PICTURE_FOLDERS if (folder / name).is_dir()]
+        root = picture_folders[0] if picture_folders else folder
+        images = pictures_of(root, recursive=True) if picture_folders else []
     if not images:
         raise UserError(folder, "--images", "no PNG, TIFF or JPEG", "images with labels beside them")
     labels = [root, *(folder / name for name in _LABEL_FOLDERS if (folder / name).is_dir())]

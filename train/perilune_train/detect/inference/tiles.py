@@ -109,10 +109,10 @@ def _detect_tiles(
 ) -> Iterator[Detections]:
     """Detections of each tile, in pixels of the whole image, without boxes that another tile keeps."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
-    places = [(int(top), int(left)) for top in tops for left in lefts]
+    corners = [(int(top), int(left)) for top in tops for left in lefts]
     tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)
-    for first in range(0, len(places), detector.config.batch_size):
-        batch = places[first : first + detector.config.batch_size]
+    for first in range(0, len(corners), detector.config.batch_size):
+        batch = corners[first : first + detector.config.batch_size]
         tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
         predictions = detections_of(*detector.predict(tiles), detector.config.evaluation)
         for corner, detections in zip(batch, predictions, strict=True):

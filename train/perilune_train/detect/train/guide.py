@@ -24,7 +24,7 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
     `stride` pixels wide; values are taken at pixel centres.
     """
     boxes = torch.cat([painted.boxes for painted in targets]).float()
-    frame = torch.cat([painted.places[0] for painted in targets])
+    frame = torch.cat([painted.predictors[0] for painted in targets])
     # Several predictors learn a label.
     rows = torch.unique(torch.cat([frame[:, None].float(), boxes], 1), dim=0)
     rows = torch.cat([rows[:, :1], rows[:, 1:] / stride], 1)

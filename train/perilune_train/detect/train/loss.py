@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.data.assign import Targets, flat_places
+from perilune_train.detect.data.assign import Targets, flat_predictors
 from perilune_train.models.boxes import iou
 from perilune_train.models.yolo import decode
 
@@ -32,9 +32,9 @@ def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "sta
     size = (predicted[:, 2:] - predicted[:, :2]).clamp(min=0)
     size_label = (label[:, 2:] - label[:, :2]).clamp(min=0)
     overlap = iou(predicted, label)
-    around = torch.maximum(predicted[:, 2:], label[:, 2:]) - torch.minimum(predicted[:, :2], label[:, :2])
+    enclosing = torch.maximum(predicted[:, 2:], label[:, 2:]) - torch.minimum(predicted[:, :2], label[:, :2])
     shift = (predicted[:, :2] + predicted[:, 2:] - label[:, :2] - label[:, 2:]) / 2
-    distance = shift.square().sum(1) / (around.square().sum(1) + _TINY)
+    distance = shift.square().sum(1) / (enclosing.square().sum(1) + _TINY)
     angle = torch.atan2(size[:, 0] + _TINY, size[:, 1] + _TINY)
     if aspect == "circular":
         angle_label = torch.full_like(angle, math.pi / 4)
@@ -68,8 +68,8 @@ def detection_loss(
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
     total = sum(1 / stride for stride in strides)
     for raw, own_anchors, stride, assignment in zip(outputs, anchors, strides, targets, strict=True):
-        _, anchor, row, column = assignment.places
-        flat = flat_places(assignment.places, raw.shape[:4])
+        _, anchor, row, column = assignment.predictors
+        flat = flat_predictors(assignment.predictors, raw.shape[:4])
         chosen, cells = raw.flatten(0, 3)[flat].float(), torch.stack([column, row], 1)
         boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), assignment.boxes
         counted = None if assignment.counted is None else assignment.counted.float()

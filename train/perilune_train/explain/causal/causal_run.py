@@ -205,8 +205,8 @@ def _draw(folder: Path, pairs: CraterPairs, masks: dict, tables: dict[str, pd.Da
     bins.draw_bins(folder / "detections_causal.png", {"share of craters that are found": tables["detection_bins"]})
     bins.draw_gate_bins(folder / "bins_causal.png", tables["mask_bins"])
     image = int(np.bincount(pairs.craters["image"].to_numpy()).argmax())
-    both = {version: masks[version][gate] for version in ("factual", "rendered")}
-    pictures.draw_pair(folder / "before_after_causal.png", pairs, both, image, gate)
+    masks_of_pair = {version: masks[version][gate] for version in ("factual", "rendered")}
+    pictures.draw_pair(folder / "before_after_causal.png", pairs, masks_of_pair, image, gate)
 
 
 def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:

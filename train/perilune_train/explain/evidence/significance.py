@@ -199,10 +199,10 @@ class _Frames:
         """Values (N,) of one map and measure; NaN where a frame has none."""
         values = rows["value"].to_numpy(np.float64)
         aligned = np.full(len(self.ids), np.nan)
-        places = self.ids.get_indexer(pd.Index(rows["frame_id"].astype(str)))
-        if len(np.unique(places)) < len(places):
+        row_of_frame = self.ids.get_indexer(pd.Index(rows["frame_id"].astype(str)))
+        if len(np.unique(row_of_frame)) < len(row_of_frame):
             raise ValueError(f"two values of one frame for {rows['map'].iloc[0]}, {rows['measure'].iloc[0]}")
-        aligned[places] = values
+        aligned[row_of_frame] = values
         return aligned
 
     def mean(self, values: Array) -> _Mean:

@@ -71,20 +71,22 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     pose, noise_px = start, np.hypot(sightings.noise_px, sightings.static_px)
     size, size_sigma = np.log(sightings.radius_px), float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
     least_px = _LEAST_SIZE * float(sightings.radius_px.min())
-    places = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
-    catalogue = catalogue.part(places)
+    in_field = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
+    catalogue = catalogue.part(in_field)
     for gate_px in _GATES_PX:
-        seen = projected(catalogue, camera, pose, 3 * gate_px, least_px)
-        placed_px = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
+        expected = projected(catalogue, camera, pose, 3 * gate_px, least_px)
+        placed_px = camera.fx_px / expected.depth_m * catalogue.position_sigma_m
         seen_circles = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
-        expected_circles = Circles(seen.centre_px, np.log(seen.radius_px), placed_px)
+        expected_circles = Circles(expected.centre_px, np.log(expected.radius_px), placed_px)
         sighting, crater, error = matched(
             seen_circles, expected_circles, size_sigma**2 + (gate_px / 60) ** 2, _GATE_SIGMAS
         )
         if len(sighting) < _LEAST_MATCHES:
             return None
         centre_sigma = np.hypot(noise_px[sighting], placed_px[crater])
-        weight, normal, gradient = _normal_equations(error, centre_sigma, size_sigma, gate_px, seen.jacobian(crater))
+        weight, normal, gradient = _normal_equations(
+            error, centre_sigma, size_sigma, gate_px, expected.jacobian(crater)
+        )
         normal += precision
         gradient -= precision @ _offset(pose, prior.pose)
         pose = pose.changed(np.linalg.solve(normal, gradient))
@@ -96,7 +98,7 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
     return Fix(
-        pose, covariance, sighting, places[seen.index[crater]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2)))
+        pose, covariance, sighting, in_field[expected.index[crater]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2)))
     )
 
 

@@ -12,7 +12,7 @@ from perilune_train.compiled import compiled
 class Grid(NamedTuple):
     """N points in a grid of n x n cells, with about as many cells as points."""
 
-    place: Array
+    points: Array
     """The points (N, 2)."""
     n: int
     """Number of rows, and of columns."""
@@ -27,51 +27,51 @@ class Grid(NamedTuple):
 
 
 @compiled
-def grid_of(place: Array) -> Grid:
+def grid_of(points: Array) -> Grid:
     """Points (N, 2) in a grid."""
-    n = int(np.ceil(np.sqrt(max(len(place), 1))))
+    n = int(np.ceil(np.sqrt(max(len(points), 1))))
     corner, side = np.zeros(2), np.ones(2)
-    if len(place):
+    if len(points):
         for axis in range(2):
-            corner[axis] = place[:, axis].min()
-            side[axis] = max((place[:, axis].max() - corner[axis]) / n, 1e-9)
-    cell, begin = np.empty(len(place), np.int64), np.zeros(n * n + 1, np.int64)
-    for k in range(len(place)):
-        row, column = _cell(place[k, 1], corner[1], side[1], n), _cell(place[k, 0], corner[0], side[0], n)
+            corner[axis] = points[:, axis].min()
+            side[axis] = max((points[:, axis].max() - corner[axis]) / n, 1e-9)
+    cell, begin = np.empty(len(points), np.int64), np.zeros(n * n + 1, np.int64)
+    for k in range(len(points)):
+        row, column = _cell(points[k, 1], corner[1], side[1], n), _cell(points[k, 0], corner[0], side[0], n)
         cell[k] = row * n + column
         begin[cell[k] + 1] += 1
     begin = np.cumsum(begin)
-    following, order = begin.copy(), np.empty(len(place), np.int64)
-    for k in range(len(place)):
+    following, order = begin.copy(), np.empty(len(points), np.int64)
+    for k in range(len(points)):
         order[following[cell[k]]] = k
         following[cell[k]] += 1
-    return Grid(place, n, corner, side, begin, order)
+    return Grid(points, n, corner, side, begin, order)
 
 
 @compiled
-def _cell(place: float, corner: float, side: float, n: int) -> int:
+def _cell(coordinate: float, corner: float, side: float, n: int) -> int:
     """Index of the cell along an axis; the nearest cell for a coordinate outside the grid."""
-    return int(min(max((place - corner) / side, 0.0), n - 1.0))
+    return int(min(max((coordinate - corner) / side, 0.0), n - 1.0))
 
 
 @compiled
-def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def within_reach(positions: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For each of M positions (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
 
     Returns the index of the first pair of each position, with the number of pairs at the end (M + 1,), then the point
     of each pair.
     """
     grid = grid_of(others)
-    first, other, count = np.zeros(len(place) + 1, np.int64), np.empty(8 * len(place) + 1, np.int64), 0
-    for i in range(len(place)):
-        left = _cell(place[i, 0] - reach[i], grid.corner[0], grid.side[0], grid.n)
-        right = _cell(place[i, 0] + reach[i], grid.corner[0], grid.side[0], grid.n)
-        top = _cell(place[i, 1] - reach[i], grid.corner[1], grid.side[1], grid.n)
-        bottom = _cell(place[i, 1] + reach[i], grid.corner[1], grid.side[1], grid.n)
+    first, other, count = np.zeros(len(positions) + 1, np.int64), np.empty(8 * len(positions) + 1, np.int64), 0
+    for i in range(len(positions)):
+        left = _cell(positions[i, 0] - reach[i], grid.corner[0], grid.side[0], grid.n)
+        right = _cell(positions[i, 0] + reach[i], grid.corner[0], grid.side[0], grid.n)
+        top = _cell(positions[i, 1] - reach[i], grid.corner[1], grid.side[1], grid.n)
+        bottom = _cell(positions[i, 1] + reach[i], grid.corner[1], grid.side[1], grid.n)
         for row in range(top, bottom + 1):
             for k in range(grid.begin[row * grid.n + left], grid.begin[row * grid.n + right + 1]):
                 j = grid.order[k]
-                if abs(place[i, 0] - others[j, 0]) <= reach[i] and abs(place[i, 1] - others[j, 1]) <= reach[i]:
+                if abs(positions[i, 0] - others[j, 0]) <= reach[i] and abs(positions[i, 1] - others[j, 1]) <= reach[i]:
                     if count == len(other):
                         other = np.append(other, other)
                     other[count] = j
@@ -83,7 +83,7 @@ def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.
 @compiled
 def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
     """The `count` points nearest to a position, nearest first, or all points if there are fewer."""
-    count = min(count, len(grid.place))
+    count = min(count, len(grid.points))
     nearest_points, squared = np.empty(count, np.int64), np.full(count, np.inf)
     column, row = _cell(x, grid.corner[0], grid.side[0], grid.n), _cell(y, grid.corner[1], grid.side[1], grid.n)
     for ring in range(grid.n):
@@ -97,7 +97,7 @@ def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
                     continue
                 for k in range(grid.begin[down * grid.n + right], grid.begin[down * grid.n + right + 1]):
                     j = grid.order[k]
-                    apart = (grid.place[j, 0] - x) ** 2 + (grid.place[j, 1] - y) ** 2
+                    apart = (grid.points[j, 0] - x) ** 2 + (grid.points[j, 1] - y) ** 2
                     if not count or apart >= squared[count - 1]:
                         continue
                     # Insert in order of distance.

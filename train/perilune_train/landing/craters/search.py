@@ -178,18 +178,18 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     none = _Placements(np.zeros(0), np.zeros(0), np.zeros((0, 2)))
     low, high = area.altitude_m
     width = camera.width_px / camera.fx_px
-    seen = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
-    seen = seen.part(seen.index[:, 0] < seen.index[:, 1])
-    if not len(seen.index):
+    sighting_pairs = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
+    sighting_pairs = sighting_pairs.part(sighting_pairs.index[:, 0] < sighting_pairs.index[:, 1])
+    if not len(sighting_pairs.index):
         return none
-    most = np.exp(seen.separation.max()) * high
-    known = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
-    if not len(known.index):
+    most = np.exp(sighting_pairs.separation.max()) * high
+    catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
+    if not len(catalogue_pairs.index):
         return none
     # At the middle of the range of altitudes, separations differ by at most half of the range.
-    middle = replace(seen, separation=seen.separation + np.log(low * high) / 2)
+    middle = replace(sighting_pairs, separation=sighting_pairs.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
-    tree = KDTree(known.places(log_range, area.heading_rad))
+    tree = KDTree(catalogue_pairs.places(log_range, area.heading_rad))
     distance, second = tree.query(
         middle.places(log_range, area.heading_rad), _MOST_HITS, distance_upper_bound=_FARTHEST
     )
@@ -197,10 +197,10 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     second = second[first, hit]
     if not len(first):
         return none
-    heading = (known.direction[second] - seen.direction[first] + np.pi) % (2 * np.pi) - np.pi
-    altitude = np.exp(known.separation[second] - seen.separation[first])
-    middle_seen = offset[seen.index[first]].mean(axis=1)
-    middle_known = local.centre_m[known.index[second], :2].mean(axis=1)
+    heading = (catalogue_pairs.direction[second] - sighting_pairs.direction[first] + np.pi) % (2 * np.pi) - np.pi
+    altitude = np.exp(catalogue_pairs.separation[second] - sighting_pairs.separation[first])
+    middle_seen = offset[sighting_pairs.index[first]].mean(axis=1)
+    middle_known = local.centre_m[catalogue_pairs.index[second], :2].mean(axis=1)
     position = middle_known - altitude[:, None] * _turned(middle_seen, heading)
     near = np.linalg.norm(position - area.centre_m, axis=1) <= area.reach_m
     return _Placements(altitude, heading, position).part(near)

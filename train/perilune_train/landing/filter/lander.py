@@ -68,8 +68,10 @@ def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surrou
     """
     if not (np.isfinite(range_m) and range_m > 0):
         return np.zeros(len(surroundings), bool)
-    places = zip(stretch.position_m, surroundings, strict=True)
-    ground_m = np.array([around.catalogue.ground_m(position, _NEAREST) for position, around in places])
+    positions_and_surroundings = zip(stretch.position_m, surroundings, strict=True)
+    ground_m = np.array(
+        [local.catalogue.ground_m(position, _NEAREST) for position, local in positions_and_surroundings]
+    )
     return stretch.range(range_m, ground_m, surroundings[0].range_sigma_m)
 
 
@@ -156,8 +158,8 @@ class Lander:
             self.state = self.state.keeping_pose()
         return located
 
-    def _matched(self, seen: Sightings) -> Located | None:
-        located = locate(seen, self._around.catalogue, self._around.camera, self._expected())
+    def _matched(self, sightings: Sightings) -> Located | None:
+        located = locate(sightings, self._around.catalogue, self._around.camera, self._expected())
         if located is None:
             self._unmatched()
             return None
@@ -168,8 +170,8 @@ class Lander:
                 return None
             self._restart(located)
         else:
-            around = self._around
-            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting)
+            local = self._around
+            self.state = craters_update(self.state, fix, sightings, local.catalogue, local.camera, mounting)
         self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
         return located
 

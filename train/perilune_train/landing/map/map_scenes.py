@@ -130,7 +130,7 @@ def _picture(image: NDArray[np.uint8], view: View, both: Matched) -> NDArray[np.
     for centre, radius, twice in zip(
         centres.tolist(), view.sightings.radius_px.tolist(), in_both.tolist(), strict=True
     ):
-        if all(-radius < place < _WINDOW_PX + radius for place in centre):
+        if all(-radius < coordinate < _WINDOW_PX + radius for coordinate in centre):
             spot = (round(8 * (centre[0] - 0.5)), round(8 * (centre[1] - 0.5)))
             cv2.circle(canvas, spot, round(8 * radius), _BOTH if twice else _ONE, 1, cv2.LINE_AA, 3)
     return np.asarray(canvas, np.uint8)

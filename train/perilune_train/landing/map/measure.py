@@ -37,17 +37,17 @@ def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFr
     table = []
     for low, high in itertools.pairwise(DIAMETERS_M):
         in_bin = (2 * mapped.radius_m >= low) & (2 * mapped.radius_m < high)
-        good, there = in_bin & true, covered & (2 * exact.radius_m >= low) & (2 * exact.radius_m < high)
+        mapped_true, true_in_bin = in_bin & true, covered & (2 * exact.radius_m >= low) & (2 * exact.radius_m < high)
         table.append(
             {
                 "diameter_m": f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or more",
                 "mapped": int(in_bin.sum()),
                 "true_share": _mean(true[in_bin]),
-                "found_share": _mean(is_found[there]),
-                "position_rmse_m": _rms(error_m[good][:, :2]),
-                "height_rmse_m": _rms(error_m[good][:, 2]),
-                "diameter_bias_share": _mean(by_size[good]),
-                "diameter_sigma_share": float(by_size[good].std()) if good.any() else np.nan,
+                "found_share": _mean(is_found[true_in_bin]),
+                "position_rmse_m": _rms(error_m[mapped_true][:, :2]),
+                "height_rmse_m": _rms(error_m[mapped_true][:, 2]),
+                "diameter_bias_share": _mean(by_size[mapped_true]),
+                "diameter_sigma_share": float(by_size[mapped_true].std()) if mapped_true.any() else np.nan,
             }
         )
     return pd.DataFrame(table)

@@ -156,12 +156,14 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
         height = np.zeros(len(view.sightings))
         for _ in range(3):
             height = ground.at(view.place_m(height))
-        place, radius = view.place_m(height)[part], view.radius_m(height)[part]
+        position, radius = view.place_m(height)[part], view.radius_m(height)[part]
         noise_m = radius / view.sightings.radius_px[part] * view.sightings.noise_px[part]
-        points.append((place, radius, noise_m))
+        points.append((position, radius, noise_m))
     typical = float(np.median(np.concatenate([noise for _, _, noise in points]))) * 2**0.5
     scale = np.array([np.hypot(steepness * ground.sigma_m, typical), typical, _SIZE_SIGMA]) * _GATE
-    spots = [np.column_stack([place @ along, place @ across, np.log(radius)]) / scale for place, radius, _ in points]
+    spots = [
+        np.column_stack([position @ along, position @ across, np.log(radius)]) / scale for position, radius, _ in points
+    ]
     trees = [KDTree(spot) for spot in spots]
     _, forth = trees[1].query(spots[0], p=2)
     _, back = trees[0].query(spots[1], p=2)
@@ -179,10 +181,10 @@ def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
     apart = start[1][:2] + rays[1][:, :2] * start[1][2] - start[0][:2] - rays[0][:, :2] * start[0][2]
     by_height = rays[0][:, :2] - rays[1][:, :2]
     height = -(apart * by_height).sum(axis=1) / np.square(by_height).sum(axis=1)
-    place = start[0][:2] + rays[0][:, :2] * (start[0][2] - height)[:, None]
-    raw = Ground(place, height)
-    off = height - raw.at(place, without_nearest=True)
+    position = start[0][:2] + rays[0][:, :2] * (start[0][2] - height)[:, None]
+    raw = Ground(position, height)
+    off = height - raw.at(position, without_nearest=True)
     sigma = max(1.4826 * float(np.median(np.abs(off))), _LEAST_RELIEF_M) if len(off) > _NEIGHBOURS else _RELIEF_M
     good = np.abs(off) < 4 * sigma
-    kept = Ground(place[good], height[good], sigma)
-    return Ground(place, np.where(good, height, kept.at(place)), sigma)
+    kept = Ground(position[good], height[good], sigma)
+    return Ground(position, np.where(good, height, kept.at(position)), sigma)

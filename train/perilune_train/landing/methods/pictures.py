@@ -56,11 +56,11 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
     figure = Figure(figsize=(14, 2.2 * len(groups) + 0.6), layout="constrained")
     axes = figure.subplots(len(groups), 3, squeeze=False, sharex=True)
     for row, (ids, flight) in zip(axes, groups, strict=True):
-        for axis, place in zip("xyz", row, strict=True):
-            draw_band(place, flight, axis)
-            _label(place, f"{'/'.join(map(str, ids))}: {axis}", "", "m")
-    for place in axes[-1]:
-        place.set_xlabel("time (s)")
+        for axis, panel in zip("xyz", row, strict=True):
+            draw_band(panel, flight, axis)
+            _label(panel, f"{'/'.join(map(str, ids))}: {axis}", "", "m")
+    for panel in axes[-1]:
+        panel.set_xlabel("time (s)")
     axes[0, 0].legend()
     save_figure(path, figure)
 

@@ -50,12 +50,12 @@ def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -
     with progress_bar() as progress:
         bar = progress.add_task("detect", total=n_frames, unit="frames", note="")
         for trajectory in trajectories:
-            seen = []
+            sightings = []
             for start in range(0, len(trajectory.images), _BATCH):
                 begun = time.perf_counter()
                 for predicted in detect_at_scales(detector, trajectory.images[start : start + _BATCH]):
                     kept = above(predicted, threshold)
-                    seen.append(Sightings.of_boxes(kept.boxes, kept.scores))
+                    sightings.append(Sightings.of_boxes(kept.boxes, kept.scores))
                 seconds += time.perf_counter() - begun
                 progress.advance(bar, len(trajectory.images[start : start + _BATCH]))
             rows = dataset.table("frames", ["time_s", "velocity_mps"], *trajectory.ids).sort_by("time_s")
@@ -65,6 +65,6 @@ def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -
             first = np.array(rows["velocity_mps"][0].as_py())
             level = trajectory.nominal_rotation_camera_from_site
             descents.append(
-                SeenDescent(trajectory.ids, trajectory.camera, rows["time_s"].to_numpy(), true, first, level, seen)
+                SeenDescent(trajectory.ids, trajectory.camera, rows["time_s"].to_numpy(), true, first, level, sightings)
             )
     return descents, seconds / n_frames

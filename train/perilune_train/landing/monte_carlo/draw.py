@@ -70,11 +70,11 @@ def _none() -> Sightings:
     return Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
-def _with_false(seen: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
+def _with_false(sightings: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
     """Add a false sighting for each sighting, of the same sizes and scores, anywhere in the image."""
-    places = rng.permutation(len(seen))
-    centre = np.concatenate([seen.centre_px, rng.uniform(0, size_px, (len(seen), 2))])
-    radius = np.concatenate([seen.radius_px, seen.radius_px[places]])
-    score = np.concatenate([seen.score, seen.score[places]])
+    shuffled = rng.permutation(len(sightings))
+    centre = np.concatenate([sightings.centre_px, rng.uniform(0, size_px, (len(sightings), 2))])
+    radius = np.concatenate([sightings.radius_px, sightings.radius_px[shuffled]])
+    score = np.concatenate([sightings.score, sightings.score[shuffled]])
     order = np.argsort(-radius, kind="stable")
     return Sightings(centre[order], radius[order], score[order])

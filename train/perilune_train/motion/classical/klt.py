@@ -114,9 +114,9 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
     warp = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP}
     index_homography = pixel_index_homography(homography)
     warped = cv2.warpPerspective(image_2, index_homography, size, **warp)
-    seen = cv2.warpPerspective(np.full_like(image_2, 255), index_homography, size, **warp)
-    seen = cv2.erode(seen, np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8))
-    corners = cv2.goodFeaturesToTrack(image_1, _N_CORNERS, 0.001, 5, mask=seen)
+    covered = cv2.warpPerspective(np.full_like(image_2, 255), index_homography, size, **warp)
+    covered = cv2.erode(covered, np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8))
+    corners = cv2.goodFeaturesToTrack(image_1, _N_CORNERS, 0.001, 5, mask=covered)
     if corners is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     window = (_WINDOW_PX, _WINDOW_PX)

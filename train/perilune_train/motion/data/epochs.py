@@ -1,7 +1,5 @@
 """Order and augmentation of the sequences of every epoch of navigation training."""
 
-from dataclasses import replace
-
 import numpy as np
 from torch.utils import data as torch_data
 
@@ -45,14 +43,14 @@ class TrainingSequences(torch_data.Dataset):
     def keys(self, epoch: int) -> list[Key]:
         """Keys of the share's sequences in the order of an epoch."""
         rng = np.random.default_rng([self.seed, epoch])
-        places = [
+        windows = [
             (number, int(start))
             for number, (trajectory, count) in enumerate(zip(self.trajectories, self.counts, strict=True))
             for start in rng.integers(0, trajectory.n_pairs - self.n_pairs + 1, count)
         ]
-        rng.shuffle(places)
+        rng.shuffle(windows)
         numbers = set(self.share.of(len(self.trajectories)))
-        return [(epoch, place, *sequence) for place, sequence in enumerate(places) if sequence[0] in numbers]
+        return [(epoch, position, *sequence) for position, sequence in enumerate(windows) if sequence[0] in numbers]
 
     def __getitem__(self, key: Key) -> Sequence:
         _, _, number, start = key
@@ -60,7 +58,6 @@ class TrainingSequences(torch_data.Dataset):
 
     def augmented_sequence(self, key: Key, trajectory: Trajectory, start: int) -> Sequence:
         """The pairs of a trajectory from `start` on, with the augmentation of a key."""
-        epoch, place, number, first = key
-        rng = np.random.default_rng([self.seed, epoch, place]) if self.warp else None
-        sequence = pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)
-        return replace(sequence, place=(number, first))
+        epoch, position, _, _ = key
+        rng = np.random.default_rng([self.seed, epoch, position]) if self.warp else None
+        return pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)

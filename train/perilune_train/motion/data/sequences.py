@@ -40,8 +40,6 @@ class Sequence:
     """Nominal altitudes (n,), metres, at the earlier frames."""
     down_c: Array
     """Unit vector (3,) towards the ground in O_C of a level body, mirrored with the frames."""
-    place: tuple[int, int] = (0, 0)
-    """Number of the trajectory and first pair."""
     flow_px: Array | None = None
     """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), pixels, from first to second."""
 

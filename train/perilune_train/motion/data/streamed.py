@@ -59,8 +59,8 @@ class StreamedSequences(TrainingSequences):
 
     def poses(self, key: Key) -> tuple[Trajectory, np.ndarray, int]:
         """The poses of a rendered sequence, without images, their velocities (n, 3), O_L, and the first noise index."""
-        epoch, place, number, start = key
-        rng = np.random.default_rng([self.stream.settings.seed, epoch, place])
+        epoch, position, number, start = key
+        rng = np.random.default_rng([self.stream.settings.seed, epoch, position])
         angle, index = rng.uniform(0, 2 * np.pi), int(rng.integers(_INDICES))
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

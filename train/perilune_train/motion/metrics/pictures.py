@@ -99,11 +99,11 @@ def draw_errors(path: Path, errors: dict[str, pd.DataFrame]) -> None:
             axis.plot(values, np.arange(1, len(values) + 1) / len(values), color=COLOURS.get(method), label=method)
     _label(axes[0], "position error of a step", "length of the error vector (m)", "fraction of pairs below")
     _label(axes[1], "orientation error of a step", "residual rotation angle (deg)", "fraction of pairs below")
-    place, width = np.arange(3), 0.8 / len(errors)
+    bar_position, width = np.arange(3), 0.8 / len(errors)
     for i, (method, table) in enumerate(errors.items()):
         heights = [float(np.sqrt(np.mean(table[f"error_{axis}_m"] ** 2))) for axis in "xyz"]
-        axes[2].bar(place + i * width, heights, width, color=COLOURS.get(method), label=method)
-    axes[2].set_xticks(place + 0.4 - width / 2, ["x", "y", "z (view)"])
+        axes[2].bar(bar_position + i * width, heights, width, color=COLOURS.get(method), label=method)
+    axes[2].set_xticks(bar_position + 0.4 - width / 2, ["x", "y", "z (view)"])
     _label(axes[2], "position RMSE of each component, by axis of O_C", "", "RMSE (m)")
     axes[0].legend()
     save_figure(path, figure)

@@ -43,10 +43,10 @@ class WindowPlaces(TrainingSequences):
     """Number of versions in addition to the trajectories themselves."""
 
     def __getitem__(self, key: Key) -> tuple[int, int]:  # type: ignore[override]
-        epoch, place, number, start = key
+        epoch, position, number, start = key
         if not self.views:
             return number, start
-        version = int(np.random.default_rng([self.seed, epoch, place]).integers(self.views + 1))
+        version = int(np.random.default_rng([self.seed, epoch, position]).integers(self.views + 1))
         return version * len(self.trajectories) + number, start
 
 

@@ -31,8 +31,8 @@ def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -
     shares = list(curve)
     for key, name in _AP_LINES.items():
         heights = [curve[share].get(key) for share in shares]
-        known = [(place, value) for place, value in enumerate(heights) if isinstance(value, int | float)]
-        axes.plot([place for place, _ in known], [value for _, value in known], marker="o", label=name)
+        known = [(position, value) for position, value in enumerate(heights) if isinstance(value, int | float)]
+        axes.plot([position for position, _ in known], [value for _, value in known], marker="o", label=name)
     axes.axhline(TARGET_AP, color="black", linestyle="--", label=f"the paper's YOLOv3, {TARGET_AP:.3f}")
     if headline in shares:
         axes.axvline(shares.index(headline), color="gray", linestyle=":", label="headline ground")

@@ -217,7 +217,7 @@ def _causes(runs: PaperRuns) -> list[str]:
 
 def _learning(runs: PaperRuns) -> list[str]:
     navigators = {
-        reading: {name: runs.navigator(navigate_name(own, reading)) for name, own in NAVIGATORS.items()}
+        reading: {name: runs.navigator(navigate_name(network, reading)) for name, network in NAVIGATORS.items()}
         for reading in READINGS
     }
     panels = {
@@ -225,7 +225,9 @@ def _learning(runs: PaperRuns) -> list[str]:
             AP_KEY,
             {NAMES[network]: runs.detector(detect_name(network)) for network in ATTENTION},
         ),
-        **{f"navigators, {reading}": (POSITION_KEY, own) for reading, own in navigators.items()},
+        **{
+            f"navigators, {reading}": (POSITION_KEY, runs_of_network) for reading, runs_of_network in navigators.items()
+        },
     }
     drawn = draw_learning(runs.root / "learning.png", panels)
     return ["![Learning curves](learning.png)"] if drawn else [NOT_RUN]

@@ -115,8 +115,8 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
     rows = []
     navigation = runs.navigation(reading)
     for network, claimed in NAVIGATION.items():
-        given = [f"{claimed['position_m']:g}", "-", f"{claimed['orientation_deg']:g}", f"{claimed['seconds']:g}"]
-        rows.append([network, "the paper", *given])
+        cells = [f"{claimed['position_m']:g}", "-", f"{claimed['orientation_deg']:g}", f"{claimed['seconds']:g}"]
+        rows.append([network, "the paper", *cells])
         if network in navigation:
             metrics = navigation[network]
             floor = lost_to(metrics)

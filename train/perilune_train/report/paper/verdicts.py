@@ -68,8 +68,8 @@ def _measured(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics]) -
         return "-"
     size = max(map(abs, known), default=0.0)
     # Four digits, so that small differences show.
-    places = max(0, 3 - math.floor(math.log10(size))) if size else 3
-    return f"{values(attended, key, places)} against {values(plain, key, places)}"
+    digits = max(0, 3 - math.floor(math.log10(size))) if size else 3
+    return f"{values(attended, key, digits)} against {values(plain, key, digits)}"
 
 
 def _of(answer: Answer, trainings: str) -> str:
@@ -125,17 +125,17 @@ def _as_fast(runs: PaperRuns) -> Verdict:
     scored = [runs.scored(name) for name in NAVIGATORS.values()]
     pairs["locked benchmark"] = [metrics for metrics in scored if metrics is not None]
     key, ratios, listed = "test/ms_per_single_pair", [], []
-    for where, both in pairs.items():
-        times = numbers(both, key)
+    for setting, metrics_of_networks in pairs.items():
+        times = numbers(metrics_of_networks, key)
         if len(times) < 2:
             continue
         without, with_ = times
-        alike = len({(metrics.get("run/hardware"), _program(metrics)) for metrics in both}) == 1
+        alike = len({(metrics.get("run/hardware"), _program(metrics)) for metrics in metrics_of_networks}) == 1
         ratios += [with_ / without] if alike else []
         note = "" if alike else ", different machines or commands, not compared"
-        loads = " and ".join(f"{value:g}" for value in reversed(numbers(both, "run/load")))
+        loads = " and ".join(f"{value:g}" for value in reversed(numbers(metrics_of_networks, "run/load")))
         load = f" at load {loads}" if loads else ""
-        listed.append(f"{where}: {with_ / 1e3:.3f} s against {without / 1e3:.3f} s{load}{note}")
+        listed.append(f"{setting}: {with_ / 1e3:.3f} s against {without / 1e3:.3f} s{load}{note}")
     if not ratios:
         return Verdict(claim, claimed, "; ".join(listed) or "-", "-", "not measured")
     # Above, below or within the tolerance.

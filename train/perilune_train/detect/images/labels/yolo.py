@@ -90,11 +90,11 @@ def pictures_of_split(path: Path, value: Any) -> list[Path]:
     images = []
     for name in value if isinstance(value, list) else [value]:
         # Roboflow writes ../test/images for a folder beside the file.
-        place = below(root, name.removeprefix("../") if isinstance(name, str) else name, path, "split")
-        if place.is_dir():
-            images += pictures_of(place, recursive=True)
-        elif place.suffix == _LISTED_SUFFIX:
-            images += listed_pictures(place)
+        pictures = below(root, name.removeprefix("../") if isinstance(name, str) else name, path, "split")
+        if pictures.is_dir():
+            images += pictures_of(pictures, recursive=True)
+        elif pictures.suffix == _LISTED_SUFFIX:
+            images += listed_pictures(pictures)
         else:
             raise UserError(path, "split", name, "a folder of images, or a list of their paths (.txt)")
     return images
