@@ -211,14 +211,14 @@ def test_the_task_chooses_the_networks(dataset_detect, tmp_path, monkeypatch):
     monkeypatch.setattr(explained, "explain_run", lambda *given: calls.append(given) or RunFolder(tmp_path / "made"))
     common = ("explain", "--out", tmp_path, "--name", "a", "--dataset", "data")
     assert in_process.call(main, *common, "--task", "detect").returncode == 0
-    installed = shipped_run("detect")
-    assert calls[-1][1:5] == ("data/detect", "data/nav", installed / "weights.safetensors", None)
+    assert calls[-1][2:4] == (NetworkOnData(shipped_run("detect") / "weights.safetensors", "data/detect"), None)
     (tmp_path / "detect" / "a").mkdir(parents=True)
     assert in_process.call(main, *common, "--task", "detect").returncode == 0
-    own = tmp_path / "detect/a/checkpoints/best.ckpt", tmp_path / "navigate/a-stack/checkpoints/best.ckpt"
-    assert calls[-1][3:5] == (own[0], None)
-    assert in_process.call(main, *common).returncode == 0 and calls[-1][3:5] == own
-    assert in_process.call(main, *common, "--task", "navigate").returncode == 0 and calls[-1][3:5] == (None, own[1])
+    detector = NetworkOnData(tmp_path / "detect/a/checkpoints/best.ckpt", "data/detect")
+    navigator = NetworkOnData(tmp_path / "navigate/a-stack/checkpoints/best.ckpt", "data/nav")
+    assert calls[-1][2:4] == (detector, None)
+    assert in_process.call(main, *common).returncode == 0 and calls[-1][2:4] == (detector, navigator)
+    assert in_process.call(main, *common, "--task", "navigate").returncode == 0 and calls[-1][2:4] == (None, navigator)
     refused = in_process.call(main, *common, "--task", "detect", "--navigator", "a.ckpt")
     assert refused.returncode == 2 and refused.stderr.startswith("error: --navigator: option: got a.ckpt, expected")
 
