@@ -5,7 +5,7 @@ Two craters determine position, heading and altitude of a level camera. Steps:
 1. `_in_reach` selects the craters that the camera may see from the area.
 2. `_Pairs.of` forms ordered pairs of sightings and of craters.
 3. `_placements` looks up each pair of sightings among the pairs of craters in a tree over their ratios of size to
-separation, their separation and their direction. Each hit gives a placement of the camera.
+   separation, their separation and their direction. Each hit gives a placement of the camera.
 4. `_agreed` counts the sightings that agree with a crater under each placement.
 5. `search` returns the best placements that differ, as hypotheses.
 

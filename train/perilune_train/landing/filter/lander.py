@@ -163,15 +163,17 @@ class Lander:
         if located is None:
             self._unmatched()
             return None
-        fix, mounting = located.fix, self._around.rotation_camera_from_body
-        if not pose_fits(self.state, fix.pose, fix.covariance, mounting):
+        fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
+        if not pose_fits(self.state, fix.pose, fix.covariance, rotation_camera_from_body):
             if not self._replaces(fix):
                 self._unmatched()
                 return None
             self._restart(located)
         else:
             local = self._around
-            self.state = craters_update(self.state, fix, sightings, local.catalogue, local.camera, mounting)
+            self.state = craters_update(
+                self.state, fix, sightings, local.catalogue, local.camera, rotation_camera_from_body
+            )
         self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
         return located
 
@@ -199,30 +201,32 @@ class Lander:
 
     def _restart(self, located: Located) -> None:
         """Take position and attitude from a fix, and add `_UNKNOWN_VELOCITY_MPS` to the uncertainty of the velocity."""
-        fix, mounting = located.fix, self._around.rotation_camera_from_body
+        fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
         state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
         covariance = state.covariance.copy()
         for part in (POSITION, ATTITUDE):
             covariance[part], covariance[:, part] = 0, 0
         covariance[VELOCITY, VELOCITY] += np.eye(3) * _UNKNOWN_VELOCITY_MPS**2
         body = np.zeros((6, 6))
-        body[:3, :3], body[3:, 3:] = np.eye(3), -mounting.T
+        body[:3, :3], body[3:, 3:] = np.eye(3), -rotation_camera_from_body.T
         of_body = body @ fix.covariance @ body.T
         covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = of_body[:3, :3], of_body[3:, 3:]
         covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = of_body[:3, 3:], of_body[3:, :3]
         self.state = replace(
             state,
             position_m=fix.pose.position_m,
-            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ mounting,
+            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ rotation_camera_from_body,
             covariance=covariance,
         )
 
     def _expected(self) -> PosePrior:
         """The expected pose of the camera, with its covariance (6, 6): shift, metres, O_L, then turn from the left,
         radians, O_C."""
-        mounting, state = self._around.rotation_camera_from_body, self.state
+        rotation_camera_from_body, state = self._around.rotation_camera_from_body, self.state
         pose_parts = [*range(3), *range(6, 9)]
         to_camera = np.zeros((6, 6))
-        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -mounting
+        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -rotation_camera_from_body
         covariance = to_camera @ state.covariance[np.ix_(pose_parts, pose_parts)] @ to_camera.T
-        return PosePrior(Pose(state.position_m, mounting @ state.rotation_site_from_body.T), covariance)
+        return PosePrior(
+            Pose(state.position_m, rotation_camera_from_body @ state.rotation_site_from_body.T), covariance
+        )

@@ -108,11 +108,11 @@ def lander_of(
     smooth: bool = False,
 ) -> Lander:
     """The lander at the first frame; with `smooth` it keeps the pose of every frame."""
-    mounting, error = rotation_camera_from_body, start.error
-    pose = descent.true[0].changed(np.concatenate([error[:3], mounting @ error[6:]]))
-    attitude = pose.rotation_camera_from_site.T @ mounting
+    error = start.error
+    pose = descent.true[0].changed(np.concatenate([error[:3], rotation_camera_from_body @ error[6:]]))
+    attitude = pose.rotation_camera_from_site.T @ rotation_camera_from_body
     state = State.starting(pose.position_m, descent.velocity_mps + error[3:6], attitude, start.sigmas, RELIEF_M)
-    surroundings = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
+    surroundings = Surroundings(descent.camera, rotation_camera_from_body, catalogue, RANGE_SIGMA_M, RELIEF_M)
     return Lander(state, InertialNoise.of(GRADES[start.grade]), surroundings, keep_poses=smooth)
 
 

@@ -5,7 +5,7 @@ grid over the ground (25). Steps for each level of an image pyramid, coarsest fi
 
 1. Project the pixels of frame 1 onto the ground and into frame 2 (`_Residuals.normal_equations`).
 2. Compare local contrast (contrast.py), with Tukey's weights (Beaton & Tukey 1974, doi
-10.1080/00401706.1974.10489171).
+   10.1080/00401706.1974.10489171).
 3. Take a Gauss-Newton step, with the prior of motion, tilt and heights (`align`).
 
 Lucas & Kanade 1981; with free heights as in direct odometry, Engel et al. 2018, doi 10.1109/TPAMI.2017.2658577. Along a

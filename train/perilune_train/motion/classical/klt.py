@@ -2,10 +2,10 @@
 
 1. Warp frame 2 onto frame 1 by the expected motion, so that only a small residual at one scale is left.
 2. Find corners in frame 1, track them into frame 2 and back, and drop tracks that do not return (`_tracks`). Lucas &
-Kanade 1981, with pyramids after Bouguet 2001, as in OpenCV.
+   Kanade 1981, with pyramids after Bouguet 2001, as in OpenCV.
 3. Project the corners of frame 1 onto the ground plane at the estimated altitude.
 4. Fit the motion by Gauss-Newton on the reprojection error, with Tukey's weights and a weak prior (`_fit`). Beaton
-& Tukey 1974, doi 10.1080/00401706.1974.10489171.
+   & Tukey 1974, doi 10.1080/00401706.1974.10489171.
 """
 
 from dataclasses import dataclass

@@ -174,6 +174,8 @@ def _split_trajectories(
 
 
 def _gyroscopes(dataset: Dataset, trajectory: Trajectory, rows: pd.DataFrame) -> dict[InertialGrade, GyroscopeTurns]:
-    time_s, mounting = rows["time_s"].to_numpy(), trajectory.nominal_rotation_camera_from_site
-    measured = {grade: gyroscope_turns(dataset, trajectory.ids, grade, time_s, mounting) for grade in GRADES}
+    time_s, rotation_camera_from_site = rows["time_s"].to_numpy(), trajectory.nominal_rotation_camera_from_site
+    measured = {
+        grade: gyroscope_turns(dataset, trajectory.ids, grade, time_s, rotation_camera_from_site) for grade in GRADES
+    }
     return {grade: turns for grade, turns in measured.items() if turns is not None}
