@@ -54,8 +54,8 @@ class Scales:
             rotation_rad = max(float(np.sqrt(np.mean(turns**2))), 1e-6)
             return cls(position.mean(0).tolist(), spread_m, rotation_rad, mean.tolist())
         translation = np.concatenate([trajectory.motion[0] for trajectory in trajectories])
-        rotation = rotation_vectors(np.concatenate([trajectory.motion[1] for trajectory in trajectories]))
-        rotation_rad = max(float(np.sqrt(np.mean(rotation**2))), 1e-6)
+        rotation_vectors_rad = rotation_vectors(np.concatenate([trajectory.motion[1] for trajectory in trajectories]))
+        rotation_rad = max(float(np.sqrt(np.mean(rotation_vectors_rad**2))), 1e-6)
         if fusion == "stack":
             return cls(translation.mean(0).tolist(), np.maximum(translation.std(0), 1e-3).tolist(), rotation_rad)
         residual = translation - np.concatenate([trajectory.nominal_motion[0] for trajectory in trajectories])
@@ -147,14 +147,14 @@ class Collate:
 
     def __call__(self, sequences: list[Sequence]) -> Batch:
         reference, unit = translation_units(sequences, self.scales, self.fusion)
-        rotation = stacked([sequence.rotation_c2_from_c1 for sequence in sequences])
+        rotation_c2_from_c1 = stacked([sequence.rotation_c2_from_c1 for sequence in sequences])
         flows = [sequence.flow_px for sequence in sequences if sequence.flow_px is not None]
         return Batch(
             torch.from_numpy(np.stack([sequence.first for sequence in sequences])),
             torch.from_numpy(np.stack([sequence.second for sequence in sequences])),
             stacked([sequence.altitude_m for sequence in sequences]),
             (stacked([sequence.translation_m for sequence in sequences]) - reference) / unit,
-            euler_from_rotation(rotation) / self.scales.rotation_rad,
+            euler_from_rotation(rotation_c2_from_c1) / self.scales.rotation_rad,
             stacked(flows) if flows else None,
         )
 

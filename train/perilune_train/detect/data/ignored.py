@@ -65,17 +65,19 @@ def unlabelled_craters(
     the ids of the craters that have a label in it.
     """
     low, high = radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
-    rotation = matrix_from_quaternion(frame["rotation_wxyz"])
+    rotation_camera_from_site = matrix_from_quaternion(frame["rotation_wxyz"])
     # Select by size first: a scene has a hundred thousand craters, and the other checks cost more.
-    rows = _right_size(craters, camera, rotation[2], frame["position_m"], (low, high))
-    centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation)
+    rows = _right_size(craters, camera, rotation_camera_from_site[2], frame["position_m"], (low, high))
+    centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation_camera_from_site)
     radius_m = craters.diameter_m[rows] / 2
     (u, v), reach_px = camera.project(centre).T, 2 * camera.fx_px * radius_m / centre[:, 2]
     near = (u > -reach_px) & (u < camera.width_px + reach_px) & (v > -reach_px) & (v < camera.height_px + reach_px)
     if labelled is not None:
         near &= ~np.isin(craters.crater_id[rows], labelled)
     near = np.flatnonzero(near)
-    shapes = project_circles(camera, centre[near], craters.normal[rows[near]] @ rotation.T, radius_m[near])
+    shapes = project_circles(
+        camera, centre[near], craters.normal[rows[near]] @ rotation_camera_from_site.T, radius_m[near]
+    )
     box, radius = shapes.bounding_boxes(), shapes.radius_px()
     in_view = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
     in_view &= (radius >= low) & (radius <= high)

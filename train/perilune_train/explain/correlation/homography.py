@@ -31,11 +31,11 @@ def true_homography(
     """
     if position_1_m[2] <= 0:
         raise ValueError(f"altitude is {position_1_m[2]} m, not above 0")
-    translation_m, rotation = relative_poses(
+    translation_m, rotation_c2_from_c1 = relative_poses(
         [position_1_m, position_2_m], [rotation_1_camera_from_site, rotation_2_camera_from_site]
     )
     down_c1 = -np.asarray(rotation_1_camera_from_site)[:, 2]
-    return plane_homography(camera.matrix, translation_m[0], rotation[0], down_c1, float(position_1_m[2]))
+    return plane_homography(camera.matrix, translation_m[0], rotation_c2_from_c1[0], down_c1, float(position_1_m[2]))
 
 
 def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool_]:

@@ -61,7 +61,7 @@ class Projected:
 
 
 @compiled
-def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) -> Array:
+def _derivatives(point_m: Array, rotation_camera_from_site: Array, fx_px: float, fy_px: float) -> Array:
     """`Projected.jacobian` at points (K, 3), O_C.
 
     A point X = R (c - p) moves by -R times a shift of the camera, and by w x X when it turns by w from the left.
@@ -72,9 +72,9 @@ def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) ->
         right, down = fx_px / z, fy_px / z
         by_step = derivatives[k]
         for axis in range(3):
-            by_step[0, axis] = right * (rotation[2, axis] * x / z - rotation[0, axis])
-            by_step[1, axis] = down * (rotation[2, axis] * y / z - rotation[1, axis])
-            by_step[2, axis] = rotation[2, axis] / z
+            by_step[0, axis] = right * (rotation_camera_from_site[2, axis] * x / z - rotation_camera_from_site[0, axis])
+            by_step[1, axis] = down * (rotation_camera_from_site[2, axis] * y / z - rotation_camera_from_site[1, axis])
+            by_step[2, axis] = rotation_camera_from_site[2, axis] / z
         by_step[0, 3], by_step[0, 4], by_step[0, 5] = -right * x * y / z, right * (z + x * x / z), -right * y
         by_step[1, 3], by_step[1, 4], by_step[1, 5] = -down * (z + y * y / z), down * x * y / z, down * x
         by_step[2, 3], by_step[2, 4], by_step[2, 5] = -y / z, x / z, 0.0
@@ -86,13 +86,15 @@ def projected(
 ) -> Projected:
     """Project craters of at least a radius whose centre is in the image or at most `margin_px` outside it."""
     index, points = _in_view(catalogue, camera, pose, margin_px, least_radius_px)
-    rotation = pose.rotation_camera_from_site
+    rotation_camera_from_site = pose.rotation_camera_from_site
     if any(camera.distortion):
-        normals = catalogue.normal[index] @ rotation.T
+        normals = catalogue.normal[index] @ rotation_camera_from_site.T
         boxes = project_circles(camera, points, normals, catalogue.radius_m[index]).bounding_boxes()
         centre, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
     else:
-        centre, half = _boxes(points, index, catalogue.normal, catalogue.radius_m, rotation, _lens(camera))
+        centre, half = _boxes(
+            points, index, catalogue.normal, catalogue.radius_m, rotation_camera_from_site, _lens(camera)
+        )
     seen = np.isfinite(half).all(axis=1)
     if not seen.all():
         index, points, centre, half = index[seen], points[seen], centre[seen], half[seen]
@@ -112,8 +114,10 @@ def _in_view(
 ) -> tuple[NDArray[np.integer], Array]:
     """The rows as `in_view` returns them, and the centres of these craters (N, 3), O_C."""
     limits = margin_px, least_radius_px
-    rotation = pose.rotation_camera_from_site
-    return _visible(catalogue.centre_m, catalogue.radius_m, pose.position_m, rotation, _lens(camera), limits)
+    rotation_camera_from_site = pose.rotation_camera_from_site
+    return _visible(
+        catalogue.centre_m, catalogue.radius_m, pose.position_m, rotation_camera_from_site, _lens(camera), limits
+    )
 
 
 _Lens = tuple[float, float, float, float, float, float]
@@ -127,7 +131,12 @@ def _lens(camera: Camera) -> _Lens:
 
 @compiled
 def _visible(
-    centre_m: Array, radius_m: Array, position_m: Array, rotation: Array, lens: _Lens, limits: tuple[float, float]
+    centre_m: Array,
+    radius_m: Array,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    lens: _Lens,
+    limits: tuple[float, float],
 ) -> tuple[NDArray[np.int64], Array]:
     """`_in_view` for circles with centres (N, 3), O_L, and radii (N,); `limits` are the margin and the least radius."""
     fx_px, fy_px, cx_px, cy_px, width_px, height_px = lens
@@ -138,37 +147,46 @@ def _visible(
     large = 0
     for k in range(len(radius_m)):
         x, y, z = centre_m[k, 0] - position_m[0], centre_m[k, 1] - position_m[1], centre_m[k, 2] - position_m[2]
-        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        depth = (
+            rotation_camera_from_site[2, 0] * x
+            + rotation_camera_from_site[2, 1] * y
+            + rotation_camera_from_site[2, 2] * z
+        )
         index[large] = k
         large += (depth > radius_m[k]) & (fx_px * radius_m[k] >= least_px * depth)
     count = 0
     for number in range(large):
         k = index[number]
-        across, down, depth = _turned(centre_m[k], position_m, rotation)
+        across, down, depth = _turned(centre_m[k], position_m, rotation_camera_from_site)
         column, row = fx_px * across / depth + cx_px, fy_px * down / depth + cy_px
         index[count] = k
         near = (column > -margin_px) & (column < width_px + margin_px)
         count += near & (row > -margin_px) & (row < height_px + margin_px)
     index, points = index[:count].copy(), np.empty((count, 3))
     for number in range(count):
-        points[number] = _turned(centre_m[index[number]], position_m, rotation)
+        points[number] = _turned(centre_m[index[number]], position_m, rotation_camera_from_site)
     return index, points
 
 
 @compiled
-def _turned(point_m: Array, position_m: Array, rotation: Array) -> tuple[float, float, float]:
+def _turned(point_m: Array, position_m: Array, rotation_camera_from_site: Array) -> tuple[float, float, float]:
     """A point (3,), O_L, in O_C."""
     x, y, z = point_m[0] - position_m[0], point_m[1] - position_m[1], point_m[2] - position_m[2]
     return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+        rotation_camera_from_site[0, 0] * x + rotation_camera_from_site[0, 1] * y + rotation_camera_from_site[0, 2] * z,
+        rotation_camera_from_site[1, 0] * x + rotation_camera_from_site[1, 1] * y + rotation_camera_from_site[1, 2] * z,
+        rotation_camera_from_site[2, 0] * x + rotation_camera_from_site[2, 1] * y + rotation_camera_from_site[2, 2] * z,
     )
 
 
 @compiled
 def _boxes(
-    points: Array, index: NDArray[np.integer], normals: Array, radius_m: Array, rotation: Array, lens: _Lens
+    points: Array,
+    index: NDArray[np.integer],
+    normals: Array,
+    radius_m: Array,
+    rotation_camera_from_site: Array,
+    lens: _Lens,
 ) -> tuple[Array, Array]:
     """Centres and half sizes (K, 2), pixels, of the boxes of circles, for a pinhole.
 
@@ -187,7 +205,7 @@ def _boxes(
         for axis in range(3):
             normal[axis] = 0.0
             for i in range(3):
-                normal[axis] += rotation[axis, i] * normals[index[k], i]
+                normal[axis] += rotation_camera_from_site[axis, i] * normals[index[k], i]
         squared = radius_m[index[k]] ** 2
         last = squared * (1 - normal[2] ** 2) - depth**2
         distance = np.sqrt(x * x + y * y + depth * depth)

@@ -120,7 +120,7 @@ class Motion:
 
 def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Motion:
     """Integrate consecutive inertial measurements, each over its interval."""
-    position, velocity, rotation = start.position_m, start.velocity_mps, start.rotation_site_from_body
+    position, velocity, rotation_site_from_body = start.position_m, start.velocity_mps, start.rotation_site_from_body
     n, step_s = len(measured), measured.interval_s
     # Time is the first axis.
     rate = np.moveaxis(measured.angular_rate_radps - start.gyro_bias_radps[:, None], 1, 0)
@@ -128,8 +128,8 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
     half = rotation_matrices(rate * (step_s / 2)[:, None, None])
     middle = np.empty_like(half)
     for k in range(n):
-        middle[k] = rotation @ half[k]
-        rotation = middle[k] @ half[k]
+        middle[k] = rotation_site_from_body @ half[k]
+        rotation_site_from_body = middle[k] @ half[k]
         acceleration = (middle[k] @ force[k][..., None])[..., 0] + gravity_mps2(position[:, 2])
         position = position + velocity * step_s[k] + acceleration * (step_s[k] ** 2 / 2)
         velocity = velocity + acceleration * step_s[k]
@@ -142,7 +142,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
         change = change @ changes[k]
     per_s = np.repeat([0.0, noise.velocity, noise.turn, noise.gyro_bias, noise.force_bias], 3)
     onward = (onward * np.sqrt(per_s * step_s[:, None])).reshape(len(position), _INERTIAL, -1)
-    end = replace(start, position_m=position, velocity_mps=velocity, rotation_site_from_body=rotation)
+    end = replace(start, position_m=position, velocity_mps=velocity, rotation_site_from_body=rotation_site_from_body)
     return Motion(end, change, onward @ np.swapaxes(onward, 1, 2))
 
 

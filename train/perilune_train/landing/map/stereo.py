@@ -48,10 +48,12 @@ class View:
 
     def radius_m(self, height_m: Array) -> Array:
         """Radii (M,), metres, of the craters as level circles at given heights (M,)."""
-        rotation = self.pose.rotation_camera_from_site
-        centres = camera_from_site(np.column_stack([self.place_m(height_m), height_m]), self.pose.position_m, rotation)
+        rotation_camera_from_site = self.pose.rotation_camera_from_site
+        centres = camera_from_site(
+            np.column_stack([self.place_m(height_m), height_m]), self.pose.position_m, rotation_camera_from_site
+        )
         guess_m = self.sightings.radius_px * centres[:, 2] / self.camera.fx_px
-        level = np.tile(rotation[:, 2], (len(centres), 1))
+        level = np.tile(rotation_camera_from_site[:, 2], (len(centres), 1))
         boxes = project_circles(self.camera, centres, level, guess_m).bounding_boxes()
         size_px = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)) / 2
         return np.asarray(guess_m * self.sightings.radius_px / size_px)

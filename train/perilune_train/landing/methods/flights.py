@@ -94,8 +94,8 @@ def flight(
     rows = [row_of(descent, estimate, rotation_camera_from_body) for estimate in estimates]
     if smooth:
         for number, row in enumerate(rows):
-            position, rotation = _true(descent, number, rotation_camera_from_body)
-            error, covariance = lander.state.past_pose_error(number, position, rotation)
+            position, rotation_site_from_body = _true(descent, number, rotation_camera_from_body)
+            error, covariance = lander.state.past_pose_error(number, position, rotation_site_from_body)
             rows[number] = _row(position[2], row["status"], error, covariance)
     return table_of(descent, rows)
 
@@ -124,9 +124,9 @@ def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFram
 
 def row_of(descent: SeenDescent, estimate: Estimate, rotation_camera_from_body: Array) -> dict[str, object]:
     """Errors of the filter at a frame."""
-    position, rotation = _true(descent, estimate.frame, rotation_camera_from_body)
+    position, rotation_site_from_body = _true(descent, estimate.frame, rotation_camera_from_body)
     covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
-    return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation), covariance)
+    return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation_site_from_body), covariance)
 
 
 _POSE = np.r_[POSITION, ATTITUDE]

@@ -70,9 +70,9 @@ class State:
     def changed(self, step: Array) -> "State":
         """The state after a step of all unknowns (n_unknown,)."""
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
-        rotation = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
-        translation = self.translation_m - rotation.T @ step[3:6]
-        return State(translation, rotation, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
+        rotation_c2_from_c1 = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
+        translation = self.translation_m - rotation_c2_from_c1.T @ step[3:6]
+        return State(translation, rotation_c2_from_c1, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
 
     def offset(self, prior: Prior) -> Array:
         """Difference (n_unknown,) of all unknowns from the prior."""
@@ -133,8 +133,8 @@ class _Residuals:
         along = self._rays @ down
         drop_m = self._prior.plane.altitude_m - self._nodes @ state.height_m.astype(np.float32)
         points = self._rays * (drop_m / along)[:, None]
-        rotation = state.rotation_c2_from_c1.astype(np.float32)
-        moved = (points - state.translation_m.astype(np.float32)) @ rotation.T
+        rotation_c2_from_c1 = state.rotation_c2_from_c1.astype(np.float32)
+        moved = (points - state.translation_m.astype(np.float32)) @ rotation_c2_from_c1.T
         value, by_u, by_v = sampled(self._maps, self._camera.project(moved))
         used = np.isfinite(value)
         error = np.where(used, value - self._values, 0)
@@ -142,7 +142,7 @@ class _Residuals:
         spread = 1.4826 * float(np.median(np.abs(error[used]))) + 1e-6 if used.any() else 1.0
         weight = np.where(used, np.clip(1 - (error / (_TUKEY * spread)) ** 2, 0, None) ** 2, 0)
         weight /= spread**2 * _DEPENDENT_PIXELS
-        jacobian = self._jacobian(points, moved, along, by_moved, by_moved @ rotation)
+        jacobian = self._jacobian(points, moved, along, by_moved, by_moved @ rotation_c2_from_c1)
         scaled = jacobian * weight[:, None].astype(np.float32)
         return (scaled.T @ jacobian).astype(np.float64), (scaled.T @ error).astype(np.float64)
 
@@ -177,10 +177,10 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
 
     The altitude is true at the first frame and then updated by the estimated motions.
     """
-    nominal_translation, rotation = trajectory.nominal_motion
+    nominal_translation, nominal_rotation_c2_from_c1 = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
     if turns is not None:
-        rotation, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
+        nominal_rotation_c2_from_c1, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
     grey = stretched(trajectory.images)
     camera, down = trajectory.camera, trajectory.down_c
     altitude_m = float(trajectory.position_m[0, 2])
@@ -190,7 +190,7 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
     for i in range(trajectory.n_pairs):
         second = pyramid(trajectory.images[i + 1], camera, _LEVELS)
         expected, plane = (
-            ExpectedMotion(nominal_translation[i], rotation[i], turn_sigma[i]),
+            ExpectedMotion(nominal_translation[i], nominal_rotation_c2_from_c1[i], turn_sigma[i]),
             GroundPlane(down, altitude_m),
         )
         # KLT must know the gyroscope's rotation too: its shift compensates errors of its own rotation.

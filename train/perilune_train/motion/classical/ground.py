@@ -65,10 +65,10 @@ def carried(
 
     `downs_c` and `altitudes_m` belong to frames 1 and 2; `motion` is translation_m and rotation_c2_from_c1.
     """
-    translation, rotation = motion
+    translation, rotation_c2_from_c1 = motion
     nodes = node_pixels(camera)
     first = ground_points(camera, nodes, downs_c[0], altitudes_m[0])
-    second = ground_points(camera, nodes, downs_c[1], altitudes_m[1]) @ rotation + translation
+    second = ground_points(camera, nodes, downs_c[1], altitudes_m[1]) @ rotation_c2_from_c1 + translation
     among, between, within = (
         _kernel(camera, altitudes_m[0], a, b) for a, b in ((first, first), (second, first), (second, second))
     )

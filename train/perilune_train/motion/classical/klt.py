@@ -62,15 +62,15 @@ def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) 
     One pair gives the translation only relative to the altitude. The altitude is true at the first frame and then
     updated by the estimated motions; the attitude is assumed to be level.
     """
-    nominal_translation, rotation = trajectory.nominal_motion
+    nominal_translation, nominal_rotation_c2_from_c1 = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
     if turns is not None:
-        rotation, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
+        nominal_rotation_c2_from_c1, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
     images = stretched(trajectory.images)
     altitude_m = float(trajectory.position_m[0, 2])
     pairs = []
     for i in range(trajectory.n_pairs):
-        expected = ExpectedMotion(nominal_translation[i], rotation[i], turn_sigma[i])
+        expected = ExpectedMotion(nominal_translation[i], nominal_rotation_c2_from_c1[i], turn_sigma[i])
         plane = GroundPlane(trajectory.down_c, altitude_m)
         tracked = klt_motion(trajectory.camera, images[i], images[i + 1], expected, plane)
         altitude_m -= float(trajectory.down_c @ tracked.translation_m)
@@ -136,11 +136,11 @@ def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMo
     """Fit the motion that maps points (N, 3), O_C of frame 1, to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
-    translation_m, rotation = expected.translation_m, expected.rotation_c2_from_c1
+    translation_m, rotation_c2_from_c1 = expected.translation_m, expected.rotation_c2_from_c1
     altitude_m = float(np.median(points_c1[:, 2]))
     prior = 1 / np.square([expected.turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
     for _ in range(_ITERATIONS):
-        points = (points_c1 - translation_m) @ rotation.T
+        points = (points_c1 - translation_m) @ rotation_c2_from_c1.T
         error = camera.project(points) - pixels_2
         distance = np.linalg.norm(error, axis=1)
         spread = max(1.4826 * float(np.median(distance)), 1e-3)
@@ -158,8 +158,8 @@ def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMo
         normal += np.diag(prior) * spread**2
         offset = np.concatenate(
             [
-                rotation_vectors(rotation @ expected.rotation_c2_from_c1.T),
-                rotation @ (expected.translation_m - translation_m),
+                rotation_vectors(rotation_c2_from_c1 @ expected.rotation_c2_from_c1.T),
+                rotation_c2_from_c1 @ (expected.translation_m - translation_m),
             ]
         )
         # Metres and radians have very different scales; a unit diagonal keeps the system well conditioned.
@@ -168,11 +168,11 @@ def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMo
         step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), gradient, rcond=None)[0]
         turn = matrix_from_rotation_vector(step[:3])
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
-        rotation = turn @ rotation
-        translation_m = translation_m - rotation.T @ step[3:]
+        rotation_c2_from_c1 = turn @ rotation_c2_from_c1
+        translation_m = translation_m - rotation_c2_from_c1.T @ step[3:]
         if np.linalg.norm(step[:3]) < 1e-8 and np.linalg.norm(step[3:]) < 1e-5:
             break
     unit: Array = 1 / np.sqrt(np.diag(information))
     scale_of_each: Array = unit[:, None] * unit
     covariance = scale_of_each * np.linalg.inv(scale_of_each * information)
-    return Tracked(translation_m, rotation, covariance, int((weights > 0).sum()))
+    return Tracked(translation_m, rotation_c2_from_c1, covariance, int((weights > 0).sum()))

@@ -66,20 +66,24 @@ def pair_sequence(
     1500 m; see tests/train/motion/test_data.py.
     """
     span = slice(start, start + n_pairs)
-    translation, rotation = (values[span] for values in trajectory.motion)
+    translation, rotation_c2_from_c1 = (values[span] for values in trajectory.motion)
     nominal_translation, nominal_rotation = (values[span] for values in trajectory.nominal_motion)
     altitude = trajectory.altitude_m[span]
     images = trajectory.images[start : start + n_pairs + 1]
-    translation, rotation, seconds = translation.copy(), rotation.copy(), []
+    translation, rotation_c2_from_c1, seconds = translation.copy(), rotation_c2_from_c1.copy(), []
     for i in range(n_pairs):
         change = np.eye(3)
         if rng is not None and jitter is not None:
             shift = rng.normal(size=3) * jitter.translation_m
             turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
-            true = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
-            translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
+            true = _homography(
+                trajectory.camera, trajectory.down_c, translation[i], rotation_c2_from_c1[i], altitude[i]
+            )
+            translation[i], rotation_c2_from_c1[i] = translation[i] + shift, turn @ rotation_c2_from_c1[i]
             # Image 2 of the moved camera, over the plane, to image 1, then to the original image 2.
-            moved = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
+            moved = _homography(
+                trajectory.camera, trajectory.down_c, translation[i], rotation_c2_from_c1[i], altitude[i]
+            )
             change = true @ np.linalg.inv(moved)
         if warp:
             change = change @ _homography(
@@ -90,7 +94,7 @@ def pair_sequence(
         np.stack([_normalised(image) for image in images[:-1]]),
         np.stack(seconds),
         translation,
-        rotation,
+        rotation_c2_from_c1,
         nominal_translation,
         altitude,
         trajectory.down_c,
@@ -127,8 +131,10 @@ def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Se
     )
 
 
-def _homography(camera: Camera, down_c: Array, translation_m: Array, rotation: Array, altitude_m: float) -> Array:
-    return plane_homography(camera.matrix, translation_m, rotation, down_c, altitude_m)
+def _homography(
+    camera: Camera, down_c: Array, translation_m: Array, rotation_c2_from_c1: Array, altitude_m: float
+) -> Array:
+    return plane_homography(camera.matrix, translation_m, rotation_c2_from_c1, down_c, altitude_m)
 
 
 def _residual_flow(sequence: Sequence, camera: Camera) -> Array:

@@ -82,8 +82,8 @@ class Stream:
             client.ground(following, wait=False)
         images = []
         for k, position in enumerate(part.position_m):
-            rotation = quaternion_from_matrix(part.rotation_camera_from_site[k])
-            frame = client.frame(position, rotation, velocity_mps=velocity[k], index=index + k, scene=scene)
+            rotation_wxyz = quaternion_from_matrix(part.rotation_camera_from_site[k])
+            frame = client.frame(position, rotation_wxyz, velocity_mps=velocity[k], index=index + k, scene=scene)
             images.append(self._checked(frame.image))
         pixels, camera = undistorted(np.stack(images), self.served.camera)
         return replace(part, images=pixels, camera=camera)

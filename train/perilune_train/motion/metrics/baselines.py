@@ -58,8 +58,8 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotio
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
     """The training set's mean motion, for every pair of the trajectory."""
     translation = np.concatenate([trajectory.motion[0] for trajectory in training]).mean(0)
-    rotation = mean_rotation(np.concatenate([trajectory.motion[1] for trajectory in training]))
-    return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation, (trajectory.n_pairs, 1, 1))
+    rotation_c2_from_c1 = mean_rotation(np.concatenate([trajectory.motion[1] for trajectory in training]))
+    return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation_c2_from_c1, (trajectory.n_pairs, 1, 1))
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:

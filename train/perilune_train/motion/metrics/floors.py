@@ -20,18 +20,22 @@ _PENALTIES = np.logspace(-6, 2, 17)
 
 def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Pose]]:
     """The training set's mean pose, and its mean pose at each frame, for every test trajectory."""
-    position_m, rotation = (np.concatenate([trajectory.pose[i] for trajectory in training]) for i in range(2))
-    mean, turn = position_m.mean(0), mean_rotation(rotation)
-    constant = [constant_pose(mean, turn, trajectory.n_pairs) for trajectory in test]
+    position_m, rotation_camera_from_site = (
+        np.concatenate([trajectory.pose[i] for trajectory in training]) for i in range(2)
+    )
+    mean_position_m, mean_rotation_camera_from_site = position_m.mean(0), mean_rotation(rotation_camera_from_site)
+    constant = [
+        constant_pose(mean_position_m, mean_rotation_camera_from_site, trajectory.n_pairs) for trajectory in test
+    ]
     return {
         "mean_pose": constant,
         "mean_pose_at_frame": [_mean_pose_at_frame(training, trajectory.n_pairs) for trajectory in test],
     }
 
 
-def constant_pose(position_m: Array, rotation: Array, n_pairs: int) -> Pose:
+def constant_pose(position_m: Array, rotation_camera_from_site: Array, n_pairs: int) -> Pose:
     """One pose, repeated for every pair."""
-    return np.tile(position_m, (n_pairs, 1)), np.tile(rotation, (n_pairs, 1, 1))
+    return np.tile(position_m, (n_pairs, 1)), np.tile(rotation_camera_from_site, (n_pairs, 1, 1))
 
 
 def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
@@ -59,11 +63,11 @@ def ridge_poses(training: Known, validation: Known, features: list[Array]) -> li
 
     Features are standardised. The penalty is the one with the lowest squared error of position on validation.
     """
-    position_m, rotation = (
+    position_m, rotation_camera_from_site = (
         np.concatenate([trajectory.pose[i] for trajectory in training.trajectories]) for i in range(2)
     )
-    turn = mean_rotation(rotation)
-    targets = np.concatenate([position_m, rotation_vectors(rotation @ turn.T)], axis=1)
+    turn = mean_rotation(rotation_camera_from_site)
+    targets = np.concatenate([position_m, rotation_vectors(rotation_camera_from_site @ turn.T)], axis=1)
     fit = _Ridge(np.concatenate(training.features), targets)
     known = np.concatenate([trajectory.pose[0] for trajectory in validation.trajectories])
     unseen = fit.projected(np.concatenate(validation.features))

@@ -28,9 +28,13 @@ def other_views(trajectories: list[Trajectory], count: int, spread: float, seed:
             # Beyond the end of the other descent, repeat its last deviation.
             moves = moves[np.minimum(np.arange(len(trajectory.position_m)), len(moves) - 1)]
             turns = np.stack([matrix_from_rotation_vector(vector) for vector in moves[:, 3:]])
-            rotation = turns @ trajectory.rotation_camera_from_site
+            rotation_camera_from_site = turns @ trajectory.rotation_camera_from_site
             versions.append(
-                replace(trajectory, position_m=trajectory.position_m + moves[:, :3], rotation_camera_from_site=rotation)
+                replace(
+                    trajectory,
+                    position_m=trajectory.position_m + moves[:, :3],
+                    rotation_camera_from_site=rotation_camera_from_site,
+                )
             )
     return versions
 
