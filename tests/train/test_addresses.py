@@ -137,7 +137,7 @@ def test_missing_credentials_are_refused_in_one_line(s3_bucket, networks):
 
 @pytest.mark.usefixtures("no_pictures")
 def test_a_run_whose_store_vanishes_ends_in_one_line_and_is_resumed(few, s3_bucket, tmp_path, monkeypatch):
-    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
+    monkeypatch.setattr("perilune_train.detect.train.detect_run.evaluate", lambda *_: {})
     # The libraries' retries would take more than a minute.
     monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
