@@ -161,7 +161,7 @@ MARKDOWN_WRITERS = {
 OWN_MODULES = [
     "perilune_shared.config.resolve",
     "perilune_render.cli.main",
-    "perilune_train.detect.train.run",
+    "perilune_train.detect.train.detect_run",
     "tests.test_house",
 ]
 OWN_MODULES += [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "benchmarks").rglob("*.py")]

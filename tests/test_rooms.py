@@ -37,11 +37,10 @@ ROOMS = {
     ),
     "train/perilune_train/cli": "options detect navigate explain report main",
     "train/perilune_train/detect": (
-        "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy"
+        "config finished_run data evaluate inference train evaluate_runs benchmark images deploy"
     ),
     "train/perilune_train/motion": (
-        "config geometry data network pose classical metrics covariance train finished_run compare_runs benchmark "
-        "deploy"
+        "config geometry data network pose classical metrics covariance train evaluate_runs benchmark deploy"
     ),
     "train/perilune_train/landing": "craters filter fly map methods monte_carlo",
 }

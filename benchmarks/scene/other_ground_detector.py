@@ -9,13 +9,13 @@ import numpy as np
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.labels.selection import read_labels
-from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, SEED
+from perilune_train.detect.benchmark.score import MATCH_IOU, SCORING_RULES, SEED, SELECTIONS
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.frame_facts import facts_of, joined_facts
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.figures import draw_frames
-from perilune_train.detect.evaluate.matching import EDGE, Detections
+from perilune_train.detect.evaluate.matching import EDGE, Criteria, Detections
+from perilune_train.detect.evaluate.pictures import draw_frames
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_split
@@ -37,7 +37,7 @@ _SETTINGS = {
 }
 _METRICS = ("ap50_paper", "f1", "precision", "recall", "ap75_paper", "labels")
 _ENDS = ("", "_low", "_high")
-"""Of a value and of its interval. AP has one in every account, the others in the usual account or none."""
+"""Of a value and of its interval. AP has one by every scoring rule, the others by the usual rule or none."""
 
 
 def render(folder: Path, name: str) -> None:
@@ -65,22 +65,22 @@ def score(folders: dict[str, Path], pictures: Path) -> dict[str, object]:
     found: dict[str, list[Detections]] = {}
     result: dict[str, object] = {}
     for labels in (*RIMS, FITTED):
-        for rule in RULES:
-            splits = {name: _load(folder, labels, rule) for name, folder in folders.items()}
+        for selection in SELECTIONS:
+            splits = {name: _load(folder, labels, selection) for name, folder in folders.items()}
             for name, split in splits.items():
                 if name not in found:
                     found[name] = detect_split(detector, split, name)[0]
             evaluation = _evaluate(splits, found, threshold)
-            result[f"{labels}/{rule}"] = _figures(evaluation)
+            result[f"{labels}/{selection}"] = _figures(evaluation)
             images = [image for split in splits.values() for image in split.frames.images]
-            draw_frames(evaluation, images, pictures / f"{labels}-{rule}.jpg")
+            draw_frames(evaluation, images, pictures / f"{labels}-{selection}.jpg")
     return {"frames": sum(map(len, found.values())), "threshold": threshold, **result}
 
 
-def _load(folder: Path, labels: str, rule: str) -> DetectSplit:
+def _load(folder: Path, labels: str, selection: str) -> DetectSplit:
     """Frames of one ground and one set of labels."""
     dataset = open_single(folder / ("measured" if labels == FITTED else labels) / "detect")
-    split = load_split(dataset, "test", LabelSettings(selection=rule), (1.0, 1 / EDGE))
+    split = load_split(dataset, "test", LabelSettings(selection=selection), (1.0, 1 / EDGE))
     if labels != FITTED:
         return split
     craters = dataset.table("craters", ["crater_id", "rim_rms_share"]).to_pandas().dropna()
@@ -99,17 +99,15 @@ def _evaluate(splits: dict[str, DetectSplit], found: dict[str, list[Detections]]
         [each for name in splits for each in found[name]],
         [each for split in splits.values() for each in split.labels],
         joined_facts({name: facts_of(split.frames) for name, split in splits.items()}),
-        threshold,
-        radius_px=next(iter(splits.values())).radius_px,
-        match_iou=MATCH_IOU,
-        seed=SEED,
+        Criteria(threshold, next(iter(splits.values())).radius_px, MATCH_IOU),
+        SEED,
     )
 
 
 def _figures(evaluation: Evaluation) -> Metrics:
     """Figures of one set of labels; the ratios are radii of found craters over radii of their labels."""
     values = evaluation.figures()
-    keys = [f"{account}{name}{end}" for account in ACCOUNTS.values() for name in _METRICS for end in _ENDS]
+    keys = [f"{prefix}{name}{end}" for prefix in SCORING_RULES.values() for name in _METRICS for end in _ENDS]
     overlaps, matches = evaluation.overlaps, evaluation.matches
     own = (matches.label >= 0) & (matches.scores >= evaluation.threshold)
     label = overlaps.label_boxes[matches.label[own]]

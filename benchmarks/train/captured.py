@@ -24,7 +24,7 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.resident import ResidentFrames
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.train.captured import CapturedStep
-from perilune_train.detect.train.network import build_network
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.training.runs import choose_bf16, choose_device
 

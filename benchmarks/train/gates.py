@@ -77,7 +77,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
         for one in own:
             place = [blocks.index(block) for block in one["deviations"]]
             right.plot(place, list(one["deviations"].values()), ".-", color=colour, linewidth=0.8)
-    left.set(xlabel="constant gates, of 23", ylabel="AP, strict account, validation split")
+    left.set(xlabel="constant gates, of 23", ylabel="AP, strict scoring rule, validation split")
     left.legend(fontsize=8)
     right.axhline(LEAST_DEVIATION, color="black", linestyle="--", linewidth=0.8)
     right.set_yscale("symlog", linthresh=LEAST_DEVIATION)

@@ -22,8 +22,7 @@ from perilune_shared.console.command_line import run_command_line
 from perilune_shared.console.terminal import progress_bar
 from perilune_train.detect.deploy.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.export import load_trained
-from perilune_train.detect.deploy.files import write_onnx
-from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.files import FlightDetector, write_onnx
 from perilune_train.detect.deploy.int8 import interleaved, quantise
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3

@@ -22,8 +22,7 @@ import typer
 from benchmarks.figures import write_figures
 from perilune_shared.console.command_line import run_command_line
 from perilune_train.detect.deploy.engines import has_bf16, openvino_core
-from perilune_train.detect.deploy.files import write_onnx
-from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.files import FlightDetector, write_onnx
 from perilune_train.detect.deploy.int8 import quantise
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3

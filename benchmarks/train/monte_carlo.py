@@ -20,8 +20,8 @@ from benchmarks.figures import write_figures
 from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_single
 from perilune_train.landing.methods.flights import default_sigmas, mounting_of
-from perilune_train.landing.monte_carlo.run import GRADE, Job, all_draws, sites_of
-from perilune_train.landing.monte_carlo.summary import run_summary
+from perilune_train.landing.monte_carlo.fly_draws import GRADE, Job, all_draws, sites_of
+from perilune_train.landing.monte_carlo.page import run_summary
 from perilune_train.shipped.models import shipped_run
 
 _TIMED_DRAWS = 20

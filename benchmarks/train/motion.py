@@ -22,10 +22,10 @@ from benchmarks.figures import write_figures
 from perilune_shared.console.command_line import run_command_line
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_train.motion.classical.descent import aligned_trajectory
+from perilune_train.motion.classical.alignment import aligned_trajectory
 from perilune_train.motion.classical.klt import klt_trajectory
 from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 from perilune_train.motion.network import load_navigator, predict
 from perilune_train.records.markdown import table
 from perilune_train.records.pictures import save_figure

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from benchmarks.figures import write_figures
 from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_single
-from perilune_train.models.navigator import Recurrent, StackNavigator, cell_means
+from perilune_train.models.navigator import Recurrent, StackNavigator, StackOptions, cell_means
 from perilune_train.motion.data.trajectories import Trajectory, load_trajectories
 from perilune_train.motion.metrics.floors import mean_poses
 from perilune_train.motion.pose import causal_outputs
@@ -87,7 +87,7 @@ def store(detector: Path, trajectories: list[Trajectory], views: list[Trajectory
     content = load_weights(RunFolder(detector).best)
     architecture = content["architecture"]
     network: Any = StackNavigator(
-        architecture["in_channels"], architecture["width"], architecture["attention"], hidden=8, pool=_GRID
+        architecture["in_channels"], architecture["width"], architecture["attention"], 8, StackOptions(pool=_GRID)
     )
     prefix = "backbone."
     backbone = {

@@ -27,10 +27,10 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import load_trajectories
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 from perilune_train.motion.network import load_navigator, predict
 from perilune_train.motion.train.task import NavigationTask
-from perilune_train.training.fit import fit
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit
 from perilune_train.training.runs import RunFolder
 
 DATASET = {
@@ -111,16 +111,8 @@ def trained(folder: Path, config: NavigateConfig, dataset: Path, pid: int | None
     torch.manual_seed(config.seed)
     task = NavigationTask(config, "warp", load_trajectories(opened), stream=stream)
     cpu, wall = processor_s(pid), time.monotonic()
-    fit(
-        run,
-        task,
-        label=folder.name,
-        epochs=config.warp.fine_epochs,
-        monitor="val/position_rmse_vector_m",
-        mode="min",
-        precision="float32",
-        device="cpu",
-    )
+    schedule = Schedule(config.warp.fine_epochs, "val/position_rmse_vector_m", "min")
+    fit(run, task, schedule, Hardware("cpu", precision="float32"), Wording(folder.name))
     spent = {"processor_s": processor_s(pid) - cpu, "wall_s": time.monotonic() - wall}
     task.close()
     torch.save(task.network.state_dict(), folder / "last.pt")

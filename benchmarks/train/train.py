@@ -35,12 +35,12 @@ from perilune_shared.threads import usable_cores
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input, training_loader
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
-from perilune_train.training.fit import fit
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit
 
 _WARM_UP_STEPS = 3
 _WORKERS = 8
@@ -105,7 +105,8 @@ def clock_of_fit(
     task.batches = batches
     with tempfile.TemporaryDirectory() as folder:
         run = runs.RunFolder(Path(folder))
-        fit(run, task, label="train", epochs=1, monitor="val/ap50_paper", mode="max", precision=config.precision)
+        hardware = Hardware(precision=config.precision)
+        fit(run, task, Schedule(1, "val/ap50_paper", "max"), hardware, Wording("train"))
     return task.clock
 
 

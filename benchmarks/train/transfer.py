@@ -31,8 +31,8 @@ from perilune_train.config import Attention
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.task import learning_rate_factor
 from perilune_train.models.yolo import YOLOv3
 

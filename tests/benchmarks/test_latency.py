@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from benchmarks.train import latency
-from perilune_train.detect.deploy.files import write_onnx
-from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.files import FlightDetector, write_onnx
 from perilune_train.models.yolo import YOLOv3
 
 

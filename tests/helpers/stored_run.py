@@ -7,7 +7,7 @@ import numpy as np
 from perilune_shared.config.resolve import resolve
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.finished_run import config_of_run
-from perilune_train.detect.train.network import build_network
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training import runs
 from perilune_train.training.begin import start_run

@@ -11,9 +11,9 @@ import torch
 from perilune_shared.storage.locks import locked
 from perilune_train.cli.main import main
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.detect.train import run as detect_training
-from perilune_train.explain import run as explaining
-from perilune_train.motion.train import run as navigate_training
+from perilune_train.detect.train import detect_run as detect_training
+from perilune_train.explain import explain_run as explaining
+from perilune_train.motion.train import navigate_run as navigate_training
 from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training.runs import RunFolder, save_weights
 from tests.helpers.stored_run import store_run

@@ -9,8 +9,8 @@ import perilune_render.jobs.local
 import perilune_render.terrain.scene
 from perilune_render.cli.main import main as render
 from perilune_train.cli.main import main as train
-from perilune_train.detect.train import run as detect_training
-from perilune_train.motion.train import run as navigate_training
+from perilune_train.detect.train import detect_run as detect_training
+from perilune_train.motion.train import navigate_run as navigate_training
 from tests.helpers.drawn_dataset import build_dataset
 from tests.hostile.measured import refused
 

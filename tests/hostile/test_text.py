@@ -17,7 +17,7 @@ import pytest
 from perilune_render.cli.main import main as render
 from perilune_shared.cli.main import main as manifest
 from perilune_train.cli.main import main as train
-from perilune_train.detect.compare_runs import compare_folders as _  # noqa: F401  (loaded before the commands are forked)
+from perilune_train.detect.evaluate_runs import compare_folders as _  # noqa: F401  (loaded before the commands are forked)
 from perilune_train.detect.images import predict as _predict  # noqa: F401
 from tests.helpers.drawn_dataset import build_dataset
 from tests.helpers.pages import shown

@@ -10,7 +10,8 @@ from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_train.cli.main import main
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
+from perilune_train.training.runs import NamedRun
 
 DRAWING = {
     "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),
@@ -64,7 +65,7 @@ def navigated(dataset_nav: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     network |= {"coarse_epochs": 0, "fine_epochs": 1, "learning_rate": 1e-2}
     config = NavigateConfig(precision="float32", device="cpu", warp=network, stack=network)
     folder = tmp_path_factory.mktemp("runs")
-    navigate_run(config, dataset_nav, folder, "a", None)
+    navigate_run(config, dataset_nav, NamedRun(folder, "a"), None)
     return folder / "navigate"
 
 

@@ -18,13 +18,13 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import main
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.run import explain_run
+from perilune_train.explain.explain_run import NetworkOnData, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
-from perilune_train.training.runs import save_weights
+from perilune_train.training.runs import NamedRun, save_weights
 
 _STACK = {
     "fusion": "stack",
@@ -105,7 +105,8 @@ def test_masks_are_explained_on_datasets_at_an_address(networks, bucket, few, da
     checkpoint = networks[0] / "checkpoints"
     found = []
     for name, data in (("local", (few, dataset_nav)), ("remote", (f"{bucket}/detect", f"{bucket}/nav"))):
-        run = explain_run(settings, *data, checkpoint / "best.ckpt", networks[1], tmp_path, name)
+        given = (checkpoint / "best.ckpt", data[0]), (networks[1], data[1])
+        run = explain_run(settings, NamedRun(tmp_path, name), *(NetworkOnData(*network) for network in given))
         found.append(pd.read_parquet(run.root / "summary.parquet"))
     assert len(found[0]) > 0 and found[0].equals(found[1])
 
@@ -136,7 +137,7 @@ def test_missing_credentials_are_refused_in_one_line(s3_bucket, networks):
 
 @pytest.mark.usefixtures("no_pictures")
 def test_a_run_whose_store_vanishes_ends_in_one_line_and_is_resumed(few, s3_bucket, tmp_path, monkeypatch):
-    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
+    monkeypatch.setattr("perilune_train.detect.train.detect_run.evaluate", lambda *_: {})
     # The libraries' retries would take more than a minute.
     monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")

@@ -15,6 +15,7 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import ObjectStore, open_store
 from perilune_train.data import stream as streaming
+from perilune_train.data.shares import Share
 from perilune_train.data.stream import FrameStream, StreamLoader
 
 N_FRAMES = 35
@@ -38,7 +39,8 @@ def frame_ids(batch, epoch):
 
 
 def loader_of(root, process=0, processes=1, workers=0, seed=0, batch_size=4):
-    stream = FrameStream(open_dataset(root), "train", batch_size, seed, process, processes, frame_ids)
+    stream = FrameStream(open_dataset(root), "train", batch_size, seed, Share(process, processes))
+    stream.make = frame_ids
     return StreamLoader(stream, workers)
 
 

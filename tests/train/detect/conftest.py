@@ -4,7 +4,7 @@ import pytest
 
 from perilune_shared.config.resolve import resolve
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.training.runs import RunFolder
 
 QUICK = ("detect.epochs=2", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")

@@ -17,17 +17,17 @@ from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_train.cli.detect import config_of_run
 from perilune_train.cli.main import main
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.explain import run as explained
+from perilune_train.explain import explain_run as explained
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.tables import TABLES
+from perilune_train.explain.explain_run import NetworkOnData, explain_run
 from perilune_train.explain.inputs import labelled_frames
 from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.page.pictures import CAPTIONS
-from perilune_train.explain.run import explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
 from perilune_train.shipped.models import shipped_run
-from perilune_train.training.runs import RunFolder, save_weights
+from perilune_train.training.runs import NamedRun, RunFolder, save_weights
 
 _BLOCKS = [f"B_{i + 1}{j + 1}" for i, count in enumerate((1, 2, 8, 8, 4)) for j in range(count)]
 _STACK = {
@@ -71,7 +71,12 @@ def _explain(checkpoints, dataset_detect, dataset_nav, folder, n_drawn=2, **opti
         occlusion_px=48,
         device="cpu",
     )
-    return explain_run(settings, dataset_detect, dataset_nav, *checkpoints, folder, "t", **options)
+    overwrite = options.pop("overwrite", False)
+    networks = [
+        None if checkpoint is None else NetworkOnData(checkpoint, dataset)
+        for checkpoint, dataset in zip(checkpoints, (dataset_detect, dataset_nav), strict=True)
+    ]
+    return explain_run(settings, NamedRun(folder, "t", overwrite), *networks, **options)
 
 
 def _banded(path):
@@ -206,14 +211,14 @@ def test_the_task_chooses_the_networks(dataset_detect, tmp_path, monkeypatch):
     monkeypatch.setattr(explained, "explain_run", lambda *given: calls.append(given) or RunFolder(tmp_path / "made"))
     common = ("explain", "--out", tmp_path, "--name", "a", "--dataset", "data")
     assert in_process.call(main, *common, "--task", "detect").returncode == 0
-    installed = shipped_run("detect")
-    assert calls[-1][1:5] == ("data/detect", "data/nav", installed / "weights.safetensors", None)
+    assert calls[-1][2:4] == (NetworkOnData(shipped_run("detect") / "weights.safetensors", "data/detect"), None)
     (tmp_path / "detect" / "a").mkdir(parents=True)
     assert in_process.call(main, *common, "--task", "detect").returncode == 0
-    own = tmp_path / "detect/a/checkpoints/best.ckpt", tmp_path / "navigate/a-stack/checkpoints/best.ckpt"
-    assert calls[-1][3:5] == (own[0], None)
-    assert in_process.call(main, *common).returncode == 0 and calls[-1][3:5] == own
-    assert in_process.call(main, *common, "--task", "navigate").returncode == 0 and calls[-1][3:5] == (None, own[1])
+    detector = NetworkOnData(tmp_path / "detect/a/checkpoints/best.ckpt", "data/detect")
+    navigator = NetworkOnData(tmp_path / "navigate/a-stack/checkpoints/best.ckpt", "data/nav")
+    assert calls[-1][2:4] == (detector, None)
+    assert in_process.call(main, *common).returncode == 0 and calls[-1][2:4] == (detector, navigator)
+    assert in_process.call(main, *common, "--task", "navigate").returncode == 0 and calls[-1][2:4] == (None, navigator)
     refused = in_process.call(main, *common, "--task", "detect", "--navigator", "a.ckpt")
     assert refused.returncode == 2 and refused.stderr.startswith("error: --navigator: option: got a.ckpt, expected")
 

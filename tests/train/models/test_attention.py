@@ -22,7 +22,7 @@ def test_gates_follow_the_equations():
     mask = torch.sigmoid(torch.nn.functional.conv2d(pooled, cbam.spatial.weight, padding=3))
     torch.testing.assert_close(cbam.gated(x)[0], mask)
     torch.testing.assert_close(cbam(x), refined * mask)
-    torch.testing.assert_close(cbam.spatial_mask(x), mask)
+    torch.testing.assert_close(cbam.gated(x)[0], mask)
 
 
 def test_identity_form_returns_its_input_exactly_and_still_learns():
@@ -68,7 +68,7 @@ def test_centred_form_is_bounded_centred_and_never_constant():
     for factor in (1e-3, 1.0, 1e3):
         with torch.no_grad():
             cbam.spatial.weight.copy_(factor * torch.randn_like(cbam.spatial.weight))
-            mask = cbam.spatial_mask(x)
+            mask = cbam.gated(x)[0]
         assert mask.min() >= 0.5 and mask.max() <= 1.5
         assert abs(float(mask.mean()) - 1) < 0.1 and float(mask.std()) > 0.1
     # A constant added to all logits, which drives a sigmoid to its bound, has no effect.
@@ -89,5 +89,5 @@ def test_centred_form_follows_its_equation_and_is_equal_when_folded():
     )
     standard = (logits - cbam.norm.running_mean) / torch.sqrt(cbam.norm.running_var + cbam.norm.eps)
     expected = 1 + 0.5 * torch.tanh(standard)
-    torch.testing.assert_close(cbam.spatial_mask(x), expected)
+    torch.testing.assert_close(cbam.gated(x)[0], expected)
     torch.testing.assert_close(FlightCBAM(cbam)(x), gated * expected)

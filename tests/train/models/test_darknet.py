@@ -41,7 +41,7 @@ def test_masks_are_what_forward_multiplies_with():
     x = torch.randn(2, 1, 32, 32)
     seen = {}
     for name, cbam in network.attentions.items():
-        cbam.register_forward_hook(lambda m, args, out, name=name: seen.update({name: m.spatial_mask(args[0])}))
+        cbam.register_forward_hook(lambda m, args, out, name=name: seen.update({name: m.gated(args[0])[0]}))
     features = network(x)
     masks = network.attention_masks(x)
     assert list(masks) == NAMES[:11] == list(seen)

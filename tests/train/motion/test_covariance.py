@@ -24,7 +24,7 @@ from perilune_train.motion.covariance import (
     write_numbers,
 )
 from perilune_train.motion.data.trajectories import load_split
-from perilune_train.motion.metrics.metrics import signed_errors
+from perilune_train.motion.metrics.errors import signed_errors
 from perilune_train.motion.network import build
 
 ARCHITECTURE = {

@@ -201,7 +201,7 @@ def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(trajectories):
 
 def sequences_of(trajectories, n_pairs=3, seed=3, share=ALONE):
     training = [d for d in trajectories if d.split == "train"]
-    return TrainingSequences(training, n_pairs, warp=True, augmented=True, jitter=None, seed=seed, share=share)
+    return TrainingSequences(training, n_pairs, warp=True, jitter=None, seed=seed, share=share)
 
 
 def test_an_epoch_follows_from_seed_and_number_alone(trajectories):

@@ -5,7 +5,7 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.motion.data.trajectories import Trajectory
 from perilune_train.motion.metrics.baselines import mean_motion, mean_motion_at_step
-from perilune_train.motion.metrics.metrics import motion_errors, normalised_errors, summary, summary_spreads
+from perilune_train.motion.metrics.errors import motion_errors, normalised_errors, summary, summary_spreads
 
 
 def _trajectory(steps_m, name="t0"):

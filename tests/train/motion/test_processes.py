@@ -9,7 +9,8 @@ from tests.train.motion import forked
 
 from perilune_shared.errors import UserError
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
+from perilune_train.training.runs import NamedRun
 
 pytestmark = pytest.mark.slow
 
@@ -69,7 +70,7 @@ def test_an_interrupted_run_of_two_processes_is_resumed_only_by_two(dataset_nav,
     finished = [folder.name for folder in (tmp_path / "navigate").iterdir() if (folder / "metrics.json").is_file()]
     assert finished == []
     with pytest.raises(UserError, match=r"last.ckpt: processes: got 1, expected 2, as in the existing run"):
-        navigate_run(SETTINGS, dataset_nav, tmp_path, "again", None)
+        navigate_run(SETTINGS, dataset_nav, NamedRun(tmp_path, "again"), None)
     done = train(dataset_nav, tmp_path, "again")
     assert done.returncode == 0, done.stderr
     for name in ("", "-stack"):

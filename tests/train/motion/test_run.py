@@ -13,9 +13,10 @@ from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.sequences import pair_sequence
 from perilune_train.motion.data.trajectories import load_trajectories
 from perilune_train.motion.network import Collate, Scales, load_navigator, predict, translation_units
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import NavigationTask
-from perilune_train.motion.train.windows import Windows
+from perilune_train.motion.train.windows import OutputUnits, Windows
+from perilune_train.training.runs import NamedRun
 
 
 def _settings(**changes):
@@ -38,7 +39,7 @@ def detector(tmp_path_factory):
 def runs(dataset_nav, tmp_path_factory, detector):
     """Both networks, trained for two epochs; the stack's backbone from a detector."""
     folder = tmp_path_factory.mktemp("runs")
-    navigate_run(_settings(), dataset_nav, folder, "tiny", detector, True)
+    navigate_run(_settings(), dataset_nav, NamedRun(folder, "tiny", True), detector)
     return folder / "navigate"
 
 
@@ -93,9 +94,9 @@ def test_a_killed_run_goes_on_to_the_same_weights(runs, dataset_nav, tmp_path, m
 
     monkeypatch.setattr(NavigationTask, "training_step", dies)
     with pytest.raises(KeyError):
-        navigate_run(settings, dataset_nav, tmp_path, "b", None)
+        navigate_run(settings, dataset_nav, NamedRun(tmp_path, "b"), None)
     monkeypatch.undo()
-    (resumed,) = navigate_run(settings, dataset_nav, tmp_path, "b", None)
+    (resumed,) = navigate_run(settings, dataset_nav, NamedRun(tmp_path, "b"), None)
     # Weights follow from the seed, whether the stack network was trained before or not.
     whole = runs / "tiny" / "checkpoints" / "last.ckpt"
     first, again = (torch.load(path, weights_only=True)["state_dict"] for path in (whole, resumed.last))
@@ -109,13 +110,13 @@ def test_finished_runs_are_left_as_they_are(runs, dataset_nav, dataset_detect, d
         return {path: path.stat().st_mtime_ns for path in runs.rglob("*") if path.is_file()}
 
     before = files()
-    folders = navigate_run(_settings(), dataset_nav, runs.parent, "tiny", detector)
+    folders = navigate_run(_settings(), dataset_nav, NamedRun(runs.parent, "tiny"), detector)
     assert [run.root.name for run in folders] == ["tiny-stack", "tiny"]
     assert " ".join(capsys.readouterr().err.split()).count("finished, left unchanged") == 2
     with pytest.raises(UserError, match=r"tiny-stack.*inputs.json: dataset: got SHA-256 .*--overwrite"):
-        navigate_run(_settings(), dataset_detect, runs.parent, "tiny", detector)
+        navigate_run(_settings(), dataset_detect, NamedRun(runs.parent, "tiny"), detector)
     with pytest.raises(UserError, match=r"navigate.kappa: got 2.0, expected 1.0, as in the existing run"):
-        navigate_run(_settings(kappa=2.0), dataset_nav, runs.parent, "tiny", detector)
+        navigate_run(_settings(kappa=2.0), dataset_nav, NamedRun(runs.parent, "tiny"), detector)
     assert files() == before
 
 
@@ -126,7 +127,9 @@ def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path,
 
     def backbone(coarse, fine):
         network = NETWORK | {"coarse_epochs": coarse, "fine_epochs": fine}
-        (run,) = navigate_run(_settings(fusion="stack", stack=network), dataset_nav, tmp_path, "t", detector, True)
+        (run,) = navigate_run(
+            _settings(fusion="stack", stack=network), dataset_nav, NamedRun(tmp_path, "t", True), detector
+        )
         state = torch.load(run.last, weights_only=True)["state_dict"]
         own = {key.removeprefix("network."): value for key, value in state.items()}
         return {key: value for key, value in own.items() if key.startswith("backbone.")}
@@ -141,10 +144,12 @@ def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path,
 @pytest.mark.usefixtures("no_pictures")
 def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
     settings = _settings(fusion="stack", stack=NETWORK | {"width": 0.25})
-    (run,) = navigate_run(settings, dataset_nav, tmp_path, "t", detector, True)
+    (run,) = navigate_run(settings, dataset_nav, NamedRun(tmp_path, "t", True), detector)
     assert "width" in json.loads(run.metrics.read_text())["network/backbone"]
     with pytest.raises(UserError, match=r"width: got 0\.125"):
-        navigate_run(settings.model_copy(update={"detector": detector}), dataset_nav, tmp_path, "t", None, True)
+        navigate_run(
+            settings.model_copy(update={"detector": detector}), dataset_nav, NamedRun(tmp_path, "t", True), None
+        )
     with pytest.raises(UserError, match="fusion"):
         load_navigator(run.best, "warp")
 
@@ -186,7 +191,7 @@ def test_outputs_made_from_the_truth_have_no_loss(trajectories, monkeypatch):
         def forward(self, first, second, state=None):
             return self.output, state
 
-    task.windows = Windows(task.training_trajectories, [0], 4, task.scales, "motion", torch.device("cpu"))
+    task.windows = Windows(task.training_trajectories, [0], 4, OutputUnits("motion", task.scales), torch.device("cpu"))
 
     def loss(output):
         task.network = Gives(output)

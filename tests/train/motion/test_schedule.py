@@ -9,9 +9,9 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.trajectories import load_trajectories
 from perilune_train.motion.train import task as tasks
-from perilune_train.motion.train.run import navigate_run
-from perilune_train.motion.train.task import NavigationTask, learning_rate_factor
-from perilune_train.training.runs import load_weights, save_weights
+from perilune_train.motion.train.navigate_run import navigate_run
+from perilune_train.motion.train.task import Initial, NavigationTask, learning_rate_factor
+from perilune_train.training.runs import NamedRun, load_weights, save_weights
 
 _NETWORK = {
     "size_px": 64,
@@ -61,10 +61,10 @@ def test_stored_features_give_the_weights_of_whole_epochs(dataset_nav, tmp_path,
     called = []
     original = tasks.stored_features
     monkeypatch.setattr(tasks, "stored_features", lambda *given: called.append(1) or original(*given))
-    (stored,) = navigate_run(settings(), dataset_nav, tmp_path, "a", detector)
+    (stored,) = navigate_run(settings(), dataset_nav, NamedRun(tmp_path, "a"), detector)
     assert len(called) == 2, "train and val, once each"
     monkeypatch.setattr(NavigationTask, "stores", property(lambda self: False, lambda self, value: None), raising=False)
-    (whole,) = navigate_run(settings(), dataset_nav, tmp_path, "b", detector)
+    (whole,) = navigate_run(settings(), dataset_nav, NamedRun(tmp_path, "b"), detector)
     assert len(called) == 2
     first, second = weights(stored), weights(whole)
     assert first.keys() == second.keys()
@@ -78,7 +78,7 @@ def test_stored_features_give_the_weights_of_whole_epochs(dataset_nav, tmp_path,
 @pytest.mark.usefixtures("no_pictures")
 def test_a_kill_within_an_epoch_of_summed_gradients_changes_nothing(dataset_nav, tmp_path, monkeypatch):
     own = settings(coarse_epochs=0, fine_epochs=2, accumulate=2)
-    (whole,) = navigate_run(own, dataset_nav, tmp_path, "whole", None)
+    (whole,) = navigate_run(own, dataset_nav, NamedRun(tmp_path, "whole"), None)
     original = NavigationTask.training_step
 
     def dies(self, batch, batch_idx):
@@ -88,13 +88,13 @@ def test_a_kill_within_an_epoch_of_summed_gradients_changes_nothing(dataset_nav,
 
     monkeypatch.setattr(NavigationTask, "training_step", dies)
     with pytest.raises(KeyError):
-        navigate_run(own, dataset_nav, tmp_path, "again", None)
+        navigate_run(own, dataset_nav, NamedRun(tmp_path, "again"), None)
     monkeypatch.undo()
     done = []
     monkeypatch.setattr(
         NavigationTask, "training_step", lambda self, batch, i: done.append(i) or original(self, batch, i)
     )
-    (again,) = navigate_run(own, dataset_nav, tmp_path, "again", None)
+    (again,) = navigate_run(own, dataset_nav, NamedRun(tmp_path, "again"), None)
     # Batches 4 and 5 make the third step of the epoch; batch 4 was computed, but its step was not done.
     assert done[0] == 4
     first, second = weights(whole), weights(again)
@@ -120,7 +120,7 @@ def test_a_backbone_from_a_detector_learns_more_slowly(dataset_nav, detector):
     for factor, rates in ((1.0, {1e-4}), (0.01, {1e-4, 1e-6})):
         own = settings(learning_rate=1e-4)
         own = own.model_copy(update={"stack": own.stack.model_copy(update={"backbone_factor": factor})})
-        task = NavigationTask(own, "stack", trajectories, backbone)
+        task = NavigationTask(own, "stack", trajectories, initial=Initial(backbone))
         groups = task.configure_optimizers()["optimizer"].param_groups
         assert {round(group["initial_lr"], 12) for group in groups if group["weight_decay"]} == rates
         slow = {id(value) for group in groups if group["initial_lr"] < 1e-5 for value in group["params"]}

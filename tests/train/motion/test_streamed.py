@@ -11,17 +11,18 @@ from tests.train.motion.served import Served
 from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
+from perilune_train.data.epochs import DataLost
 from perilune_train.data.frames import normalised
-from perilune_train.data.lost import DataLost
 from perilune_train.data.shares import ALONE
 from perilune_train.motion.config import NavigateConfig, StreamConfig
 from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.streamed import StreamedSequences
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.motion.geometry import pixel_index_homography, plane_homography
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.records.provenance import TerrainUse, check_terrain, read_provenance
+from perilune_train.training.runs import NamedRun
 
 _NETWORK = {
     "size_px": 64,
@@ -56,7 +57,7 @@ def settings(address, **changes):
 
 def sequences(stream, dataset, **changes):
     """Plain sequences, so that frames can be compared with poses."""
-    own = {"warp": False, "augmented": False, "jitter": None, "seed": 3, "share": ALONE} | changes
+    own = {"warp": False, "jitter": None, "seed": 3, "share": ALONE} | changes
     return StreamedSequences(stream, 96, load_split(dataset, "train"), 4, **own)
 
 
@@ -151,7 +152,7 @@ def leave_the_error(made):
 def test_a_lost_server_ends_with_a_saved_state_that_resumes_to_the_same_weights(
     served, dataset_nav, tmp_path, monkeypatch, capsys
 ):
-    (whole,) = navigate_run(settings(served.address), dataset_nav, tmp_path, "whole", None)
+    (whole,) = navigate_run(settings(served.address), dataset_nav, NamedRun(tmp_path, "whole"), None)
     lost = Served(tmp_path)
     step, taken = NavigationTask.training_step, []
 
@@ -164,20 +165,20 @@ def test_a_lost_server_ends_with_a_saved_state_that_resumes_to_the_same_weights(
 
     monkeypatch.setattr(NavigationTask, "training_step", stops)
     with pytest.raises(DataLost, match=r"got none in 5 s, expected .*run the same command again to resume") as error:
-        navigate_run(settings(lost.address, timeout_s=5.0), dataset_nav, tmp_path, "lost", None)
+        navigate_run(settings(lost.address, timeout_s=5.0), dataset_nav, NamedRun(tmp_path, "lost"), None)
     assert "\n" not in str(error.value)
     saved = torch.load(tmp_path / "navigate/lost/checkpoints/last.ckpt", weights_only=True)
     assert saved["epoch_and_batches"] == [1, len(taken) - 4]
     assert 0 < len(taken) - 4 < 4
     begun = len(taken)
     # Another address is no other run.
-    (resumed,) = navigate_run(settings(served.address), dataset_nav, tmp_path, "lost", None)
+    (resumed,) = navigate_run(settings(served.address), dataset_nav, NamedRun(tmp_path, "lost"), None)
     assert taken[begun] == (1, begun - 4)
     assert "resuming" in capsys.readouterr().err
     first, again = (torch.load(run.last, weights_only=True) for run in (whole, resumed))
     assert all(torch.equal(value, again["state_dict"][key]) for key, value in first["state_dict"].items())
     with pytest.raises(UserError, match=r"navigate\.stream\.share: got 0\.5, expected 1\.0"):
-        navigate_run(settings(served.address, share=0.5), dataset_nav, tmp_path, "lost", None)
+        navigate_run(settings(served.address, share=0.5), dataset_nav, NamedRun(tmp_path, "lost"), None)
     # The record of the terrain has what was rendered, before and after.
     for run in (whole, resumed):
         record = read_provenance(torch.load(run.best, weights_only=True), run.best)
@@ -217,7 +218,7 @@ def test_a_server_that_does_not_fit_is_an_error_and_leaves_no_run(served, datase
         ("nowhere", {}, dataset_nav, r"client: address: got nowhere"),
     ):
         with pytest.raises(UserError, match=message):
-            navigate_run(settings(address, **changes), place, tmp_path, "none", None)
+            navigate_run(settings(address, **changes), place, NamedRun(tmp_path, "none"), None)
     assert not (tmp_path / "navigate").exists()
     # The same view in fewer pixels fits: frames are shrunk to those of the network.
     assert Stream(settings(served.address).stream, open_dataset(other)).served.camera.width_px == 96

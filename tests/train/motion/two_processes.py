@@ -7,10 +7,11 @@ import torch
 
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.epochs import TrainingSequences
-from perilune_train.motion.train import run
+from perilune_train.motion.train import navigate_run as run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.motion.train.windows import WindowPlaces
 from perilune_train.training import runs
+from perilune_train.training.runs import NamedRun
 
 
 def main(dataset: Path, out: Path, name: str, settings: str, stop: str) -> None:
@@ -40,7 +41,7 @@ def main(dataset: Path, out: Path, name: str, settings: str, stop: str) -> None:
     for drawing in ("draw_trajectory", "draw_errors"):
         setattr(run, drawing, lambda *_, **__: None)
     config = NavigateConfig.model_validate_json(settings)
-    run.navigate_run(config, dataset, out, name, None)
+    run.navigate_run(config, dataset, NamedRun(out, name), None)
     process = torch.distributed.get_rank()
     torch.save(ended, out / f"{name}.{process}.pt")
     assert runs.is_first_process() == (process == 0)

@@ -15,14 +15,14 @@ from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import recipes_of
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import app
-from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.deploy.export import export_run
+from perilune_train.detect.deploy.export import ExportedFiles, export_run
 from perilune_train.detect.evaluate.split_evaluation import WRITTEN
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.evaluate_runs import compare_folders
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.detect.train.transfer import inherited_terrain
 from perilune_train.motion.config import NavigateConfig
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.records.provenance import (
     UNKNOWN,
     Provenance,
@@ -34,6 +34,7 @@ from perilune_train.records.provenance import (
     training_provenance,
 )
 from perilune_train.training import runs
+from perilune_train.training.runs import NamedRun
 
 QUICK = ("detect.epochs=1", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 ELSEWHERE = TerrainUse("elsewhere", "scene-0007", "trained", "ab" * 32, "elsewhere")
@@ -194,7 +195,7 @@ def test_the_papers_two_datasets_are_one_landing_area(named, dataset_nav):
 def test_export_refuses_to_calibrate_on_terrain_that_the_run_was_tested_on(dataset_detect, tmp_path):
     tested = stored(tmp_path, uses_of(dataset_detect, "train", "tested"))
     with pytest.raises(UserError, match=r"elsewhere/s000 = test/s000 \(calibrated\)"):
-        export_run(tested, tmp_path / "flight", size_px=96, dataset=dataset_detect, int8=True)
+        export_run(tested, tmp_path / "flight", ExportedFiles(size_px=96, int8=True), dataset_detect)
     assert not (tmp_path / "flight").exists()
 
 
@@ -217,7 +218,7 @@ def test_navigation_refuses_a_backbone_that_knows_the_test_terrain(dataset_nav, 
     }
     expected = NavigateConfig(device="cpu", warp=network, stack=network)
     with pytest.raises(UserError, match=r"s000 = elsewhere/s000"):
-        navigate_run(expected, dataset_nav, tmp_path, "a", detector, False)
+        navigate_run(expected, dataset_nav, NamedRun(tmp_path, "a"), detector)
     assert not (tmp_path / "navigate").exists()
 
 

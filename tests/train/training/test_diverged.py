@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from perilune_shared.errors import UserError
-from perilune_train.training.fit import fit
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit
 from perilune_train.training.runs import RunFolder
 
 
@@ -43,18 +43,9 @@ class Diverging(lightning.LightningModule):
 
 def train(tmp_path, fault, accumulate=1):
     run = RunFolder(tmp_path / "a")
-    fit(
-        run,
-        Diverging(fault),
-        label="line",
-        epochs=3,
-        monitor="val/error",
-        mode="min",
-        precision="float32",
-        device="cpu",
-        accumulate=accumulate,
-        learning_rate="detect.learning_rate, which is 0.1",
-    )
+    schedule = Schedule(3, "val/error", "min", accumulate=accumulate)
+    wording = Wording("line", "detect.learning_rate, which is 0.1")
+    fit(run, Diverging(fault), schedule, Hardware("cpu", precision="float32"), wording)
     return run
 
 

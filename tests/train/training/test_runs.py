@@ -164,17 +164,9 @@ class Line(lightning.LightningModule):
 
 
 def fit(run, task, epochs, resume=False):
-    return fitting.fit(
-        run,
-        task,
-        label="line",
-        epochs=epochs,
-        monitor="val/error",
-        mode="min",
-        resume=resume,
-        precision="float32",
-        device="cpu",
-    )
+    schedule = fitting.Schedule(epochs, "val/error", "min")
+    hardware = fitting.Hardware("cpu", precision="float32")
+    return fitting.fit(run, task, schedule, hardware, fitting.Wording("line"), resume)
 
 
 def test_a_resumed_run_repeats_the_uninterrupted_one(tmp_path):

@@ -1,7 +1,7 @@
 """`perilune-train detect`: train, evaluate, find craters in images, export for flight."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -89,7 +89,7 @@ def train(
     """
     settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.detect.train.run import run_detect
+    from perilune_train.detect.train.detect_run import run_detect
 
     run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)
 
@@ -212,10 +212,14 @@ def evaluate(
         own["evaluation"]["scales"] = scale
         config = resolve_over(DetectConfig, "detect", "--scale", own)
     # Importing torch takes seconds; check the settings first.
-    from perilune_train.detect.evaluate_run import evaluate_again
+    from perilune_train.detect.evaluate_runs import evaluate_again
+    from perilune_train.records.provenance import EvaluatedSplit
 
     address = dataset or Path("data", run.resolve().name, "detect")
-    folder = evaluate_again(run, config, address, split, threshold, out, choose_threshold, allow_overlap)
+    score: float | Literal["run", "validation"] = (
+        "validation" if choose_threshold else "run" if threshold is None else threshold
+    )
+    folder = evaluate_again(run, config, EvaluatedSplit(address, split, allow_overlap), score, out)
     say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
 
 
@@ -245,7 +249,7 @@ def benchmark(
         raise UserError("--threshold", "score", threshold, expected)
     if threshold is not None and not 0 <= threshold <= 1:
         raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
-    from perilune_train.detect.benchmark.run import FIGURES, PAGE, score_run, score_submission
+    from perilune_train.detect.benchmark.score_run import FIGURES, PAGE, score_run, score_submission
 
     if detections is not None and threshold is not None:
         folder = out or Path("runs/benchmark", detections.stem)
@@ -255,8 +259,9 @@ def benchmark(
         folder = out or Path("runs/benchmark", run.resolve().name)
         check_output(folder, run)
         made = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
-    rule, account, value = made.least("ap50_paper")
-    say(f"AP {value:.3f} by the least favourable account (labels by {rule}, {account}); {folder}: {PAGE}, {FIGURES}")
+    selection, rule, value = made.least("ap50_paper")
+    chosen = f"labels by {selection}, {rule}"
+    say(f"AP {value:.3f} by the least favourable scoring rule ({chosen}); {folder}: {PAGE}, {FIGURES}")
 
 
 @app.command("compare")
@@ -267,7 +272,7 @@ def compare(
 ) -> None:
     """Compare runs or evaluations: writes compare.md (a table) and precision_recall.png."""
     # matplotlib and torch take seconds to load.
-    from perilune_train.detect.compare_runs import compare_folders
+    from perilune_train.detect.evaluate_runs import compare_folders
 
     say_page(compare_folders(folders, out, allow_overlap))
     say(f"{out}: compare.md, precision_recall.png")
@@ -357,9 +362,9 @@ def export(
     if int8 and dataset is None:
         raise UserError("options", "--int8", "no --dataset", "a dataset to calibrate and to evaluate on")
     # Importing torch takes seconds; check the options first.
-    from perilune_train.detect.deploy.export import export_run
+    from perilune_train.detect.deploy.export import ExportedFiles, export_run
 
-    export_run(run or shipped_run("detect"), out, asked, size_px, dataset, int8, allow_overlap)
+    export_run(run or shipped_run("detect"), out, ExportedFiles(asked, size_px, int8), dataset, allow_overlap)
     say(f"{out}: README.md explains how to use the files")
 
 

@@ -60,8 +60,8 @@ def explain(
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.explain.run import explain_run
-    from perilune_train.training.runs import RunFolder
+    from perilune_train.explain.explain_run import NetworkOnData, explain_run
+    from perilune_train.training.runs import NamedRun, RunFolder
 
     name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
     for given, option, other in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
@@ -73,7 +73,11 @@ def explain(
     if task != "detect" and navigator is None:
         navigator = RunFolder(runs / "navigate" / f"{name}-stack").best
     run = explain_run(
-        settings, f"{above}/detect", f"{above}/nav", detector, navigator, runs, name, overwrite, allow_overlap
+        settings,
+        NamedRun(runs, name, overwrite),
+        None if detector is None else NetworkOnData(detector, f"{above}/detect"),
+        None if navigator is None else NetworkOnData(navigator, f"{above}/nav"),
+        allow_overlap,
     )
     say(f"{run.root}: claims.json, metrics.json, *.parquet, *.png")
 
@@ -127,9 +131,9 @@ def causal(
     if (nav_dataset is None) != (nav_counterfactual is None):
         raise UserError("--nav-dataset", "datasets", "one of two", "--nav-dataset and --nav-counterfactual together")
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.explain.causal.run import causal_folder, causal_run
+    from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_folder, causal_run
     from perilune_train.training.begin import held
-    from perilune_train.training.runs import RunFolder
+    from perilune_train.training.runs import NamedRun, RunFolder
 
     name = name or preset
     own = run or runs / "detect" / name
@@ -138,22 +142,14 @@ def causal(
     pose = None
     if nav_dataset is not None and nav_counterfactual is not None:
         best = navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt"
-        pose = nav_dataset, nav_counterfactual, best
-    with held(causal_folder(runs, name)):
-        made = causal_run(
-            settings,
-            dataset or f"data/{preset}/detect",
-            counterfactual or f"data/{preset}/causal",
-            RunFolder(own).best,
-            gate or _chosen_gate(runs / "explain" / name),
-            runs,
-            name,
-            split,
-            turned,
-            pose,
-            overwrite,
-            allow_overlap,
-        )
+        pose = PoseInputs(nav_dataset, nav_counterfactual, best)
+    named = NamedRun(runs, name, overwrite)
+    inputs = CausalInputs(
+        dataset or f"data/{preset}/detect", counterfactual or f"data/{preset}/causal", split, turned, pose
+    )
+    gate = gate or _chosen_gate(runs / "explain" / name)
+    with held(causal_folder(named)):
+        made = causal_run(settings, named, RunFolder(own).best, gate, inputs, allow_overlap)
     say(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
 
 

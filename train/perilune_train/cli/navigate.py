@@ -11,7 +11,7 @@ from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.inertial_grades import GRADES
 from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
-from perilune_train.landing.monte_carlo.scenario import SCENARIOS
+from perilune_train.landing.monte_carlo.scenario import SCENARIOS, Draws
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.shipped.models import shipped_run
 
@@ -47,12 +47,13 @@ def train(
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.motion.train.run import navigate_run
+    from perilune_train.motion.train.navigate_run import navigate_run
+    from perilune_train.training.runs import NamedRun
 
     name = name or preset
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
     address = dataset or Path("data", preset, "nav")
-    for run in navigate_run(settings, address, runs, name, detector, overwrite, allow_overlap):
+    for run in navigate_run(settings, address, NamedRun(runs, name, overwrite), detector, allow_overlap):
         say(f"{run.root}: metrics.json, navigation.parquet, errors.png")
 
 
@@ -78,10 +79,12 @@ def evaluate(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.motion.finished_run import evaluate_navigator
+    from perilune_train.motion.evaluate_runs import evaluate_navigator
+    from perilune_train.records.provenance import EvaluatedSplit
 
     default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
-    folder = evaluate_navigator(run or shipped_run("navigate"), dataset, split, out or default, allow_overlap)
+    evaluated = EvaluatedSplit(dataset, split, allow_overlap)
+    folder = evaluate_navigator(run or shipped_run("navigate"), evaluated, out or default)
     say(f"{folder}: metrics.json, navigation.parquet, errors.parquet, errors.png")
 
 
@@ -153,7 +156,7 @@ def calibrate(
     from perilune_train.motion.covariance import FILE
     from perilune_train.motion.covariance import calibrate as fit
     from perilune_train.motion.data.trajectories import load_split
-    from perilune_train.motion.finished_run import fusion_of
+    from perilune_train.motion.evaluate_runs import fusion_of
     from perilune_train.motion.network import load_navigator
     from perilune_train.records.provenance import check_calibration, read_provenance, split_terrain
     from perilune_train.training.runs import RunFolder, load_weights
@@ -177,7 +180,7 @@ def compare(
 ) -> None:
     """Compare runs or evaluations: writes compare.md (a table) and errors.png."""
     # matplotlib takes seconds to load.
-    from perilune_train.motion.compare_runs import compare_folders
+    from perilune_train.motion.evaluate_runs import compare_folders
 
     say_page(compare_folders(folders, out, allow_overlap))
     say(f"{out}: compare.md, errors.png")
@@ -235,10 +238,11 @@ def methods(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.landing.methods.run import PAGE, fly_methods
+    from perilune_train.landing.methods.fly_methods import PAGE, fly_methods
+    from perilune_train.records.provenance import EvaluatedSplit
 
     networks = run or shipped_run("navigate"), detector or shipped_run("detect")
-    fly_methods(dataset, split, *networks, out, allow_overlap, maps)
+    fly_methods(EvaluatedSplit(dataset, split, allow_overlap), *networks, out, maps)
     say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")
 
 
@@ -271,10 +275,12 @@ def monte_carlo(
     if scenario not in SCENARIOS:
         raise UserError("--scenario", "scenario", scenario, "one of " + ", ".join(SCENARIOS))
     # torch takes seconds to load.
-    from perilune_train.landing.monte_carlo.run import PAGE, fly_draws
+    from perilune_train.landing.monte_carlo.fly_draws import PAGE, fly_draws
+    from perilune_train.records.provenance import EvaluatedSplit
 
     own = detector or shipped_run("detect")
-    fly_draws(dataset, split, own, out, scenario, draws, attitude_deg, seed, workers, allow_overlap)
+    drawn = Draws(scenario, draws, attitude_deg, seed)
+    fly_draws(EvaluatedSplit(dataset, split, allow_overlap), own, out, drawn, workers)
     say(f"{out / PAGE}: table and pictures; draws.parquet")
 
 
@@ -293,7 +299,7 @@ def make_map(
     map.json (stated errors), map.md and errors.parquet (compared with the craters of the terrain), and map.png.
     """
     # torch takes seconds to load.
-    from perilune_train.landing.map.run import PAGE, map_scenes
+    from perilune_train.landing.map.map_scenes import PAGE, map_scenes
 
     map_scenes(dataset, detector or shipped_run("detect"), out, allow_overlap)
     say(f"{out / PAGE}: errors and picture; one catalogue per scene beside it")

@@ -6,16 +6,22 @@ from typing import Any
 import cv2
 from torch.utils import data as torch_data
 
+from perilune_shared.errors import UserError
+
+
+class DataLost(UserError):
+    """A source of training data failed between two steps; the training loop saves its state and ends."""
+
 
 class EpochBatches(torch_data.Sampler[list[Any]]):
     """Batches of the keys with which a dataset is indexed: `size` keys each, in the order of the current epoch.
 
-    `keys(epoch)` has the keys of this process in their order. `fewest` is the number of keys of the process that has
-    fewest. All processes take as many batches as that one needs, so that each step has one batch of each process. The
-    last keys of the others may be left out.
+    `keys(epoch)` are the keys of this process in order. `fewest` is the number of keys of the process that has the
+    fewest. All processes take as many batches as that process needs, so that each step has one batch of each process;
+    the last keys of the others may be left out.
 
-    The first epoch that is iterated over starts at batch `start`, for a run that is resumed within an epoch; the length
-    is always that of a whole epoch. Lightning sets the epoch before each epoch but the first.
+    The first epoch starts at batch `start`, for a run that is resumed within an epoch; the length is always that of a
+    whole epoch. Lightning sets the epoch before each later epoch.
     """
 
     def __init__(
@@ -48,10 +54,9 @@ def batch_loader(
 ) -> torch_data.DataLoader:
     """Load batches in `workers` processes, which live as long as the loader; with 0 in the calling process.
 
-    With workers, OpenCV uses one thread from now on, here and in the workers, which together use all cores anyway. It
-    is set before the workers are forked: a worker that stops inherited threads would wait for ever.
-
-    `pinned` puts the batches into page-locked memory, from which a GPU copies them without making the process wait.
+    With workers, OpenCV uses one thread from now on, here and in the workers, which together use all cores anyway. This
+    is set before the workers are forked: a worker that stopped inherited threads would wait forever. `pinned` puts the
+    batches into page-locked memory, from which a GPU copies them without making the process wait.
     """
     if workers:
         one_thread()
@@ -67,7 +72,7 @@ def batch_loader(
 
 
 def one_thread(_: int = 0) -> None:
-    """Let OpenCV use one thread in this process, a worker or one that is about to fork workers."""
-    # A forked worker has inherited it; a spawned one has not.
+    """Let OpenCV use one thread in this process."""
+    # A forked worker inherits the setting; a spawned one does not.
     if cv2.getNumThreads() != 1:
         cv2.setNumThreads(1)

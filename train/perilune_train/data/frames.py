@@ -79,8 +79,8 @@ def load_frames(dataset: Dataset, split: str, share: Share = ALONE, table: pd.Da
     frames do not fit into memory, or if one is invalid.
     """
     table = frame_table(dataset, split) if table is None else table
-    own = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
-    return FrameStore(own, load_images(dataset, own, split))
+    rows = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
+    return FrameStore(rows, load_images(dataset, rows, split))
 
 
 def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np.uint8]:
@@ -94,12 +94,12 @@ def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np
         found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
         raise UserError(dataset.store, "frames", found, f"{split} frames that fit into memory; see detect.stream")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
-    place_of = {frame_id: place for place, frame_id in enumerate(table["frame_id"])}
+    index_of = {frame_id: index for index, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
     rows = pa.table({column: table[column].tolist() for column in ("frame_id", "png_path")})
 
     def unpack(frame: tuple[str, bytes]) -> None:
-        i = place_of[frame[0]]
+        i = index_of[frame[0]]
         images[i] = decode(frame[1], f"{dataset.store}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
 
     # OpenCV releases Python's global interpreter lock while it decodes.

@@ -1,4 +1,4 @@
-"""A split of a dataset with its crater labels, for a loop of one's own in PyTorch: `dataset.torch(split="train")`.
+"""A split of a dataset with its crater labels, for your own loop in PyTorch: `dataset.torch(split="train")`.
 
     frames = LabelledFrames(open_single("data/small/detect"), "train", "visible")
     loader = DataLoader(frames, batch_size=8, shuffle=True, collate_fn=frames.collate)
@@ -40,7 +40,7 @@ class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
     """
 
     def __init__(self, dataset: Dataset, split: str = "train", selection: str = "visible"):
-        """Read frames and labels of a split; `selection` (all, paper, visible) says which labels.
+        """Read frames and labels of a split; `selection` (all, paper, visible) chooses the labels.
 
         Raises UserError on another name, on a split without frames, on several cameras, and on frames that do not fit
         into memory.
@@ -54,10 +54,10 @@ class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
         self.frames = load_frames(dataset, split)
         labels = read_labels(dataset, ["crater_id", *_BOX_COLUMNS, *ELLIPSE_COLUMNS], split)
         labels = labels[selected(labels, SELECTIONS[selection])]
-        places = {frame_id: place for place, frame_id in enumerate(self.frames.table["frame_id"])}
-        place = labels["frame_id"].map(places).to_numpy(np.int64)
-        order = np.argsort(place, kind="stable")
-        self._bounds = np.searchsorted(place[order], np.arange(len(places) + 1))
+        row_of_frame = {frame_id: row_of_label for row_of_label, frame_id in enumerate(self.frames.table["frame_id"])}
+        row_of_label = labels["frame_id"].map(row_of_frame).to_numpy(np.int64)
+        order = np.argsort(row_of_label, kind="stable")
+        self._bounds = np.searchsorted(row_of_label[order], np.arange(len(row_of_frame) + 1))
         self._crater_id = labels["crater_id"].to_numpy(np.int64)[order]
         self._boxes = labels[_BOX_COLUMNS].to_numpy(np.float32)[order]
         self._ellipses = labels[ELLIPSE_COLUMNS].to_numpy(np.float32)[order]
@@ -65,18 +65,18 @@ class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, place: int) -> tuple[Tensor, Target]:
-        place = range(len(self))[place]
-        row, own = self.frames.table.iloc[place], slice(self._bounds[place], self._bounds[place + 1])
+    def __getitem__(self, index: int) -> tuple[Tensor, Target]:
+        index = range(len(self))[index]
+        row, labels_of_frame = self.frames.table.iloc[index], slice(self._bounds[index], self._bounds[index + 1])
         target: Target = {
-            "boxes": torch.from_numpy(self._boxes[own]),
-            "ellipses": torch.from_numpy(self._ellipses[own]),
-            "crater_id": torch.from_numpy(self._crater_id[own]),
+            "boxes": torch.from_numpy(self._boxes[labels_of_frame]),
+            "ellipses": torch.from_numpy(self._ellipses[labels_of_frame]),
+            "crater_id": torch.from_numpy(self._crater_id[labels_of_frame]),
             "position_m": torch.tensor(np.asarray(row["position_m"]), dtype=torch.float32),
             "rotation_wxyz": torch.tensor(np.asarray(row["rotation_wxyz"]), dtype=torch.float32),
             "frame_id": str(row["frame_id"]),
         }
-        return torch.from_numpy(self.frames.images[place])[None].float() / 255, target
+        return torch.from_numpy(self.frames.images[index])[None].float() / 255, target
 
     @staticmethod
     def collate(items: Sequence[tuple[Tensor, Target]]) -> tuple[Tensor, list[Target]]:

@@ -1,4 +1,4 @@
-"""Shares of the data of several processes that train together."""
+"""Shares of the data for several processes that train together."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Share:
-    """The part of one process: every n-th frame or trajectory, the same in every epoch."""
+    """The share of one process: every n-th frame or trajectory, the same in every epoch."""
 
     process: int = 0
     """Rank of the process, from 0."""
@@ -16,13 +16,13 @@ class Share:
     """Number of processes that train together."""
 
     def of(self, count: int) -> range:
-        """Own numbers among 0 .. count - 1."""
+        """Numbers of this share among 0 .. count - 1."""
         return range(self.process, count, self.processes)
 
     def owns(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the numbers (N,) are own ones (N,)."""
+        """Which of the numbers (N,) belong to this share (N,)."""
         return numbers % self.processes == self.process
 
 
 ALONE = Share()
-"""The share of the only process: everything."""
+"""The share of a single process: everything."""

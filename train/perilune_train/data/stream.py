@@ -5,8 +5,8 @@ Use:
     stream = FrameStream(open_single("packed"), "train", batch_size=8, seed=0)
     for epoch in range(10):
         stream.set_epoch(epoch)
-        for batch in stream_loader(stream, workers=2):
-            ...  # a list of StreamedFrame, or what `make` returns
+        for batch in StreamLoader(stream, workers=2):
+            ...  # a list of StreamedFrame, or what `stream.make` returns
             state = stream.state_dict()  # load_state_dict(state) continues after this batch
 
 Everything is a function of seed, epoch, and the numbers of processes and workers: the row groups of all shards are
@@ -35,13 +35,14 @@ from perilune_shared.dataset.packed import SHARDS, open_shard, shard_name
 from perilune_shared.dataset.parts import Part
 from perilune_shared.errors import UserError
 from perilune_train.data.epochs import one_thread
+from perilune_train.data.shares import ALONE, Share
 
 _GROUPS_PER_WINDOW = 8
 _MAX_OPEN_SHARDS = 16
-"""Open shards of a worker. Of those in an object store the footers are kept."""
+"""Largest number of open shards of a worker. For shards in an object store, footers are kept."""
 _NESTED = ("image", "labels")
 COLUMNS = tuple(name for name in SHARDS.names if name not in _NESTED)
-"""Columns of the table frames, by default all are read."""
+"""Columns of the table frames; all are read by default."""
 _STATE = ("batch_size", "seed", "processes", "workers", "frames")
 
 
@@ -57,6 +58,20 @@ class StreamedFrame:
     """Content of the PNG file."""
     labels: pa.StructArray
     """The frame's rows of the table labels, without the columns that `row` has."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameContent:
+    """What a stream reads of each frame."""
+
+    columns: tuple[str, ...] = COLUMNS
+    """Columns of the table frames."""
+    images: bool = True
+    """Whether to read the images; otherwise `StreamedFrame.png` is empty."""
+
+
+EVERYTHING = FrameContent()
+"""All columns and the images."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +99,7 @@ class FrameStream(torch_data.IterableDataset):
     """Batches of the frames of a split that belong to one of several processes; see the module.
 
     All processes have the same number of batches, `len(stream)`, of `batch_size` frames each. The last batch of an
-    epoch has what is left: at least one frame, at most batch_size + 1.
+    epoch has the remaining frames: at least one, at most batch_size + 1.
     """
 
     def __init__(
@@ -93,65 +108,65 @@ class FrameStream(torch_data.IterableDataset):
         split: str,
         batch_size: int,
         seed: int,
-        process: int = 0,
-        processes: int = 1,
-        make: Callable[[list[StreamedFrame], int], Any] = _unchanged,
-        columns: tuple[str, ...] = COLUMNS,
-        images: bool = True,
+        share: Share = ALONE,
+        content: FrameContent = EVERYTHING,
     ):
         """Read the footers of the split's shards.
 
-        `make` converts a batch of an epoch in the worker that reads it. `columns` of the table frames are read; without
-        `images` the PNGs are empty. Raises UserError if a shard is missing or damaged, or if
-        there are fewer frames than processes.
+        `share` selects the frames of this process. Raises UserError if a shard is missing or damaged, or if there are
+        fewer frames than processes.
         """
         self.dataset, self.split, self.batch_size, self.seed = dataset, split, batch_size, seed
-        self.process, self.processes, self.make, self.columns = process, processes, make, columns
-        self._nested = _NESTED if images else _NESTED[1:]
+        self.share, self.columns = share, content.columns
+        self.make = _unchanged
+        self._nested = _NESTED if content.images else _NESTED[1:]
         self.epoch = self.batches = self.workers = 0
         # Epoch and first batch of the current iteration, for workers, which live longer than an epoch.
         self._begun = torch.zeros(2, dtype=torch.int64).share_memory_()
         self._groups = _groups_of(dataset, split)
         self.n_frames = int(self._groups.n_frames.sum())
-        if self.n_frames < processes:
-            expected = f"at least {processes}, one for each process"
+        if self.n_frames < share.processes:
+            expected = f"at least {share.processes}, one for each process"
             raise UserError(dataset.store, f"{split} frames", self.n_frames, expected)
 
+    make: Callable[[list[StreamedFrame], int], Any]
+    """Converts the frames of a batch, given the epoch, in the worker that reads them."""
+
     def __len__(self) -> int:
-        return -(-(self.n_frames // self.processes) // self.batch_size)
+        return -(-(self.n_frames // self.share.processes) // self.batch_size)
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch of the next iteration. If it is another one, iteration starts at its first batch."""
+        """Choose the epoch of the next iteration. A new epoch starts at its first batch."""
         if epoch != self.epoch:
             self.epoch, self.batches = epoch, 0
 
     def state_dict(self) -> dict[str, int]:
-        """Return the position of the stream and what the order of frames depends on."""
+        """Return the position in the stream, and the settings that determine the order of frames."""
         return {"epoch": self.epoch, "batches": self.batches, **self._settings()}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continue at a position. Raises UserError if the order of frames would be another one."""
+        """Continue at a position. Raises UserError if a setting that determines the order of frames differs."""
         for name, value in self._settings().items():
-            # Before the first iteration, the number of workers is not known.
+            # The number of workers is unknown before the first iteration.
             if state[name] != value and not (name == "workers" and 0 in (value, state[name])):
                 raise UserError("state of the stream", name, value, f"{state[name]}, as when the state was saved")
         self.epoch, self.batches = state["epoch"], state["batches"]
 
     def _settings(self) -> dict[str, int]:
-        values = (self.batch_size, self.seed, self.processes, self.workers, self.n_frames)
+        values = (self.batch_size, self.seed, self.share.processes, self.workers, self.n_frames)
         return dict(zip(_STATE, values, strict=True))
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the batches of this worker, or all of the process, from batch `batches` of the epoch on.
 
-        In a worker an error of the user is yielded instead of raised: torch would lose its type (`stream_loader`).
+        In a worker a UserError is yielded instead of raised, because torch would lose its type (`StreamLoader`).
         """
         worker = torch_data.get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker is not None else (0, 1)
         if worker is not None:
             self.epoch, self.batches = self._begun.tolist()
         try:
-            # The loader asks worker 0 first, also on resuming.
+            # The loader asks worker 0 first, also when it resumes.
             yield from self._batches((self.batches + number) % workers, workers)
         except UserError as error:
             if worker is None:
@@ -160,45 +175,46 @@ class FrameStream(torch_data.IterableDataset):
 
     def _batches(self, lane: int, lanes: int) -> Iterator[Any]:
         """Yield batches lane, lane + lanes, ... of this process, without those before `batches`."""
-        start, stop = (self.n_frames * place // self.processes for place in (self.process, self.process + 1))
+        share = self.share
+        start, stop = (self.n_frames * rank // share.processes for rank in (share.process, share.process + 1))
         sizes = np.full(len(self), self.batch_size)
         sizes[-1] = stop - start - sizes[:-1].sum()
         start += sum(int(sizes[before::lanes].sum()) for before in range(lane))
-        own = np.arange(len(self))[lane::lanes]
-        done = int(sizes[own[own < self.batches]].sum())
-        frames = self._frames(start, start + int(sizes[own].sum()), done)
-        for batch in own[own >= self.batches]:
+        numbers = np.arange(len(self))[lane::lanes]
+        n_done = int(sizes[numbers[numbers < self.batches]].sum())
+        frames = self._frames(start, start + int(sizes[numbers].sum()), n_done)
+        for batch in numbers[numbers >= self.batches]:
             yield self.make([next(frames) for _ in range(sizes[batch])], self.epoch)
 
-    def _frames(self, start: int, stop: int, done: int) -> Iterator[StreamedFrame]:
-        """Yield the frames at the places [start, stop) of the epoch's order of row groups, after the first `done`."""
+    def _frames(self, start: int, stop: int, n_done: int) -> Iterator[StreamedFrame]:
+        """Yield the frames at positions [start, stop) of the epoch's order of row groups, after the first `n_done`."""
         opened: dict[str, Part] = {}
         with ThreadPoolExecutor(1) as reader:
             pending = []
-            for window in self._windows(start, stop, done):
+            for window in self._windows(start, stop, n_done):
                 pending.append((window, reader.submit(self._read, opened, np.unique(window[0]))))
                 if len(pending) > 1:
                     yield from self._of_window(*pending.pop(0))
             for last in pending:
                 yield from self._of_window(*last)
 
-    def _windows(self, start: int, stop: int, done: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def _windows(self, start: int, stop: int, n_done: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Yield row groups (N,) and rows in them (N,) of the frames of each window, in their order."""
         order = np.random.default_rng([self.seed, self.epoch]).permutation(len(self._groups.shard))
         ends = np.cumsum(self._groups.n_frames[order])
         first, last = np.searchsorted(ends, [start, stop - 1], side="right")
         for window in range(first, last + 1, _GROUPS_PER_WINDOW):
-            places = range(window, min(window + _GROUPS_PER_WINDOW, last + 1))
-            sizes = self._groups.n_frames[order[places]]
-            groups = np.repeat(order[places], sizes)
+            window_groups = range(window, min(window + _GROUPS_PER_WINDOW, last + 1))
+            sizes = self._groups.n_frames[order[window_groups]]
+            groups = np.repeat(order[window_groups], sizes)
             rows = np.concatenate([np.arange(size) for size in sizes])
-            at = np.arange(len(rows)) + ends[window] - sizes[0]
-            own = np.flatnonzero((at >= start) & (at < stop))
-            own = np.random.default_rng([self.seed, self.epoch, int(at[own[0]])]).permutation(own)
-            skipped, done = own[:done], max(done - len(own), 0)
-            own = own[len(skipped) :]
-            if len(own):
-                yield groups[own], rows[own]
+            position = np.arange(len(rows)) + ends[window] - sizes[0]
+            chosen = np.flatnonzero((position >= start) & (position < stop))
+            chosen = np.random.default_rng([self.seed, self.epoch, int(position[chosen[0]])]).permutation(chosen)
+            skipped, n_done = chosen[:n_done], max(n_done - len(chosen), 0)
+            chosen = chosen[len(skipped) :]
+            if len(chosen):
+                yield groups[chosen], rows[chosen]
 
     def _read(self, opened: dict[str, Part], groups: NDArray[np.int64]) -> dict[int, pa.Table]:
         """Read row groups, by number."""
@@ -239,9 +255,9 @@ def _groups_of(dataset: Dataset, split: str) -> _Groups:
     with ThreadPoolExecutor(16) as readers:
         sizes = list(readers.map(functools.partial(_group_sizes, dataset), shards))
     return _Groups(
-        [path for path, own in zip(shards, sizes, strict=True) for _ in own],
-        np.array([number for own in sizes for number in range(len(own))]),
-        np.array([size for own in sizes for size in own]),
+        [path for path, sizes_of_shard in zip(shards, sizes, strict=True) for _ in sizes_of_shard],
+        np.array([number for sizes_of_shard in sizes for number in range(len(sizes_of_shard))]),
+        np.array([size for sizes_of_shard in sizes for size in sizes_of_shard]),
     )
 
 

@@ -11,7 +11,7 @@ from perilune_train.config import Attention, Count, Device, Epochs, Fraction, Pr
 
 _Stride = Annotated[int, Field(ge=1, le=1024)]
 COARSEST_STRIDE = 32
-"""Pixels; the sides of the network's input are multiples of it."""
+"""The sides of the network's input are multiples of this number of pixels."""
 
 
 class LabelSettings(Selection):

@@ -31,17 +31,17 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
             )
     named = any(text.startswith("detect.labels.selection=") for text in settings)
     if named:
-        # The run stores every threshold of its own selection; another name sets its own thresholds.
+        # The run stores every threshold of its own selection; another selection sets its own thresholds.
         section = {key: value for key, value in section.items() if key != "labels"}
     return resolve_over(DetectConfig, "detect", str(path), section, None, settings)
 
 
 def chosen_threshold(run: Path) -> float:
-    """The score threshold that a run chose on its validation split. Raises UserError if it has none."""
-    found = read_metrics(run).get("test/threshold")
-    if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
-        raise UserError(run / METRICS_FILE, "test/threshold", found, "a number; or give --threshold")
-    return float(found)
+    """Read the score threshold that a run chose on its validation split. Raises UserError if there is none."""
+    threshold = read_metrics(run).get("test/threshold")
+    if isinstance(threshold, bool) or not isinstance(threshold, float | int) or not math.isfinite(threshold):
+        raise UserError(run / METRICS_FILE, "test/threshold", threshold, "a number; or give --threshold")
+    return float(threshold)
 
 
 def check_output(folder: Path, run: Path) -> None:

@@ -13,10 +13,10 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.correlation.measures import detector_values
+from perilune_train.explain.correlation.measures import FrameTargets, detector_values
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
 from perilune_train.explain.evidence.localisation import MEASURES, localisation
-from perilune_train.explain.evidence.nulls import detector_nulls, of_other_rows, renamed
+from perilune_train.explain.evidence.nulls import detector_nulls, measure_statistics, of_other_rows, renamed
 from perilune_train.explain.evidence.performance import DetectionPerformance
 from perilune_train.explain.evidence.permutation import detector_permutations
 from perilune_train.explain.evidence.randomisation import randomised
@@ -24,7 +24,6 @@ from perilune_train.explain.evidence.removal import removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary, validation_signs
 from perilune_train.explain.evidence.stability import stability
 from perilune_train.explain.evidence.tables import Evidence
-from perilune_train.explain.evidence.untrained import measure_statistics
 from perilune_train.explain.inputs import LabelledFrames, evenly_spaced
 from perilune_train.explain.maps.attributions import DetectorTarget, grad_cam, integrated_gradients, occlusion
 from perilune_train.explain.maps.baselines import baseline_maps, brightness_map, gradient_map
@@ -46,17 +45,16 @@ def explain_detector(
     """
     network = detector.network
     rng = np.random.default_rng([settings.seed, 1])
-    masks, known = (detector_masks(network, one.images, where) for one in (frames, validation))
+    masks, known = (detector_masks(network, subset.images, where) for subset in (frames, validation))
     untrained = untrained_detector(detector, validation.images, settings.seed)
-    blank, known_blank = (detector_masks(untrained, one.images, where) for one in (frames, validation))
+    blank, known_blank = (detector_masks(untrained, subset.images, where) for subset in (frames, validation))
     say("detector: masks and null maps")
     before = _values(validation, known, known_blank, rng)
     signs = validation_signs(before)
     plain = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
     strongest = strongest_gate(before, plain)
     values = _values(frames, masks, blank, rng)
-    maps = frames.truth, brightness_map(frames.images), gradient_map(frames.images)
-    permutations = detector_permutations(masks, *maps, frames.scene_ids, signs, rng)
+    permutations = detector_permutations(masks, _targets(frames), signs, rng)
     differences = pd.concat([null_differences(values, signs, rng), permutations], ignore_index=True)
 
     some = evenly_spaced(len(frames.images), settings.n_attributed)
@@ -105,7 +103,7 @@ def explain_detector(
 
 
 def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int) -> YOLOv3:
-    """A network of the same form with random weights; its batch statistics are measured on `images` (N, h, w)."""
+    """A network of equal architecture with random weights; its batch statistics are measured on `images` (N, h, w)."""
     trained, config = detector.network, detector.config
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -120,9 +118,9 @@ def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
 
     A gate without a defined correlation is never chosen, unless there is no other.
     """
-    own = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
-    own = own[own["map"].str[2].isin(list(SHALLOW_STAGES))]
-    means = own.groupby("map", sort=False)["value"].mean()
+    rows = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
+    rows = rows[rows["map"].str[2].isin(list(SHALLOW_STAGES))]
+    means = rows.groupby("map", sort=False)["value"].mean()
     strength = means * pd.Series(signs).reindex(means.index)
     return str(strength.idxmax()) if strength.notna().any() else str(means.index[0])
 
@@ -139,15 +137,18 @@ def attributions(settings: ExplainConfig, network: YOLOv3, images: NDArray[np.ui
 
 
 def _values(frames: LabelledFrames, masks: Masks, untrained: Masks, rng: np.random.Generator) -> pd.DataFrame:
+    targets = _targets(frames)
+    nulls = detector_nulls(frames.images, masks, untrained, targets, rng)
+    return pd.concat([detector_values(masks, targets), nulls], ignore_index=True)
+
+
+def _targets(frames: LabelledFrames) -> FrameTargets:
     brightness, gradient = brightness_map(frames.images), gradient_map(frames.images)
-    own = frames.truth, brightness, gradient, frames.frame_ids, frames.scene_ids
-    return pd.concat(
-        [detector_values(masks, *own), detector_nulls(frames.images, masks, untrained, *own, rng)], ignore_index=True
-    )
+    return FrameTargets(frames.truth, brightness, gradient, frames.frame_ids, frames.scene_ids)
 
 
 def _attribution_values(frames: LabelledFrames, some: list[int], maps: Masks) -> pd.DataFrame:
     images = frames.images[some]
-    ids, scenes = ([own[i] for i in some] for own in (frames.frame_ids, frames.scene_ids))
-    maps_of = brightness_map(images), gradient_map(images)
-    return detector_values(maps, frames.truth[some], *maps_of, ids, scenes, "attribution")
+    ids, scenes = ([names[i] for i in some] for names in (frames.frame_ids, frames.scene_ids))
+    targets = FrameTargets(frames.truth[some], brightness_map(images), gradient_map(images), ids, scenes)
+    return detector_values(maps, targets, "attribution")

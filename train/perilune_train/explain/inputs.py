@@ -1,23 +1,47 @@
-"""Images that an explain run uses: labelled frames of the detector, pairs of the stack navigator."""
+"""Images that an explain run uses: labelled frames of the detector with the paper's masks G, pairs of the navigator."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import Array
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit, load_split
-from perilune_train.explain.correlation.ground_truth import ground_truth_mask
 from perilune_train.explain.correlation.homography import true_homography
 from perilune_train.motion.data import trajectories as navigation
 
 RUN_PAIRS = 8
-"""Consecutive pairs of a run, which starts from the initial state of the LSTM, as in training; fewer over short
-descents."""
+"""Largest number of consecutive pairs of a run. Each run starts from the initial state of the LSTM, as in training."""
+
+
+def ground_truth_mask(
+    width_px: int, height_px: int, centres_px: ArrayLike, radii_px: ArrayLike, ring_factors: tuple[float, ...]
+) -> Array:
+    """The paper's mask G (height, width): 0 in craters, 0.2, 0.4, 0.6, 0.8 in rings around them, 1 elsewhere.
+
+    Takes centres (N, 2) and radii (N,) in pixels; the rings end at ring_factors times the radius (equation
+    "crater_width"). Where craters overlap, the smallest value is used; the paper does not define this case. The paper's
+    text calls the craters white and the background black, which contradicts its numbers; this code uses the numbers.
+    """
+    mask = np.ones((height_px, width_px))
+    levels = np.arange(len(ring_factors) + 1) / (len(ring_factors) + 1)
+    for (x, y), radius in zip(np.asarray(centres_px, np.float64).reshape(-1, 2), np.asarray(radii_px), strict=True):
+        reach = radius * ring_factors[-1]
+        left, right = max(int(x - reach), 0), min(int(x + reach) + 1, width_px)
+        top, bottom = max(int(y - reach), 0), min(int(y + reach) + 1, height_px)
+        if left >= right or top >= bottom:
+            continue
+        u, v = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
+        distance = np.hypot(u - x, v - y) / radius
+        value = np.append(levels, 1.0)[np.searchsorted([1.0, *ring_factors], distance)]
+        part = mask[top:bottom, left:right]
+        np.minimum(part, value, out=part)
+    return mask
 
 
 @dataclass(frozen=True)
@@ -84,8 +108,14 @@ def frames_of(split: DetectSplit, chosen: Sequence[int], ring_factors: tuple[flo
     labels = [split.labels[i] for i in chosen]
     height, width = split.frames.images.shape[1:]
     truth = [
-        ground_truth_mask(width, height, own.ellipses[own.selected, :2], own.radius_px[own.selected], ring_factors)
-        for own in labels
+        ground_truth_mask(
+            width,
+            height,
+            frame_labels.ellipses[frame_labels.selected, :2],
+            frame_labels.radius_px[frame_labels.selected],
+            ring_factors,
+        )
+        for frame_labels in labels
     ]
     table = split.frames.table.iloc[list(chosen)]
     return LabelledFrames(
@@ -107,9 +137,9 @@ def first_descent(split: DetectSplit) -> list[int]:
 
 def consecutive_pairs(descents: Sequence[navigation.Trajectory], count: int) -> Pairs:
     """At most `count` pairs of descents in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes."""
-    length = min(RUN_PAIRS, *(one.n_pairs for one in descents))
-    places = [(one, start) for one in descents for start in range(0, one.n_pairs - length + 1, length)]
-    return _pairs_of([(*places[i], length) for i in evenly_spaced(len(places), max(1, count // length))])
+    length = min(RUN_PAIRS, *(descent.n_pairs for descent in descents))
+    runs = [(descent, start) for descent in descents for start in range(0, descent.n_pairs - length + 1, length)]
+    return _pairs_of([(*runs[i], length) for i in evenly_spaced(len(runs), max(1, count // length))])
 
 
 def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:
@@ -120,16 +150,16 @@ def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:
 def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:
     """Pairs of runs of equal length: trajectory, first step, number of pairs."""
     images, homographies, translations, positions, ids, scenes, heights = [], [], [], [], [], [], []
-    for one, start, length in runs:
-        translations.append(one.motion[0][start : start + length])
-        positions.append(one.pose[0][start : start + length])
+    for trajectory, start, length in runs:
+        translations.append(trajectory.motion[0][start : start + length])
+        positions.append(trajectory.pose[0][start : start + length])
         for step in range(start, start + length):
-            images.append(np.concatenate([one.images[step], one.images[step + 1]]))
-            poses = [(one.position_m[k], one.rotation_camera_from_site[k]) for k in (step, step + 1)]
-            homographies.append(true_homography(one.camera, *poses[0], *poses[1]))
-            ids.append("/".join([*one.ids, str(step)]))
-            scenes.append(one.ids[0])
-            heights.append(float(one.position_m[step][2]))
+            images.append(np.concatenate([trajectory.images[step], trajectory.images[step + 1]]))
+            poses = [(trajectory.position_m[k], trajectory.rotation_camera_from_site[k]) for k in (step, step + 1)]
+            homographies.append(true_homography(trajectory.camera, *poses[0], *poses[1]))
+            ids.append("/".join([*trajectory.ids, str(step)]))
+            scenes.append(trajectory.ids[0])
+            heights.append(float(trajectory.position_m[step][2]))
     truths = np.stack(translations), np.stack(positions)
     return Pairs(np.stack(images), np.stack(homographies), *truths, ids, scenes, heights)
 

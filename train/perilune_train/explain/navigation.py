@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from perilune_shared.console.terminal import say
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.correlation.measures import pair_values
+from perilune_train.explain.correlation.measures import PairTargets, pair_values
 from perilune_train.explain.detection import SHALLOW_STAGES
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
-from perilune_train.explain.evidence.nulls import pair_nulls
+from perilune_train.explain.evidence.nulls import measure_statistics, pair_nulls
 from perilune_train.explain.evidence.performance import MotionPerformance
 from perilune_train.explain.evidence.permutation import pair_permutations
 from perilune_train.explain.evidence.randomisation import randomised
@@ -21,7 +21,6 @@ from perilune_train.explain.evidence.removal import removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary
 from perilune_train.explain.evidence.stability import stability
 from perilune_train.explain.evidence.tables import Evidence
-from perilune_train.explain.evidence.untrained import measure_statistics
 from perilune_train.explain.inputs import Pairs, evenly_spaced
 from perilune_train.explain.maps.baselines import baseline_maps
 from perilune_train.explain.maps.masks import Masks, navigator_masks, stacked_input
@@ -55,12 +54,10 @@ def explain_navigator(
     blank = navigator_masks(untrained, pairs.images, size_px, where)
     say("navigator: masks and null maps")
     strongest = strongest_gate(known, validation)
-    homographies, ids_of_pairs, scenes = list(pairs.homographies), pairs.pair_ids, pairs.scene_ids
-    halves = np.split(pairs.images, 2, axis=1)
-    scale = pairs.images.shape[2] / size_px
-    nulls = pair_nulls(halves[0], halves[1], masks, blank, homographies, ids_of_pairs, scenes, rng, scale)
-    values = pd.concat([pair_values(masks, homographies, ids_of_pairs, scenes), nulls], ignore_index=True)
-    permutations = pair_permutations(masks, homographies, scenes, rng)
+    targets, scale = _targets(pairs), pairs.images.shape[2] / size_px
+    nulls = pair_nulls(pairs.images, masks, blank, targets, rng, scale)
+    values = pd.concat([pair_values(masks, targets), nulls], ignore_index=True)
+    permutations = pair_permutations(masks, targets, rng)
     differences = pd.concat([null_differences(values, {}, rng), permutations], ignore_index=True)
 
     truth_m = pairs.position_m if target_of(architecture) == "pose" else pairs.translation_m
@@ -75,7 +72,7 @@ def explain_navigator(
     )
     gates = forced_gates(navigator.backbone, gate_means(known), images, measure, "force gates of the navigator")
     edge = f"edge/stage_{strongest[2]}"
-    halved = [baseline_maps(half[changed], scale)[edge] for half in halves]
+    halved = [baseline_maps(half, scale)[edge] for half in np.split(images, 2, axis=1)]
     to_remove = {strongest: masks[strongest][changed], edge: np.concatenate(halved, axis=1)}
     say(f"navigator: remove pixels by {strongest}, chosen on validation pairs, and by edges")
     removal = removal_effect(images, to_remove, dict.fromkeys(to_remove, 1), measure, rng, settings.removed_share)
@@ -110,9 +107,13 @@ def untrained_navigator(
     return network
 
 
+def _targets(pairs: Pairs) -> PairTargets:
+    return PairTargets(list(pairs.homographies), pairs.pair_ids, pairs.scene_ids)
+
+
 def strongest_gate(masks: Masks, validation: Pairs) -> str:
     """The gate up to stride 8 of the largest mean PCC4 on validation pairs; the first gate if none is defined."""
-    values = pair_values(masks, list(validation.homographies), validation.pair_ids, validation.scene_ids)
-    own = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
-    means = own.groupby("map", sort=False)["value"].mean()
+    values = pair_values(masks, _targets(validation))
+    rows = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
+    means = rows.groupby("map", sort=False)["value"].mean()
     return str(means.idxmax()) if means.notna().any() else str(means.index[0])

@@ -1,4 +1,4 @@
-"""Settings that rebuild a network, as its weights state them: checked before anything is built."""
+"""Settings from which a network is rebuilt, as stored with its weights; checked before anything is built."""
 
 import json
 from collections.abc import Callable, Mapping

@@ -38,7 +38,7 @@ class MeanAndMax(torch.autograd.Function):
 
 def mean_and_max(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """Mean and maximum of a tensor along one dimension, which is kept with length 1."""
-    # A GPU finds the place of a maximum slowly, and a compiler can join the two plain reductions.
+    # A GPU finds the index of a maximum slowly, and a compiler can join the two plain reductions.
     return (x.mean(dim, keepdim=True), x.amax(dim, keepdim=True)) if x.is_cuda else MeanAndMax.apply(x, dim)
 
 
@@ -90,10 +90,6 @@ class CBAM(nn.Module):
         x = self.channel_gate(x).to(x.dtype) * x
         mask = self.spatial_gate(x)
         return mask, mask.to(x.dtype) * x
-
-    def spatial_mask(self, x: Tensor) -> Tensor:
-        """The spatial mask M_s (N, 1, H, W) by which `forward` multiplies the features."""
-        return self.gated(x)[0]
 
     def forward(self, x: Tensor) -> Tensor:
         return self.gated(x)[1]

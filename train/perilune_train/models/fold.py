@@ -40,6 +40,6 @@ def fold(network: nn.Module) -> None:
 
 
 def _as_convolution(layer: nn.Linear) -> nn.Conv2d:
-    made = nn.Conv2d(layer.in_features, layer.out_features, 1, bias=False)
-    made.weight = nn.Parameter(layer.weight.detach()[:, :, None, None].clone(), requires_grad=False)
-    return made
+    convolution = nn.Conv2d(layer.in_features, layer.out_features, 1, bias=False)
+    convolution.weight = nn.Parameter(layer.weight.detach()[:, :, None, None].clone(), requires_grad=False)
+    return convolution

@@ -1,6 +1,7 @@
 """Two networks over pairs of consecutive frames of a trajectory: their motion, or the pose at the later frame."""
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +11,7 @@ from perilune_train.config import Attention
 from perilune_train.models.darknet import AttentionDarknet53, conv_block
 
 OUTPUTS = 9
-"""3 of the translation and 6 of the continuous rotation (see navigate/geometry.py)."""
+"""3 of the translation and 6 of the continuous rotation (see motion/geometry.py)."""
 State = tuple[Tensor, Tensor]
 """Hidden and cell state of the LSTM, each (2 layers, batch, hidden)."""
 
@@ -51,12 +52,28 @@ class Recurrent(nn.Module):
             return self.output(self.dropout(hidden)).float(), state
 
 
+@dataclass(frozen=True, slots=True)
+class StackOptions:
+    """Deviations of a stack network from the paper's."""
+
+    pool: int = 1
+    """Cells along each side of a grid over each frame: features are averaged over each cell, and a linear layer to at
+    most `StackNavigator.SUMMARY` values follows. 1 averages over both frames, without a linear layer."""
+    stages: int = 5
+    """Stages of the backbone."""
+    dropout: float = 0.0
+    """Share of the LSTM's inputs and outputs that a training step sets to 0."""
+    standardised: bool = False
+    """Whether to subtract the mean of each feature over the training pairs and divide by its spread; `measure` sets
+    both."""
+
+
+AS_PAPER = StackOptions()
+"""The paper's network."""
+
+
 class StackNavigator(nn.Module):
     """The paper's network: the pair stacked in height, attention-Darknet53, global average pool, LSTM.
-
-    Deviations on request: `pool` > 1 averages over a grid of pool x pool cells of each frame and adds a linear layer to
-    at most 512 values; `stages` 4 leaves out the last stage; `standardised` subtracts the mean of each feature over the
-    training pairs and divides by its spread, which `measure` sets.
 
     Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9) and the state of
     the LSTM.
@@ -73,26 +90,23 @@ class StackNavigator(nn.Module):
         width: float,
         attention: Attention,
         hidden: int,
-        *,
-        pool: int = 1,
-        stages: int = 5,
-        dropout: float = 0.0,
-        standardised: bool = False,
+        options: StackOptions = AS_PAPER,
     ):
         super().__init__()
+        pool, standardised = options.pool, options.standardised
         self.in_channels, self.pool, self.standardised = in_channels, pool, standardised
-        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=stages)
+        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=options.stages)
         inputs = self.backbone.channels[-1] * (1 if pool == 1 else 2 * pool**2)
         summary = None if pool == 1 else min(inputs, self.SUMMARY)
-        self.recurrent = Recurrent(inputs, hidden, summary, dropout, exact=standardised)
+        self.recurrent = Recurrent(inputs, hidden, summary, options.dropout, exact=standardised)
         if standardised:
             self.register_buffer("feature_mean", torch.zeros(inputs))
             self.register_buffer("feature_spread", torch.ones(inputs))
 
     def stacked(self, first: Tensor, second: Tensor) -> Tensor:
         """The backbone's input (batch * pairs, in_channels, 2 height, width): the earlier frame above."""
-        both = torch.cat([first, second], dim=2).flatten(0, 1)
-        return both[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
+        pair = torch.cat([first, second], dim=2).flatten(0, 1)
+        return pair[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
 
     def pooled(self, first: Tensor, second: Tensor) -> Tensor:
         """The backbone's last features, averaged over the pair or over each cell (batch, pairs, inputs)."""
@@ -141,7 +155,7 @@ class WarpNavigator(nn.Module):
     motion that explains the flow over the ground plane. The LSTM's output is added as a correction.
 
     Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
-    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/network.py, the flow (batch, pairs,
+    pairs) in metres, to the motion (batch, pairs, 9) in the units of motion/network.py, the flow (batch, pairs,
     height / 8, width / 8, 2), pixels, and the LSTM's state.
     """
 
@@ -258,9 +272,9 @@ class WarpNavigator(nn.Module):
         focal = self.focal_over_width * width_px / self.STRIDE
         x = ((torch.arange(columns, device=self.unit.device) + 0.5 - columns / 2) / focal).expand(rows, columns)
         y = ((torch.arange(rows, device=self.unit.device) + 0.5 - rows / 2) / focal)[:, None].expand(rows, columns)
-        zero, one = torch.zeros_like(x), torch.ones_like(x)
-        along_x = torch.stack([-one, zero, x, -x * y, 1 + x * x, -y], dim=-1)
-        along_y = torch.stack([zero, -one, y, -1 - y * y, x * y, x], dim=-1)
+        zero, ones = torch.zeros_like(x), torch.ones_like(x)
+        along_x = torch.stack([-ones, zero, x, -x * y, 1 + x * x, -y], dim=-1)
+        along_y = torch.stack([zero, -ones, y, -1 - y * y, x * y, x], dim=-1)
         return torch.stack([along_x, along_y], dim=-2)
 
 

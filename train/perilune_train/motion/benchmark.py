@@ -12,9 +12,9 @@ from perilune_shared.export.foreign_text import code_span
 from perilune_shared.storage.store import Address
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.finished_run import fusion_of
-from perilune_train.motion.metrics.baselines import baselines
-from perilune_train.motion.metrics.metrics import motion_errors, summary, summary_spreads
+from perilune_train.motion.evaluate_runs import fusion_of
+from perilune_train.motion.metrics.baselines import MethodMotions, baselines
+from perilune_train.motion.metrics.errors import motion_errors, summary, summary_spreads
 from perilune_train.motion.metrics.report import write_evaluation
 from perilune_train.motion.network import check_motion, load_navigator, predict, predict_by_pairs
 from perilune_train.records.benchmark_parts import Part, open_parts, part_names
@@ -26,7 +26,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
 HEADLINE = "position_rmse_vector_m"
-"""The least favourable of the RMSEs of position: of the vector's length, not of a component."""
+"""The least favourable RMSE of position: over lengths of the error vector, not over components."""
 _COLUMNS = {
     HEADLINE: "position RMSE, vector (m)",
     "position_rmse_per_component_m": "per component (m)",
@@ -36,7 +36,7 @@ _COLUMNS = {
     "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is right)",
 }
 _OF_BINS = tuple(_COLUMNS)[:3]
-"""The figures that are also given by region, altitude and Sun."""
+"""Figures that are also computed by region, altitude and Sun."""
 _ALTITUDES_M = (200, 500, 1000, 1600)
 _SUNS_DEG = (0, 15, 30, 45, 60, 90)
 
@@ -68,12 +68,14 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     stated = stated_covariances(run, network, architecture, trajectories)
     if stated is not None:
         covariances = {fusion: stated, **covariances}
-    errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
+    errors = {
+        method: motion_errors(trajectories, estimated, covariances.get(method)) for method, estimated in motions.items()
+    }
     mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
     counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}
     ms = round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2)
     details: Metrics = {"test/ms_per_single_pair": ms, "terrain/mark": mark, "dataset/name": "locked benchmark"}
-    write_evaluation(out, fusion, "test", trajectories, motions, covariances, details)
+    write_evaluation(out, fusion, "test", trajectories, MethodMotions(motions, covariances), details)
     figures = _figures(errors, regions, suns) | {"headline/method": fusion, f"headline/{HEADLINE}": None}
     figures[f"headline/{HEADLINE}"] = figures[f"{fusion}/{HEADLINE}"]
     for name, (n_frames, n_locked) in counts.items():
@@ -91,26 +93,26 @@ def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str
         for row in part.dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist():
             scene = f"{part.name}/{row['scene_id']}"
             regions[scene], suns[scene] = part.region, float(row["sun_elevation_deg"])
-        for one in load_split(part.dataset, "test"):
-            trajectories.append(replace(one, ids=(f"{part.name}/{one.ids[0]}", one.ids[1])))
+        for trajectory in load_split(part.dataset, "test"):
+            trajectories.append(replace(trajectory, ids=(f"{part.name}/{trajectory.ids[0]}", trajectory.ids[1])))
     return trajectories, regions, suns
 
 
 def _figures(errors: dict[str, pd.DataFrame], regions: dict[str, str], suns: dict[str, float]) -> Metrics:
     """Flat keys: <method>/<figure>, <method>/region/<name>/..., <method>/altitude/<bin>/..., <method>/sun/<bin>/..."""
     figures: Metrics = {}
-    for method, own in errors.items():
-        figures |= {f"{method}/{key}": value for key, value in summary(own).items()}
-        for key, spread in summary_spreads(own).items():
+    for method, pairs in errors.items():
+        figures |= {f"{method}/{key}": value for key, value in summary(pairs).items()}
+        for key, spread in summary_spreads(pairs).items():
             figures |= spread.keys(f"{method}/{key}")
         for kind, names in (
-            ("region", own["scene_id"].map(regions)),
-            ("altitude_m", _bins(own["altitude_m"], _ALTITUDES_M)),
-            ("sun_deg", _bins(own["scene_id"].map(suns), _SUNS_DEG)),
+            ("region", pairs["scene_id"].map(regions)),
+            ("altitude_m", _bins(pairs["altitude_m"], _ALTITUDES_M)),
+            ("sun_deg", _bins(pairs["scene_id"].map(suns), _SUNS_DEG)),
         ):
-            for name, rows in own.groupby(names):
-                found = summary(rows)
-                figures |= {f"{method}/{kind}/{name}/{key}": found[key] for key in _OF_BINS}
+            for name, rows in pairs.groupby(names):
+                figures_of_group = summary(rows)
+                figures |= {f"{method}/{kind}/{name}/{key}": figures_of_group[key] for key in _OF_BINS}
                 figures[f"{method}/{kind}/{name}/scenes"] = int(rows["scene_id"].nunique())
     return figures
 
@@ -129,7 +131,7 @@ def _page(
     counts: dict[str, tuple[int, int]],
 ) -> str:
     """The page as Markdown."""
-    spreads = {method: summary_spreads(own) for method, own in errors.items()}
+    spreads = {method: summary_spreads(table_of_method) for method, table_of_method in errors.items()}
     headline = spreads[fusion][HEADLINE].text(float(figures[f"{fusion}/{HEADLINE}"] or np.nan))
     lines = ["# Locked benchmark of navigation", ""]
     lines += [

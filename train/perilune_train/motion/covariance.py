@@ -1,8 +1,8 @@
 """The covariance that a warp network states for its motions.
 
-The network fits a motion to flows with weights of its own and a prior, so the fit has a covariance. It is not right by
-itself: weights of neighbouring cells are not independent, the ground is no plane, and the recurrent part corrects the
-fit. Five numbers are therefore fitted to the errors of validation descents, by maximum likelihood.
+The network fits a motion to flows, with weights and a prior of its own, so the fit has a covariance. By itself it is
+wrong: weights of neighbouring cells are not independent, the ground is not a plane, and the recurrent part corrects the
+fit. So five numbers are fitted to the errors on validation descents, by maximum likelihood.
 """
 
 import json
@@ -21,13 +21,14 @@ from perilune_shared.storage.files import write_text
 from perilune_train.models.navigator import WarpNavigator
 from perilune_train.motion.data.sequences import pair_sequence
 from perilune_train.motion.data.trajectories import Motion, Trajectory
-from perilune_train.motion.metrics.metrics import signed_errors
+from perilune_train.motion.metrics.errors import signed_errors
 from perilune_train.motion.network import Collate, Scales, predict
 
 FILE = "covariance.json"
 NAMES = ("flow", "flow_by_altitude", "prior", "turn", "along")
 """Logarithms of: the factor on the information of the flows; its growth with the logarithm of the altitude over 1000 m;
-the factor on the prior; the factors on the deviations of the rotation about z and of the translation along z."""
+the factor on the prior; the factors on the standard deviations of the rotation about z and of the translation along
+z."""
 _ALTITUDE_M, _LARGEST = 1000.0, 20.0
 
 
@@ -36,7 +37,8 @@ class MotionInformation:
     """Information on the motions of one trajectory of n frames, from a network's flows and its prior."""
 
     information: Array
-    """Of the flows (n - 1, 6, 6), without factors: turn, radians, and shift, metres, as in `EstimatedMotion`."""
+    """Information of the flows (n - 1, 6, 6), without factors: turn, radians, and shift, metres, as in
+    `EstimatedMotion`."""
     prior: Array
     """Inverse variances of the network's own prior (6,)."""
     altitude_m: Array
@@ -63,20 +65,22 @@ def information_of(network: WarpNavigator, architecture: dict[str, Any], traject
     # The turn leads from the estimate to the truth, the shift from the truth to the estimate (`EstimatedMotion`).
     unit = np.array([*scales.spread_m, *[-scales.rotation_rad] * 3])
     order = np.r_[3:6, 0:3]
-    found = (information / unit[:, None] / unit)[:, order][:, :, order]
-    return MotionInformation(found, (prior / unit**2)[order], shrunk.altitude_m)
+    arranged = (information / unit[:, None] / unit)[:, order][:, :, order]
+    return MotionInformation(arranged, (prior / unit**2)[order], shrunk.altitude_m)
 
 
 def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
-    """The five numbers under which the errors of these motions are most likely, as those of a Gaussian."""
-    errors = np.concatenate([signed_errors(one, motion) for one, motion in zip(trajectories, motions, strict=True)])
+    """The five numbers that make the errors of these motions most likely under a Gaussian distribution."""
+    errors = np.concatenate(
+        [signed_errors(trajectory, motion) for trajectory, motion in zip(trajectories, motions, strict=True)]
+    )
 
     def cost(numbers: Array) -> float:
-        stated = np.concatenate([one.covariance(numbers) for one in known])
+        stated = np.concatenate([item.covariance(numbers) for item in known])
         squared = np.einsum("ni,ni->n", errors, np.linalg.solve(stated, errors[:, :, None])[:, :, 0])
         return float(np.mean(np.linalg.slogdet(stated)[1] + squared))
 
-    # Bounds, since the flows of a network that was hardly trained have no information.
+    # Bounds, since the flows of a barely trained network carry no information.
     start, bounds = np.array([-4.0, 0.0, 0.0, 0.0, 0.0]), [(-_LARGEST, _LARGEST)] * len(NAMES)
     options = {"maxfev": 4000, "maxiter": 4000}
     return minimize(cost, start, method="Nelder-Mead", bounds=bounds, options=options).x.tolist()
@@ -86,9 +90,11 @@ def calibrate(
     folder: Path, network: WarpNavigator, architecture: dict[str, Any], trajectories: list[Trajectory]
 ) -> None:
     """Fit the five numbers to validation trajectories, and write covariance.json to a run's folder."""
-    motions = [predict(network, architecture, one) for one in trajectories]
-    numbers = fit_numbers([information_of(network, architecture, one) for one in trajectories], trajectories, motions)
-    write_numbers(folder, numbers, sum(one.n_pairs for one in trajectories))
+    motions = [predict(network, architecture, trajectory) for trajectory in trajectories]
+    numbers = fit_numbers(
+        [information_of(network, architecture, trajectory) for trajectory in trajectories], trajectories, motions
+    )
+    write_numbers(folder, numbers, sum(trajectory.n_pairs for trajectory in trajectories))
 
 
 def write_numbers(folder: Path, numbers: list[float], n_pairs: int) -> None:
@@ -98,7 +104,7 @@ def write_numbers(folder: Path, numbers: list[float], n_pairs: int) -> None:
 
 
 def read_numbers(folder: Path) -> list[float] | None:
-    """The five numbers of a run; None if it has none. Raises UserError if the file is damaged."""
+    """The five numbers of a run, or None. Raises UserError if the file is damaged."""
     path = folder / FILE
     if not path.is_file():
         return None
@@ -114,8 +120,8 @@ def read_numbers(folder: Path) -> list[float] | None:
 def stated_covariances(
     folder: Path, network: Any, architecture: dict[str, Any], trajectories: list[Trajectory]
 ) -> list[Array] | None:
-    """Covariances of a run's motions over some trajectories, as in `EstimatedMotion`; None if the run states none."""
+    """Covariances of a run's motions over trajectories, as in `EstimatedMotion`; None if the run states none."""
     numbers = read_numbers(folder)
     if numbers is None or not isinstance(network, WarpNavigator):
         return None
-    return [information_of(network, architecture, one).covariance(numbers) for one in trajectories]
+    return [information_of(network, architecture, trajectory).covariance(numbers) for trajectory in trajectories]

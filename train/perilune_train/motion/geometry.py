@@ -67,7 +67,7 @@ def ground_homography(camera_matrix: ArrayLike, position_m: ArrayLike, rotation_
 
 
 def pixel_index_homography(homography: ArrayLike) -> Array:
-    """The same homography (3, 3) in OpenCV's coordinates, which are 0, not 0.5, at the first pixel's centre."""
+    """The homography (3, 3) in OpenCV's coordinates, which are 0 instead of 0.5 at the centre of the first pixel."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     return np.linalg.inv(shift) @ np.asarray(homography) @ shift
 
@@ -89,11 +89,6 @@ def rotation_from_sixd(sixd: Tensor) -> Tensor:
     x = functional.normalize(a, dim=-1)
     y = functional.normalize(b - (x * b).sum(-1, keepdim=True) * x, dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
-
-
-def sixd_from_rotation(rotation: Tensor) -> Tensor:
-    """The continuous representation (..., 6) of rotation matrices (..., 3, 3): the first two columns."""
-    return torch.cat([rotation[..., :, 0], rotation[..., :, 1]], dim=-1)
 
 
 def euler_from_rotation(rotation: Tensor) -> Tensor:

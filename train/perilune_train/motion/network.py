@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.models.architecture import NavigatorArchitecture, check_architecture_of, without_memory
-from perilune_train.models.navigator import StackNavigator, State, WarpNavigator
+from perilune_train.models.navigator import StackNavigator, StackOptions, State, WarpNavigator
 from perilune_train.motion.config import Target
 from perilune_train.motion.data.sequences import Sequence, pair_sequence
 from perilune_train.motion.data.trajectories import Motion, Trajectory
@@ -25,7 +25,7 @@ Fusion = Literal["warp", "stack"]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """Scales that convert a network's standardised output to a motion, or to a pose (navigate/pose.py).
+    """Scales that convert a network's standardised output to a motion, or to a pose (motion/pose.py).
 
     stack: translation = mean_m + spread_m * y. warp: translation = nominal + spread_m * y. Both: rotation_c2_from_c1 =
     the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the nominal motion has no
@@ -47,20 +47,20 @@ class Scales:
     def measured(cls, trajectories: list[Trajectory], fusion: Fusion, target: Target = "motion") -> "Scales":
         """Compute the scales of a training set."""
         if target == "pose":
-            position, attitude = (np.concatenate([one.pose[i] for one in trajectories]) for i in range(2))
+            position, attitude = (np.concatenate([trajectory.pose[i] for trajectory in trajectories]) for i in range(2))
             mean = mean_rotation(attitude)
             spread_m = np.maximum(position.std(0), 1e-3).tolist()
             turns = rotation_vectors(attitude @ mean.T)
             rotation_rad = max(float(np.sqrt(np.mean(turns**2))), 1e-6)
             return cls(position.mean(0).tolist(), spread_m, rotation_rad, mean.tolist())
         translation = np.concatenate([trajectory.motion[0] for trajectory in trajectories])
-        rotation = rotation_vectors(np.concatenate([trajectory.motion[1] for trajectory in trajectories]))
-        rotation_rad = max(float(np.sqrt(np.mean(rotation**2))), 1e-6)
+        rotation_vectors_rad = rotation_vectors(np.concatenate([trajectory.motion[1] for trajectory in trajectories]))
+        rotation_rad = max(float(np.sqrt(np.mean(rotation_vectors_rad**2))), 1e-6)
         if fusion == "stack":
             return cls(translation.mean(0).tolist(), np.maximum(translation.std(0), 1e-3).tolist(), rotation_rad)
         residual = translation - np.concatenate([trajectory.nominal_motion[0] for trajectory in trajectories])
         across, along = np.sqrt(np.mean(residual[:, :2] ** 2)), np.sqrt(np.mean(residual[:, 2] ** 2))
-        # One number for x and y, because a mirrored pair may exchange them.
+        # x and y have one number, because mirroring a pair may exchange them.
         return cls([0.0] * 3, [max(float(value), 1e-3) for value in (across, across, along)], rotation_rad)
 
 
@@ -74,10 +74,7 @@ def build(architecture: dict[str, Any]) -> StackNavigator | WarpNavigator:
             a["attention"],
             a["hidden"],
             # Checkpoints of older versions have none of these.
-            pool=a.get("pool", 1),
-            stages=a.get("stages", 5),
-            dropout=a.get("dropout", 0.0),
-            standardised=target_of(a) == "pose",
+            StackOptions(a.get("pool", 1), a.get("stages", 5), a.get("dropout", 0.0), target_of(a) == "pose"),
         )
     scales = a["scales"]
     return WarpNavigator(
@@ -123,21 +120,19 @@ class Batch:
     """True translations in the network's units, see Scales (batch, pairs, 3)."""
     angles: Tensor
     """True rotations as Euler angles, divided by `rotation_rad` of Scales (batch, pairs, 3)."""
-    place: Tensor
-    """Number of the trajectory and first pair of each sequence (batch, 2)."""
     flow_px: Tensor | None
     """For warp: true flow, pixels (batch, pairs, height / 8, width / 8, 2)."""
 
     def pin_memory(self) -> "Batch":
-        """The same in page-locked memory; a DataLoader calls it."""
+        """The batch in page-locked memory; a DataLoader calls this."""
         return self.each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Batch":
-        """The same on another device; from page-locked memory without waiting."""
+        """The batch on another device; from page-locked memory without waiting."""
         return self.each(lambda part: part.to(device, non_blocking=True))
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Batch":
-        """The same with each tensor changed."""
+        """The batch with each tensor changed."""
         return replace(self, **{name: change(part) for name, part in vars(self).items() if part is not None})
 
 
@@ -152,15 +147,14 @@ class Collate:
 
     def __call__(self, sequences: list[Sequence]) -> Batch:
         reference, unit = translation_units(sequences, self.scales, self.fusion)
-        rotation = stacked([sequence.rotation_c2_from_c1 for sequence in sequences])
+        rotation_c2_from_c1 = stacked([sequence.rotation_c2_from_c1 for sequence in sequences])
         flows = [sequence.flow_px for sequence in sequences if sequence.flow_px is not None]
         return Batch(
             torch.from_numpy(np.stack([sequence.first for sequence in sequences])),
             torch.from_numpy(np.stack([sequence.second for sequence in sequences])),
             stacked([sequence.altitude_m for sequence in sequences]),
             (stacked([sequence.translation_m for sequence in sequences]) - reference) / unit,
-            euler_from_rotation(rotation) / self.scales.rotation_rad,
-            torch.tensor([sequence.place for sequence in sequences]),
+            euler_from_rotation(rotation_c2_from_c1) / self.scales.rotation_rad,
             stacked(flows) if flows else None,
         )
 
@@ -170,15 +164,15 @@ def predict(
 ) -> Motion:
     """Motions of a whole trajectory, in one pass of the network in evaluation mode.
 
-    `features` (pairs, channels) are those of the backbone of a stack network, if they are known.
+    `features` (pairs, channels) are the features of a stack network's backbone, if they are already computed.
     """
     shrunk = trajectory.shrunk(architecture["size_px"])
-    motion, _ = _predicted(network, architecture, shrunk, 0, shrunk.n_pairs, None, features)
+    motion, _ = _predicted(network, architecture, shrunk, range(shrunk.n_pairs), None, features)
     return motion
 
 
 def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Motion, float]:
-    """Motions of a trajectory, pair by pair with the LSTM's state carried, as in flight; mean seconds per pair.
+    """Motions of a trajectory, pair by pair with the LSTM's state carried, as in flight; and mean seconds per pair.
 
     The time is from frames in memory to the motion, without shrinking the frames.
     """
@@ -186,7 +180,7 @@ def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajector
     translations, rotations = [], []
     started = time.perf_counter()
     for pair in range(shrunk.n_pairs):
-        (translation, rotation), state = _predicted(network, architecture, shrunk, pair, 1, state)
+        (translation, rotation), state = _predicted(network, architecture, shrunk, range(pair, pair + 1), state)
         translations.append(translation)
         rotations.append(rotation)
     seconds = (time.perf_counter() - started) / shrunk.n_pairs
@@ -197,16 +191,15 @@ def _predicted(
     network: Any,
     architecture: dict[str, Any],
     shrunk: Trajectory,
-    start: int,
-    n_pairs: int,
+    pairs: range,
     state: State | None,
     features: Tensor | None = None,
 ) -> tuple[Motion, State]:
-    """Motions of some pairs of a shrunk trajectory, and the LSTM's state after them."""
-    sequence = pair_sequence(shrunk, start, n_pairs, warp=architecture["fusion"] == "warp")
+    """Motions of consecutive pairs of a shrunk trajectory, and the LSTM's state after them."""
+    sequence = pair_sequence(shrunk, pairs.start, len(pairs), warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
     if architecture["fusion"] == "warp":
-        # The fit of the motion is for the camera of these frames, which may differ from that of the training.
+        # Fit the motion with the camera of these frames, which may differ from the camera of the training.
         network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     batch = Collate(scales, architecture["fusion"])([sequence]).to(next(network.parameters()).device)
     with torch.no_grad():
@@ -221,7 +214,8 @@ def _predicted(
 
 
 def network_output(network: nn.Module, batch: Batch, state: State | None = None) -> tuple[Tensor, Tensor | None, State]:
-    """Outputs (batch, pairs, 9), of a warp network the flow (batch, pairs, height / 8, width / 8, 2), and the state."""
+    """Outputs (batch, pairs, 9); for warp also the flow (batch, pairs, height / 8, width / 8, 2); and the LSTM's
+    state."""
     if isinstance(network, WarpNavigator):
         return network(batch.first, batch.second, batch.altitude_m, state)
     output, state = network(batch.first, batch.second, state)

@@ -1,7 +1,8 @@
 """Poses in O_L from a stack network: features of pairs, causal windows over a trajectory, pair by pair as in flight.
 
-The network is trained on sequences of `sequence_pairs` pairs from the zero state of the LSTM, and it is evaluated so:
-the pose at each pair comes from the window of the last `sequence_pairs` pairs, which is shorter at the start.
+The network is trained on sequences of `sequence_pairs` pairs that start from the zero state of the LSTM. It is
+evaluated in the same way: the pose at each pair comes from the window of the last `sequence_pairs` pairs, which is
+shorter at the start.
 """
 
 import time
@@ -19,11 +20,12 @@ from perilune_train.motion.data.trajectories import Pose, Trajectory
 from perilune_train.motion.network import Scales, decoded_rotation
 
 _PAIRS = {"cpu": 16, "cuda": 32}
-"""Pairs at a time through the backbone, to bound memory. More on a GPU, which would wait for launches of kernels."""
+"""Pairs that pass the backbone together, to bound memory. More on a GPU, which would otherwise wait for kernel
+launches."""
 
 
 def normalised_frames(frames: Tensor) -> Tensor:
-    """8-bit frames (..., height, width) as `perilune_train.data.frames.normalised` gives them, on their device."""
+    """8-bit frames (..., height, width), normalised on their device as by `perilune_train.data.frames.normalised`."""
     pixels = frames.float()
     deviation, mean = torch.std_mean(pixels, dim=(-2, -1), correction=0, keepdim=True)
     return (pixels - mean) / deviation.clamp(min=1.0)
@@ -38,13 +40,13 @@ def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
     height, width = (int(size) for size in frames.shape[1:])
     x = torch.arange(width, device=frames.device) + 0.5
     y = (torch.arange(height, device=frames.device) + 0.5)[:, None]
-    # Not as a product of matrices, which autocast would compute in bfloat16.
+    # Not as a matrix product, which autocast would compute in bfloat16.
     rows = homographies[:, :, :, None, None]
     u, v, w = (rows[:, i, 0] * x + rows[:, i, 1] * y + rows[:, i, 2] for i in range(3))
     grid = torch.stack([2 * u / (w * width) - 1, 2 * v / (w * height) - 1], dim=-1)
     pixels = frames[:, None].float()
-    found = functional.grid_sample(pixels, grid, mode="bicubic", padding_mode="reflection", align_corners=False)
-    return found[:, 0].clamp(0, 255)
+    sampled = functional.grid_sample(pixels, grid, mode="bicubic", padding_mode="reflection", align_corners=False)
+    return sampled[:, 0].clamp(0, 255)
 
 
 def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tensor | None = None) -> Iterator[Tensor]:
@@ -86,7 +88,7 @@ def predict_pose(
 ) -> Pose:
     """Poses at the later frames of a trajectory's pairs, with the network in evaluation mode.
 
-    `features` (pairs, inputs) are the backbone's, as `StackNavigator.features` gives them, if they are known.
+    `features` (pairs, inputs) are the output of `StackNavigator.features`, if they are already computed.
     """
     if features is None:
         frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)
@@ -101,7 +103,7 @@ def predict_pose(
 def predict_pose_by_pairs(network: Any, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Pose, float]:
     """Poses of a trajectory, pair by pair as in flight, and mean seconds per pair.
 
-    In flight the last `sequence_pairs` summaries of pairs are kept. The time is from frames in memory to the pose,
+    The last `sequence_pairs` summaries of pairs are kept, as in flight. The time is from frames in memory to the pose,
     without shrinking the frames.
     """
     frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)
@@ -114,4 +116,4 @@ def predict_pose_by_pairs(network: Any, architecture: dict[str, Any], trajectory
         output, _ = network.recurrent.over_time(torch.cat(list(last))[None])
         poses.append(pose_of(output[0, -1:], scales))
     seconds = (time.perf_counter() - started) / trajectory.n_pairs
-    return (np.concatenate([one[0] for one in poses]), np.concatenate([one[1] for one in poses])), seconds
+    return (np.concatenate([pose[0] for pose in poses]), np.concatenate([pose[1] for pose in poses])), seconds

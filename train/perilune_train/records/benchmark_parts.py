@@ -1,4 +1,4 @@
-"""The datasets of the locked benchmark, and whether they are those of the shared manifests."""
+"""The datasets of the locked benchmark, checked against the shared manifests."""
 
 from dataclasses import dataclass
 
@@ -45,10 +45,10 @@ def part_names(kind: str) -> list[str]:
 def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
     """Open the datasets of a kind below `data` that belong to the benchmark; compare them with the shared manifests.
 
-    Raises UserError if there is none, or if a scene or a frame is not that of its manifest.
+    Raises UserError if there is none, or if a scene or a frame differs from its manifest.
     """
     store, locked = open_store(data), open_store(manifests)
-    found = []
+    parts = []
     for name in part_names(kind):
         if store.exists(f"{name}/dataset.json"):
             dataset, manifest = open_single(store.sub(name)), open_single(locked.sub(name))
@@ -56,11 +56,11 @@ def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
                 raise UserError(dataset.store, "complete", "false", "a finished dataset; resume its rendering")
             _check_scenes(dataset, manifest)
             _check_frames(dataset, manifest)
-            found.append(Part(name, dataset, manifest.info.counts.frames))
-    if not found:
+            parts.append(Part(name, dataset, manifest.info.counts.frames))
+    if not parts:
         expected = f"one of {', '.join(part_names(kind))}; see docs/how-to/benchmark.md"
         raise UserError(store, "benchmark", "no dataset", expected)
-    return found
+    return parts
 
 
 def _check_scenes(dataset: Dataset, manifest: Dataset) -> None:

@@ -29,7 +29,7 @@ def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
             _mark_file(unmarked[0], mark)
             del unmarked[0]
     finally:
-        # After a fault, as a full disk, no file stays that looks as if it needed no mark.
+        # If writing fails, for example on a full disk, no file without its mark may remain.
         for path in unmarked:
             path.unlink(missing_ok=True)
 

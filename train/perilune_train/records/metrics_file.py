@@ -59,7 +59,7 @@ def read_metrics(folder: Path, name: str = METRICS_FILE) -> Metrics:
 
 
 def has_metrics(folder: Path, name: str = METRICS_FILE) -> bool:
-    """Whether a folder has metrics that are a whole file: an empty or truncated one is none."""
+    """Whether the metrics.json of a folder is a whole file; False if it is missing, empty or truncated."""
     try:
         return bool(read_metrics(folder, name))
     except UserError:

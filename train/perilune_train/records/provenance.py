@@ -17,6 +17,7 @@ from perilune_shared.content import terrain_of
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Address
 from perilune_train.records.metrics_file import Metrics
 
 RECORD = "terrain"
@@ -145,6 +146,18 @@ def _group(info: DatasetInfo) -> str:
 def protocol_of(info: DatasetInfo) -> str:
     """Name of a dataset's protocol: what the test split holds out and what the splits share."""
     return _PROTOCOLS[info.split_by] + info.leak
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedSplit:
+    """A split of a dataset on which finished networks are evaluated."""
+
+    dataset: Address
+    """Folder or address of the dataset."""
+    split: str = "test"
+    """train, val or test."""
+    allow_overlap: bool = False
+    """Whether terrain that a network was fitted to is accepted; all output is then marked."""
 
 
 @dataclass(frozen=True, slots=True)

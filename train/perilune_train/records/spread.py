@@ -50,7 +50,7 @@ class Resamples:
 
 @dataclass(frozen=True)
 class Spread:
-    """Spread of one metric between units."""
+    """Spread of one metric among units."""
 
     unit: str
     """scene, trajectory or image."""
@@ -63,11 +63,15 @@ class Spread:
         """The value, and its spread if known; a dash if the value is undefined. `shown` makes names of units safe."""
         if value is None or not np.isfinite(value):
             return "-"
-        known = {name: one for name, one in self.by_unit.items() if np.isfinite(one)}
+        known = {name: value_of_unit for name, value_of_unit in self.by_unit.items() if np.isfinite(value_of_unit)}
         if self.interval is not None and all(map(np.isfinite, self.interval)):
             return f"{value:.3f} ({self.interval[0]:.3f} to {self.interval[1]:.3f})"
         if known:
-            return f"{value:.3f} (" + ", ".join(f"{shown(name)} {one:.3f}" for name, one in known.items()) + ")"
+            return (
+                f"{value:.3f} ("
+                + ", ".join(f"{shown(name)} {value_of_unit:.3f}" for name, value_of_unit in known.items())
+                + ")"
+            )
         return f"{value:.3f}"
 
     def keys(self, key: str) -> dict[str, float | None]:
@@ -83,9 +87,11 @@ def read_spread(figures: Mapping[str, object], key: str) -> Spread:
     low, high = figures.get(f"{key}_low"), figures.get(f"{key}_high")
     if isinstance(low, float) and isinstance(high, float):
         return Spread("", (low, high))
-    own = {name.removeprefix(f"{key}/by_"): value for name, value in figures.items() if name.startswith(f"{key}/by_")}
-    values = {name.partition("/")[2]: value for name, value in own.items() if isinstance(value, float)}
-    return Spread(next(iter(own), "").partition("/")[0], None, values)
+    by_unit = {
+        name.removeprefix(f"{key}/by_"): value for name, value in figures.items() if name.startswith(f"{key}/by_")
+    }
+    values = {name.partition("/")[2]: value for name, value in by_unit.items() if isinstance(value, float)}
+    return Spread(next(iter(by_unit), "").partition("/")[0], None, values)
 
 
 def draw_resamples(
@@ -98,10 +104,10 @@ def draw_resamples(
     unit, names = "scene", scenes
     if len(set(scenes)) < 2:
         unit, names = ("trajectory", trajectories) if any(trajectories) else ("image", images)
-    found, of_row = np.unique(np.asarray(names, dtype=str), return_inverse=True)
-    count = len(found)
+    units, of_row = np.unique(np.asarray(names, dtype=str), return_inverse=True)
+    count = len(units)
     weights = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES) if count else np.zeros((RESAMPLES, 0))
-    return Resamples(unit, found.tolist(), of_row.reshape(-1), weights.astype(np.float64))
+    return Resamples(unit, units.tolist(), of_row.reshape(-1), weights.astype(np.float64))
 
 
 def spreads(statistics: Callable[[Resamples], dict[str, Array]], rows: Rows, resamples: Resamples) -> dict[str, Spread]:

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError, one_line
-from perilune_train.landing.monte_carlo.summary import by_trajectory, run_summary
+from perilune_train.landing.monte_carlo.page import by_trajectory, run_summary
 from perilune_train.motion.metrics.floors import FLOORS
 from perilune_train.records.markdown import number
 from perilune_train.records.spread import read_spread

@@ -32,12 +32,12 @@ _STATE_KEY = "perilune/run"
 
 
 def hashes_of(inputs: Mapping[str, Address | None]) -> dict[str, str | None]:
-    """Hash of each input: of the dataset.json of a dataset (a folder or an address), or of the file itself."""
-    return {name: None if place is None else _hash_of(place) for name, place in inputs.items()}
+    """Hash of each input: of dataset.json for a dataset (a folder or an address), otherwise of the file."""
+    return {name: None if address is None else _hash_of(address) for name, address in inputs.items()}
 
 
-def _hash_of(place: Address) -> str | None:
-    store = open_store(place)
+def _hash_of(address: Address) -> str | None:
+    store = open_store(address)
     if store.folder is None:
         return store.sha256(INFO_NAME) if store.exists(INFO_NAME) else None
     file = store.folder / INFO_NAME if store.folder.is_dir() else store.folder
@@ -46,9 +46,9 @@ def _hash_of(place: Address) -> str | None:
 
 @contextlib.contextmanager
 def held(*folders: RunFolder) -> Iterator[None]:
-    """Hold the folders of runs within the block, so that no second training writes into them.
+    """Lock the folders of runs within the block, so that no second training writes into them.
 
-    Of several processes that train together the first holds them. Raises UserError if another training does.
+    Of several processes that train together, the first holds the locks. Raises UserError if another training holds one.
     """
     with contextlib.ExitStack() as locks:
         for run in folders if is_first_process() else ():
@@ -85,9 +85,10 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
 
 
 def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state: State) -> None:
-    """Prepare the folder of a run: with `new` remove an older run and write config.yaml and inputs.json.
+    """Prepare the folder of a run: with `new`, remove an older run and write config.yaml and inputs.json.
 
-    Of several processes only the first changes the folder. Raises UserError on a folder that is no run of this task.
+    Of several processes, only the first changes the folder. Raises UserError on a folder that is not a run of this
+    task.
     """
     # Record the commit before training: the checkout may change during it.
     run_record()

@@ -22,7 +22,8 @@ import torch
 from perilune_shared.errors import UserError
 
 MOST_WEIGHT_BYTES, MOST_STATE_BYTES = 2 * 2**30, 12 * 2**30
-"""Largest files: weights of a network of width 2 have half of it; a state has them four times more."""
+"""Largest files: weights of a network of width 2 take half of the first limit; a training state has them four times
+over."""
 _MOST_PICKLE_BYTES = 4_000_000
 _MOST_DIRECTORY_BYTES = 16_000_000
 _MOST_VALUES, _MOST_TEXT, _MOST_DEPTH, _MOST_AXES = 1_000_000, 16_000_000, 50, 8
@@ -39,7 +40,7 @@ _ITEM_BYTES = {
     "ByteStorage": 1,
     "BoolStorage": 1,
 }
-# In Python, since the one in C allocates as much memory as a place in its list of values says.
+# The Python version: the C version allocates as much memory as an index into its memo says.
 _Unpickler: Any = vars(pickle)["_Unpickler"]
 _INSTRUCTIONS = (
     pickle.PROTO, pickle.STOP, pickle.MARK, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE, pickle.BININT,
@@ -71,9 +72,9 @@ class _Storage:
 
 
 def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
-    """Content of a checkpoint, on the CPU. Raises UserError on anything that perilune does not write.
+    """Read a checkpoint to the CPU. Raises UserError on anything that perilune does not write.
 
-    Memory and time are bounded by the file's size, and that by `most_bytes`.
+    Memory and time are bounded by the size of the file, which is at most `most_bytes`.
     """
     size = path.stat().st_size
     if size > most_bytes:
@@ -95,7 +96,7 @@ def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
 def check_weights(path: Path, field: str, state: object) -> None:
     """Raise UserError unless a state is a dictionary of named tensors of finite numbers, with variances of at least 0.
 
-    Networks compute NaN from others, without a message.
+    Networks would compute NaN from other numbers, without a message.
     """
     expected = "finite weights"
     if not isinstance(state, dict):
@@ -112,7 +113,7 @@ def check_weights(path: Path, field: str, state: object) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file is a checkpoint from its first byte to its last, as `load_checked` needs it; reads no tensor."""
+    """Whether a file is a complete checkpoint, as `load_checked` needs it; reads no tensor."""
     try:
         with path.open("rb") as stream:
             _check(_read_records(stream, path.stat().st_size))
@@ -141,16 +142,16 @@ def _read_records(stream: BinaryIO, size: int) -> Any:
 
 
 def _check_directory(stream: BinaryIO, size: int) -> None:
-    """Refuse a file that is no ZIP, or one with a long list of files: `zipfile` would keep all of it in memory."""
+    """Refuse a file that is not a ZIP, or has a long list of files: `zipfile` would keep the list in memory."""
     start = max(0, size - _END.size - 2**16)
     stream.seek(start)
     tail = stream.read(_END.size + 2**16)
-    place = tail.rfind(b"PK\x05\x06")
-    if place < 0 or len(tail) < place + _END.size:
+    end = tail.rfind(b"PK\x05\x06")
+    if end < 0 or len(tail) < end + _END.size:
         raise _Refused("no checkpoint, or the beginning of one")
-    length = _END.unpack_from(tail, place)[5]
+    length = _END.unpack_from(tail, end)[5]
     if length == 0xFFFFFFFF:
-        stream.seek(max(0, start + place - _LOCATOR.size))
+        stream.seek(max(0, start + end - _LOCATOR.size))
         stream.seek(_LOCATOR.unpack(stream.read(_LOCATOR.size))[2])
         length = _END_64.unpack(stream.read(_END_64.size))[8]
     if length > _MOST_DIRECTORY_BYTES:
@@ -185,7 +186,7 @@ class _Records(_Unpickler):
     def load_long1(self) -> None:
         length = self.read(1)[0]
         if length > 8:
-            # Equal hashes of such numbers would make a dictionary slow.
+            # Such numbers may have equal hashes, which would make a dictionary slow.
             raise _Refused("an integer of more than 64 bits")
         self.append(pickle.decode_long(self.read(length)))
 
@@ -200,7 +201,7 @@ class _Records(_Unpickler):
 
     def load_build(self) -> None:
         state = self.stack.pop()
-        # torch's own note on versions; other names would replace methods of the dictionary.
+        # Only torch's own note on versions: other names would replace methods of the dictionary.
         if not isinstance(self.stack[-1], OrderedDict) or set(state) != {"_metadata"}:
             raise _Refused("an object with attributes")
 
@@ -222,6 +223,7 @@ def _ordered() -> OrderedDict:
     return OrderedDict()
 
 
+# The parameters are those of torch's `_rebuild_tensor_v2`, which the pickle calls.
 def _tensor(
     storage: _Storage, offset: int, shape: tuple, strides: tuple, grad: bool, hooks: dict, _: object = None
 ) -> TensorRecord:
@@ -244,7 +246,7 @@ def _parameter(data: TensorRecord, grad: bool, hooks: dict) -> TensorRecord:
 
 
 def _check(content: Any) -> None:
-    """Refuse nesting that is deep, or that repeats parts so often that a text of it would fill the memory."""
+    """Refuse deep nesting, and parts that repeat so often that their text would fill the memory."""
     values, text, left = 0, 0, [(content, 0)]
     while left:
         value, depth = left.pop()

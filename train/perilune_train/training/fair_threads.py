@@ -9,26 +9,27 @@ import torch
 from perilune_shared.threads import OtherWork, chosen_by_user
 
 _CHECK_S = 1.0
-"""Interval at which the work of other processes is read."""
+"""Interval at which the load of other processes is read, seconds."""
 _TRIAL_S, _TRIAL_STEPS = 1.0, 3
-"""Least duration and number of steps for which a number of threads is tried."""
+"""Smallest duration, seconds, and number of steps of a trial of one number of threads."""
 _RETRY_S = 20.0
-"""Least interval between two trials."""
+"""Smallest interval between two trials, seconds."""
 _QUIET_CORES = 0.2
-"""Work of other processes below which all threads are used."""
+"""Load of other processes, in cores, below which all threads are used."""
 _GAIN = 1.03
-"""Least gain in speed for which the number of threads changes."""
+"""Smallest gain in speed for which the number of threads changes."""
 
 
 class FairThreads:
     """Chooses torch's number of threads for each step of a loop; restores it after the step.
 
     Each operation ends when its slowest thread ends. If another process takes half of one core, all threads of an
-    operation therefore run at half speed, and fewer threads are faster. While others use the cores, a trial of some
+    operation run at half speed, and fewer threads are faster. While other processes use the cores, a trial of some
     steps with fewer threads decides; when they have ended, all threads are used again.
 
     The number of threads changes the last digits of sums, so two trainings on a busy machine are equal only up to
-    rounding. It stays constant on an idle machine, on a GPU, and if OMP_NUM_THREADS is set, which is how to fix it.
+    rounding. It stays constant on an idle machine, on a GPU, and if OMP_NUM_THREADS is set; set it for exactly
+    repeatable trainings.
 
     Example:
 
@@ -44,9 +45,9 @@ class FairThreads:
         clock: Callable[[], float] = time.monotonic,
         others: Callable[[], float] | None = None,
     ):
-        """With `enabled` false the number stays; torch computes on a GPU, or several processes share the cores.
+        """Without `enabled` the number stays: torch computes on a GPU, or several processes share the cores.
 
-        `clock` returns the time, s; `others` the cores that other processes have used since it was last called.
+        `clock` returns the time, s; `others` the cores that other processes have used since its last call.
         """
         self._active = enabled and not chosen_by_user("OMP_NUM_THREADS")
         self._clock, self._others = clock, OtherWork().cores if others is None else others
@@ -54,7 +55,7 @@ class FairThreads:
         self._most = self._number = self._preferred = torch.get_num_threads()
         """Numbers of threads of the program, of the next step, and outside trials."""
         self._waiting: list[int] = []
-        """Numbers of threads that are still to be tried, the current one first; empty outside a trial."""
+        """Numbers of threads still to be tried, the current one first; empty outside a trial."""
         self._speeds: dict[int, float] = {}
         self._n_steps, self._steps_s, self._began_s = 0, 0.0, 0.0
 
@@ -79,7 +80,7 @@ class FairThreads:
             self._check(now_s)
 
     def restore(self) -> None:
-        """Use the program's number again, after a step that did not end."""
+        """Use the program's number again after a step that failed."""
         if self._active:
             _use(self._most)
 
@@ -105,7 +106,7 @@ class FairThreads:
             self._preferred = best
         self._number = self._preferred
         self._checked_s = self._tried_s = now_s
-        # What others used during the trial says nothing about the chosen number.
+        # The load during the trial says nothing about the chosen number.
         self._others()
 
     def _try_next(self) -> None:

@@ -5,6 +5,7 @@ import math
 import os
 import time
 import warnings
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import lightning
@@ -17,7 +18,7 @@ from perilune_shared.console.terminal import progress_bar
 from perilune_shared.errors import UserError
 from perilune_shared.threads import warn_if_crowded
 from perilune_train.config import Precision
-from perilune_train.data.lost import DataLost
+from perilune_train.data.epochs import DataLost
 from perilune_train.data.shares import Share
 from perilune_train.training.fair_threads import FairThreads
 from perilune_train.training.runs import (
@@ -32,7 +33,8 @@ from perilune_train.training.runs import (
 
 _STEPS_BETWEEN_CHECKS = 20
 _EARLY_STEPS, _DIVERGED, _LEAST_LOSS = 10, 1e3, 1e-3
-"""First steps, of which each is checked; a loss of so many times the first one, or of this value, has diverged."""
+"""Number of first steps that are all checked; a loss above this multiple of the first loss, or of the smallest loss,
+has diverged."""
 _PROCESSES = "processes"
 """Key of the number of processes in last.ckpt. It must not change on resume: it determines the batches of a step."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
@@ -134,7 +136,7 @@ class KeepLast(Callback):
         between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
         if self.minutes is None or trainer.is_last_batch or between:
             return
-        # Several processes use the clock of the first. Asking it makes them wait, so do it rarely.
+        # Several processes follow the clock of the first. Asking for it makes them wait, so do it rarely.
         if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_CHECKS == 0:
             due = time.monotonic() - self.saved >= 60 * self.minutes
             if trainer.strategy.broadcast(due):
@@ -146,8 +148,8 @@ class KeepLast(Callback):
             self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        # Loaders raise it between two batches, when the state is whole. Several processes cannot save, since the
-        # others may still train, and before the first batch of an epoch the state of the last epoch is saved already.
+        # Loaders raise it between two batches, when the state is complete. Several processes cannot save, since the
+        # others may still train, and before the first batch of an epoch the state of the last epoch is already saved.
         done = trainer.fit_loop.epoch_loop.batch_progress.current
         between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
         if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
@@ -166,7 +168,7 @@ class FewerThreadsIfCrowded(Callback):
     """Adapt the number of threads on a CPU to other work on the machine (see `FairThreads`)."""
 
     def __init__(self, enabled: bool):
-        # Steps of validation cost less than those of training, so each has its own trials of speed.
+        # Validation steps cost less than training steps, so each has its own trials of speed.
         self.training, self.validation = FairThreads(enabled), FairThreads(enabled)
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
@@ -215,7 +217,7 @@ class Bar(Callback):
 
 
 def machines(devices: int, num_nodes: int) -> tuple[int, int]:
-    """Processes on each machine and number of machines: torchrun's values from the environment, else the arguments."""
+    """Processes on each machine and number of machines: from torchrun's environment, else from the arguments."""
     if torch.distributed.is_torchelastic_launched():
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return local, int(os.environ["WORLD_SIZE"]) // local
@@ -227,45 +229,78 @@ def own_share(devices: int, num_nodes: int) -> Share:
     return Share(int(rank_zero_only.rank), math.prod(machines(devices, num_nodes)))
 
 
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Length of a training, its steps, and when it validates and saves."""
+
+    epochs: int
+    """Number of epochs."""
+    monitor: str
+    """Validation metric that selects the best weights."""
+    mode: Literal["min", "max"]
+    """Whether a smaller or a larger value of this metric is better."""
+    validate_every: int = 1
+    """Epochs from one validation to the next."""
+    checkpoint_minutes: float | None = None
+    """Minutes between saved states within an epoch; None to save after validations only."""
+    accumulate: int = 1
+    """Batches whose gradients are summed for one step."""
+    gradient_clip: float = 10.0
+    """Largest norm of the gradient of a step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hardware:
+    """Devices and processes of a training."""
+
+    device: str = "auto"
+    """auto, cuda or cpu."""
+    devices: int = 1
+    """Processes on each machine; torchrun's environment overrides it."""
+    num_nodes: int = 1
+    """Machines; torchrun's environment overrides it."""
+    strategy: str = "auto"
+    """Lightning's strategy for several processes."""
+    precision: Precision = "auto"
+    """Floating-point format of the computation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wording:
+    """Names in the messages of a training."""
+
+    progress: str
+    """Label of the progress bar."""
+    learning_rate: str = "the learning rate"
+    """The setting to lower if the loss diverges."""
+
+
 def fit(
     run: RunFolder,
     task: lightning.LightningModule,
-    *,
-    label: str,
-    epochs: int,
-    monitor: str,
-    mode: Literal["min", "max"],
+    schedule: Schedule,
+    hardware: Hardware,
+    wording: Wording,
     resume: bool = False,
-    gradient_clip: float = 10.0,
-    precision: Precision = "auto",
-    device: str = "auto",
-    devices: int = 1,
-    num_nodes: int = 1,
-    strategy: str = "auto",
-    checkpoint_minutes: float | None = None,
-    accumulate: int = 1,
-    validate_every: int = 1,
-    learning_rate: str = "the learning rate",
 ) -> float:
     """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
     Returns the training time in seconds, including the time before a resume.
 
-    A step sums the gradients of `accumulate` batches. Validation follows every `validate_every` epochs.
-
-    The task provides its own loaders, once; a batch sampler with an attribute `sampler` is told each epoch by
-    `set_epoch` (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several
-    processes, each loader provides the batches of its own process. The task logs `monitor` in validation, and has
+    The task provides its own loaders, once. Each epoch calls `set_epoch` of the attribute `sampler` of a batch sampler
+    (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several processes, each
+    loader provides the batches of its own process. The task logs `schedule.monitor` in validation, and has
     `architecture` and `evaluated` (see KeepBest).
 
     With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
-    uninterrupted run. The state is saved after every epoch, and with `checkpoint_minutes` within epochs too; then the
-    task's training batches must continue at the position of the checkpoint. Raises UserError if last.ckpt is damaged,
-    of another network or of another number of processes, if the rank of this process was unknown before, or if the loss
-    diverges; `learning_rate` names the setting to lower then.
+    uninterrupted run. The state is saved after every validation. With `schedule.checkpoint_minutes` it is also saved
+    within epochs; the task's training batches must then continue at the position of the checkpoint.
+
+    Raises UserError if last.ckpt is damaged, of another network or of another number of processes, if Lightning gives
+    this process another rank than the environment states, or if the loss diverges.
     """
-    share = own_share(devices, num_nodes)
-    devices, num_nodes = machines(devices, num_nodes)
+    share = own_share(hardware.devices, hardware.num_nodes)
+    devices, num_nodes = machines(hardware.devices, hardware.num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
     if resume_from is not None:
         expected = "the state of an interrupted run; --overwrite replaces it"
@@ -275,41 +310,41 @@ def fit(
         if began != devices * num_nodes:
             expected = f"{began}, as in the existing run; --overwrite replaces the run"
             raise UserError(resume_from, "processes", devices * num_nodes, expected)
-    keep_last = KeepLast(run, checkpoint_minutes)
-    device = choose_device(device)
+    keep_last = KeepLast(run, schedule.checkpoint_minutes)
+    device = choose_device(hardware.device)
     # Several processes share the cores: Lightning gives each its part.
     threads = FewerThreadsIfCrowded(device == "cpu" and devices * num_nodes == 1)
     warn_if_crowded()
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Deterministic algorithms would also fill all memory that is about to be overwritten.
+    # Deterministic algorithms would otherwise also fill all memory that is about to be overwritten.
     setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer = lightning.Trainer(
             default_root_dir=run.root,
-            max_epochs=epochs,
+            max_epochs=schedule.epochs,
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=devices,
             num_nodes=num_nodes,
-            strategy=strategy if devices * num_nodes > 1 else "auto",
+            strategy=hardware.strategy if devices * num_nodes > 1 else "auto",
             use_distributed_sampler=False,
-            precision="bf16-mixed" if choose_bf16(precision, device) else "32-true",
+            precision="bf16-mixed" if choose_bf16(hardware.precision, device) else "32-true",
             deterministic="warn",
-            gradient_clip_val=gradient_clip,
-            accumulate_grad_batches=accumulate,
+            gradient_clip_val=schedule.gradient_clip,
+            accumulate_grad_batches=schedule.accumulate,
             num_sanity_val_steps=0,
-            check_val_every_n_epoch=validate_every,
+            check_val_every_n_epoch=schedule.validate_every,
             logger=TensorBoardLogger(run.root, name="", version=""),
             log_every_n_steps=10,
             enable_progress_bar=False,
             enable_model_summary=False,
             enable_checkpointing=False,
             callbacks=[
-                *([Bar(label)] if is_first_process() else []),
+                *([Bar(wording.progress)] if is_first_process() else []),
                 LearningRateMonitor("step"),
-                StopDiverged(run, learning_rate),
-                KeepBest(run, monitor, mode),
+                StopDiverged(run, wording.learning_rate),
+                KeepBest(run, schedule.monitor, schedule.mode),
                 keep_last,
                 threads,
             ],

@@ -17,7 +17,7 @@ SUFFIX = ".safetensors"
 _MOST_HEADER_BYTES = 8_000_000
 _DTYPES = {"F16", "F32", "F64", "I64", "I32", "I8", "BOOL"}
 _STEP = "#step"
-"""Ending of the name of the steps of a tensor of 8-bit integers."""
+"""Suffix of the name of the tensor with the steps of an 8-bit tensor."""
 _PLAIN = ("architecture", "terrain")
 """Keys of a checkpoint that are stored as JSON in the header; `terrain` may be missing."""
 
@@ -26,7 +26,7 @@ def write_half(path: Path, content: Mapping[str, Any]) -> None:
     """Write the content of a checkpoint (`runs.load_weights`) in half precision.
 
     Only convolutions and matrices are halved. Vectors, such as the variances of norms, and buffers keep their type:
-    they are few and may exceed the range of half precision. Raises UserError if a weight does.
+    they are few and may exceed the range of half precision. Raises UserError if a weight exceeds it.
     """
     tensors = {}
     for name, tensor in content["state_dict"].items():
@@ -113,10 +113,10 @@ def precision_of(path: Path) -> str:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file is a safetensors file from its first byte to its last; reads no tensor."""
+    """Whether a file is a complete safetensors file; reads no tensor."""
     try:
         _check_header(path, "")
-        # It refuses a file whose size is not that of its header and its tensors.
+        # The library refuses a file whose size differs from the sizes of its header and its tensors.
         with safetensors.safe_open(path, "pt"):
             return True
     except (safetensors.SafetensorError, UserError, OSError):

@@ -65,12 +65,28 @@ class RunFolder:
 
     @property
     def damaged(self) -> Path | None:
-        """The weights or the metrics, if they are an empty or truncated file; None if they are whole or missing."""
+        """The weights or the metrics if that file is empty or truncated; None if both are complete or missing."""
         if self.best.is_file() and not (half_is_whole if self.best.suffix == SUFFIX else is_whole)(self.best):
             return self.best
         if self.metrics.is_file() and not has_metrics(self.root):
             return self.metrics
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class NamedRun:
+    """A run to start, resume or replace."""
+
+    runs: Path
+    """Folder of all runs."""
+    name: str
+    """Name of the run."""
+    overwrite: bool = False
+    """Whether to replace an existing run."""
+
+    def folder(self, task: str, ending: str = "") -> RunFolder:
+        """The folder <runs>/<task>/<name><ending>."""
+        return RunFolder(self.runs / task / f"{self.name}{ending}")
 
 
 def is_first_process() -> bool:
@@ -145,10 +161,10 @@ def load_state(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path
 
 def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Module) -> None:
     """Raise UserError naming the first tensor of a checkpoint that is missing, extra or of the wrong shape."""
-    own = network.state_dict()
-    for key in sorted(own.keys() | state.keys()):
+    tensors = network.state_dict()
+    for key in sorted(tensors.keys() | state.keys()):
         found = tuple(state[key].shape) if key in state else "nothing"
-        expected = str(tuple(own[key].shape)) if key in own else "no such tensor"
+        expected = str(tuple(tensors[key].shape)) if key in tensors else "no such tensor"
         if str(found) != expected:
             raise UserError(path, key, found, f"{expected}; the checkpoint is of another architecture")
 

@@ -59,21 +59,21 @@ def test_a_detector_that_finds_every_label_is_perfect_by_the_papers_rule(places,
     figures = json.loads((tmp_path / "out/benchmark.json").read_text())
     for account in ("", "edge/", "strict/"):
         assert figures[f"paper/{account}ap50_paper"] == figures[f"paper/{account}f1"] == 1
-    # By `visible`, the boxes on eroded craters are ignored, but count as false positives in the strict account.
+    # By `visible`, the boxes on eroded craters are ignored, but count as false positives by the strict scoring rule.
     assert figures["visible/ap50_paper"] == 1 and figures["visible/strict/ap50_paper"] < 1
     assert figures["headline/ap50_paper"] == figures["visible/strict/ap50_paper"]
     assert figures["headline/ap50_paper_account"] == "visible, strict"
     assert (figures["paper/intervals_over"], figures["paper/intervals_units"]) == ("scene", 5)
     assert (figures["paper/region/highland/scenes"], figures["paper/region/mare/scenes"]) == (3, 2)
     page = (tmp_path / "out/benchmark.md").read_text()
-    assert "by the least favourable account (AP: labels by `visible`, strict account" in page
+    assert "by the least favourable scoring rule (AP: labels by `visible`, strict rule" in page
     assert "`benchmark-detect-mare`: all frames of the shared manifest" in page
     assert "`benchmark-detect-camera`: **not scored**" in page
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_headline_is_the_lowest_of_all_accounts(places, tmp_path):
-    """Half of the labels found: recall 0.5 by the paper's rule, whatever the account."""
+def test_the_headline_is_the_lowest_of_all_scoring_rules(places, tmp_path):
+    """Half of the labels found: recall 0.5 by the paper's rule, whatever the scoring rule."""
     done = submitted(places, truth(places[0], lambda labels: labels.iloc[::2]), tmp_path)
     assert done.returncode == 0, done.stderr
     figures = json.loads((tmp_path / "out/benchmark.json").read_text())

@@ -277,7 +277,7 @@ def test_batches(split):
     assert [part.ignored.shape for part in targets] == [(5, 3, side, side) for side in (12, 6, 3)]
     for frame, labels in enumerate(split.labels[5:10]):
         # Each selected label has a predictor at some scale, and no other box has one.
-        assigned = torch.cat([part.boxes[part.places[0] == frame] for part in targets])
+        assigned = torch.cat([part.boxes[part.predictors[0] == frame] for part in targets])
         assert {tuple(box) for box in assigned.tolist()} == {
             tuple(box) for box in labels.boxes[labels.selected].astype(np.float32).tolist()
         }
@@ -296,5 +296,5 @@ def test_workers_under_spawn_give_the_same_batches(split):
         assert torch.equal(images, own_images)
         for part, own in zip(targets, own_targets, strict=True):
             found, expected = ({key: one for key, one in vars(each).items() if one is not None} for each in (part, own))
-            assert found.keys() == expected.keys() >= {"places", "boxes", "ignored"}
+            assert found.keys() == expected.keys() >= {"predictors", "boxes", "ignored"}
             assert all(torch.equal(value, expected[name]) for name, value in found.items())

@@ -20,7 +20,7 @@ from perilune_train.detect.data import streamed
 from perilune_train.detect.data.batches import TrainingFrames
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.data.streamed import open_streamed, streamed_loader
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.detect.train.task import DetectTask
 
 QUICK = ("detect.epochs=2", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu", "detect.stream=true")
@@ -64,7 +64,7 @@ def test_samples_are_those_of_frames_in_memory(few, packed):
 def test_a_run_stopped_within_an_epoch_is_resumed_with_the_frames_that_were_left(
     packed, tmp_path, workers, monkeypatch
 ):
-    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
+    monkeypatch.setattr("perilune_train.detect.train.detect_run.evaluate", lambda *_: {})
     quick = ("detect.batch_size=1", f"detect.workers={workers}")
     # Only the run that is stopped writes a checkpoint after every batch.
     config = settings(*quick, "detect.checkpoint_minutes=0")
@@ -100,7 +100,7 @@ def test_a_run_stopped_within_an_epoch_is_resumed_with_the_frames_that_were_left
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_a_run_on_an_object_store_gives_the_same_weights(packed, s3_bucket, tmp_path, monkeypatch):
-    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
+    monkeypatch.setattr("perilune_train.detect.train.detect_run.evaluate", lambda *_: {})
     source, target = open_store(packed), open_store(f"{s3_bucket}/packed")
     for item in source.list():
         target.write(item.path, source.read(item.path))

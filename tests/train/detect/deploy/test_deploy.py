@@ -18,7 +18,7 @@ from perilune_train.cli.main import app
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
-from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.files import FlightDetector
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.records.metrics_file import write_metrics
@@ -98,7 +98,7 @@ def test_settings_come_from_the_run_alone(run_folder):
 @pytest.fixture(scope="module")
 def exported(run_folder, dataset_detect, tmp_path_factory):
     out = tmp_path_factory.mktemp("export") / "flight"
-    export.export_run(run_folder, out, size_px=SIZE, dataset=dataset_detect)
+    export.export_run(run_folder, out, export.ExportedFiles(size_px=SIZE), dataset_detect)
     return out
 
 
@@ -202,7 +202,7 @@ def test_a_file_that_differs_is_not_left(run_folder, tmp_path, monkeypatch):
 
     monkeypatch.setattr(export, "FlightDetector", wrong)
     with pytest.raises(UserError, match=r"detector.onnx: onnxruntime: got boxes 0.*px.*expected at most 0.001 px"):
-        export.export_run(run_folder, tmp_path / "flight", ("onnx",), SIZE)
+        export.export_run(run_folder, tmp_path / "flight", export.ExportedFiles(("onnx",), SIZE))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -231,7 +231,7 @@ def test_int8_is_evaluated_and_kept_only_if_better(
     monkeypatch.setattr(int8, "MAX_AP_LOSS", most_loss)
     timed = int8.interleaved
     monkeypatch.setattr(int8, "interleaved", lambda *given: timed(*given) | {"int8": [0.0]})
-    verdict = export.export_run(run_folder, tmp_path / "a", ("onnx",), SIZE, dataset_detect, int8=True)
+    verdict = export.export_run(run_folder, tmp_path / "a", export.ExportedFiles(("onnx",), SIZE, True), dataset_detect)
     assert verdict.kept == (most_loss > 0)
     assert 0 <= verdict.ap50_paper_int8 <= 1 and verdict.float_s > 0
     assert (tmp_path / "a" / "detector-int8.onnx").exists() == verdict.kept
@@ -245,7 +245,7 @@ def test_int8_is_evaluated_and_kept_only_if_better(
 def test_without_the_extra_one_line_says_what_to_install(run_folder, dataset_detect, tmp_path, monkeypatch, missing):
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(UserError, match=rf"{missing}: got not installed, expected pip install"):
-        export.export_run(run_folder, tmp_path / "a", export.FORMATS, SIZE, dataset_detect, int8=True)
+        export.export_run(run_folder, tmp_path / "a", export.ExportedFiles(size_px=SIZE, int8=True), dataset_detect)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -291,7 +291,7 @@ def test_wrong_options_leave_nothing(run_folder, tmp_path, options, words):
 
 def test_frames_of_another_size(run_folder, dataset_detect, tmp_path):
     with pytest.raises(UserError, match="frames: got 96 x 96, expected 256 x 256"):
-        export.export_run(run_folder, tmp_path / "x", ("onnx",), 256, dataset_detect)
+        export.export_run(run_folder, tmp_path / "x", export.ExportedFiles(("onnx",)), dataset_detect)
 
 
 def test_engines_refuse_what_is_no_network(tmp_path):

@@ -11,9 +11,9 @@ from perilune_train.detect.data.frame_facts import FrameFacts, unknown_facts
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import evaluate_detections
-from perilune_train.detect.evaluate.figures import choose_frames
-from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections, Matches
+from perilune_train.detect.evaluate.matching import FALSE, FOUND, Criteria, Detections, Matches
 from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.evaluate.pictures import choose_frames
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.records.spread import Spread, draw_resamples, read_spread
 
@@ -58,7 +58,7 @@ def test_radius_bins_ignore_the_labels_and_the_detections_of_other_bins():
     truth = [labels((20, 20, 4), (60, 60, 8), (100, 100, 12))]
     # Both smaller are found; in the open lie a false one of 4 px and one of 15 px.
     ours = [found((20, 20, 4, 0.9), (60, 60, 8, 0.8), (150, 20, 4, 0.85), (150, 150, 15, 0.7))]
-    bins = by_key(evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)))
+    bins = by_key(evaluate_detections(ours, truth, facts("a"), Criteria(0.5, (2.0, 50.0))))
     assert set(bins) == {"radius_3_5_px", "radius_5_10_px", "radius_10_20_px"}
     small = bins["radius_3_5_px"]
     assert (small.precision, small.recall, small.ap50_paper) == (0.5, 1, 1)
@@ -69,7 +69,7 @@ def test_radius_bins_ignore_the_labels_and_the_detections_of_other_bins():
 def test_labels_above_50_px_have_a_bin_of_their_own():
     truth = [labels((100, 100, 50), (300, 300, 80))]
     ours = [found((100, 100, 50, 0.9), (300, 300, 80, 0.8))]
-    evaluation = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 200.0))
+    evaluation = evaluate_detections(ours, truth, facts("a"), Criteria(0.5, (2.0, 200.0)))
     bins = by_key(evaluation)
     assert set(bins) == {"radius_20_50_px", "radius_50_inf_px"}
     assert all((part.labels, part.precision, part.recall) == (1, 1, 1) for part in bins.values())
@@ -78,7 +78,7 @@ def test_labels_above_50_px_have_a_bin_of_their_own():
 
 def test_a_find_of_another_size_counts_for_the_labels_bin():
     truth, ours = [labels((50, 50, 4.8))], [found((50, 50, 5.2, 0.9))]
-    bins = by_key(evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)))
+    bins = by_key(evaluate_detections(ours, truth, facts("a"), Criteria(0.5, (2.0, 50.0))))
     assert bins["radius_3_5_px"].ap50_paper == 1 and set(bins) == {"radius_3_5_px"}
 
 
@@ -86,7 +86,7 @@ def test_altitude_and_sun_bins_hold_whole_frames():
     truth = [labels((20, 20, 5)), labels((20, 20, 5)), labels((20, 20, 5))]
     ours = [found((20, 20, 5, 0.9)), found((90, 90, 5, 0.9)), found((20, 20, 5, 0.4))]
     known = facts("aab", altitude_m=[190, 500, 5000], sun_deg=[20, 29.9, 90])
-    evaluation = evaluate_detections(ours, truth, known, 0.5, radius_px=(2.0, 50.0))
+    evaluation = evaluate_detections(ours, truth, known, Criteria(0.5, (2.0, 50.0)))
     bins = by_key(evaluation)
     # 190 m is within a tenth of the first bin, 5000 m is in none.
     assert (bins["altitude_200_500_m"].ap50_paper, bins["altitude_500_1000_m"].ap50_paper) == (1, 0)
@@ -104,7 +104,7 @@ def test_freshness_has_recall_alone():
         labels(*[(20 + 30 * k, 20, 5) for k in range(5)], depth_ratio=ratio, selected=[True, True, True, True, False])
     ]
     ours = [found((20, 20, 5, 0.9), (50, 20, 5, 0.2), (80, 20, 5, 0.9))]
-    evaluation = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0))
+    evaluation = evaluate_detections(ours, truth, facts("a"), Criteria(0.5, (2.0, 50.0)))
     bins = {key: part for key, part in by_key(evaluation).items() if part.by == "depth_ratio"}
     assert {key: (part.labels, part.recall) for key, part in bins.items()} == {
         "depth_ratio_0.04_0.06": (2, 0.5),
@@ -116,13 +116,13 @@ def test_freshness_has_recall_alone():
 def test_errors_of_found_craters():
     truth = [labels((50, 50, 10), (100, 100, 20), (150, 150, 10))]
     ours = [found((53, 54, 10, 0.9), (100, 100, 22, 0.9), (150, 150, 10, 0.1))]
-    errors = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)).errors
+    errors = evaluate_detections(ours, truth, facts("a"), Criteria(0.5, (2.0, 50.0))).errors
     # Two found above the threshold: 5 px off, and 2 px too large.
     assert errors["centre_error_px_median"] == pytest.approx(2.5)
     assert errors["centre_error_relative_p95"] == pytest.approx(0.95 * 0.5)
     assert errors["radius_error_px_median"] == errors["radius_bias_px"] == pytest.approx(1)
     assert errors["radius_bias_relative"] == pytest.approx(0.05)
-    nothing = evaluate_detections([found()], truth, facts("a"), 0.5, radius_px=(2.0, 50.0)).errors
+    nothing = evaluate_detections([found()], truth, facts("a"), Criteria(0.5, (2.0, 50.0))).errors
     assert all(np.isnan(value) for value in nothing.values())
 
 
@@ -177,7 +177,7 @@ def scenes_found(scenes):
     """One label a frame, of which the second scene finds none; a find in each frame of the others."""
     ours = [found((20, 20, 5, 0.9)) if scene != "b" else found() for scene in scenes]
     known = facts(scenes, altitude_m=[300 if scene in "ab" else 700 for scene in scenes])
-    return evaluate_detections(ours, [labels((20, 20, 5))] * len(scenes), known, 0.5, radius_px=(2.0, 50.0))
+    return evaluate_detections(ours, [labels((20, 20, 5))] * len(scenes), known, Criteria(0.5, (2.0, 50.0)))
 
 
 def test_fewer_than_five_units_give_their_values_and_no_interval(tmp_path):
@@ -221,7 +221,7 @@ def test_the_report_of_images_of_which_nothing_is_known(tmp_path: Path):
     truth = [labels((20, 20, 5), (40, 30, 8)), labels((50, 50, 6)), labels()]
     ours = [found((20, 20, 5, 0.9), (50, 20, 4, 0.8)), found(), found((30, 30, 5, 0.6))]
     known = unknown_facts(["one|x.png", "two.png", "three.png"], np.array(sizes))
-    evaluation = evaluate_detections(ours, truth, known, 0.5, radius_px=(2.0, 50.0))
+    evaluation = evaluate_detections(ours, truth, known, Criteria(0.5, (2.0, 50.0)))
     images = [np.full((height, width), 90, np.uint8) for width, height in sizes]
     write_evaluation(tmp_path, evaluation, images, ["made by hand"])
     report = (tmp_path / "report.md").read_text()
@@ -238,7 +238,7 @@ def test_the_report_of_images_of_which_nothing_is_known(tmp_path: Path):
 
 
 def test_nothing_at_all(tmp_path: Path):
-    evaluation = evaluate_detections([found()], [labels()], facts("a"), 0.5, radius_px=(2.0, 50.0))
+    evaluation = evaluate_detections([found()], [labels()], facts("a"), Criteria(0.5, (2.0, 50.0)))
     assert evaluation.bins == [] and evaluation.figures()["ap50_paper"] == 0
     write_evaluation(tmp_path, evaluation, [np.zeros((64, 64), np.uint8)], [])
     assert (tmp_path / "report.md").is_file()

@@ -144,7 +144,7 @@ def test_nothing_found_and_nothing_wanted():
     assert curve(nothing_selected).ap_paper() == 0
 
 
-def test_figures_of_both_accounts():
+def test_figures_of_both_scoring_rules():
     truth = labels([square(0, 0, 8), square(20, 0, 8), square(40, 40, 30)], [True, True, False])
     result = figures(match_one(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.8]), truth), threshold=0.5)
     assert result["recall"] == result["strict/recall"] == result["ap50_paper"] == result["ap50_envelope"] == 0.5

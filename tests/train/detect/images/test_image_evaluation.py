@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import app
-from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate_runs import compare_folders
 from perilune_train.detect.images.evaluate import ImageSettings, evaluate_detections_in_images, evaluate_images
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
 from perilune_train.detect.inference.tiling import Tiling

@@ -11,7 +11,7 @@ from tests.helpers.stored_run import settings_of, store_run
 from perilune_shared.errors import UserError
 from perilune_train.detect.images.pictures import pictures_of
 from perilune_train.detect.images.predict import PredictSettings, predict_images
-from perilune_train.detect.images.read import picture_format, picture_size, read_grey
+from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.inference.tiling import Tiling
 
 HEIGHT, WIDTH = 70, 96
@@ -62,7 +62,7 @@ def written(folder, kind):
 def test_pixels_are_those_of_the_file(tmp_path, kind):
     path = written(tmp_path, kind)
     read = read_grey(path)
-    assert picture_size(path) == (WIDTH, HEIGHT) and picture_format(path) not in ("PNG", "TIFF", "JPEG")
+    assert picture_size(path) == (WIDTH, HEIGHT)
     assert (read.min(), read.max()) == (0, 255)
     assert np.corrcoef(read.ravel(), values().ravel())[0, 1] > 0.9999
 

@@ -12,8 +12,8 @@ from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.batches import network_input, training_loader
 from perilune_train.detect.data.resident import ResidentFrames, fits, may_reside, resident_loader
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.training.runs import load_weights
 

@@ -14,9 +14,8 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import evaluation_loader, network_input
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.inference.detector import load_detector
+from perilune_train.detect.train.detect_run import build_network, load_teacher, run_detect
 from perilune_train.detect.train.distill import Teacher, distill_loss
-from perilune_train.detect.train.network import build_network, load_teacher
-from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3

@@ -9,10 +9,10 @@ from perilune_train.detect.config import DetectConfig, LabelSettings, LossSettin
 from perilune_train.detect.data.assign import Assignment
 from perilune_train.detect.data.batches import training_loader
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.detect.train.guide import GUIDED, craterness, guide_loss
-from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.task import DetectTask
-from perilune_train.explain.correlation.ground_truth import ground_truth_mask
+from perilune_train.explain.inputs import ground_truth_mask
 
 
 def assigned(frames, boxes):

@@ -116,7 +116,7 @@ def test_no_step_of_the_loss_needs_a_value(objectness):
     boxes = torch.tensor([[8.0, 8.0, 16.0, 16.0], [4.0, 4.0, 20.0, 20.0], [0.0, 0.0, 30.0, 30.0]])
     labels = BatchLabels(boxes, torch.tensor([0, 0, 1]), torch.tensor([True, True, False]))
     targets = assign(labels, anchors, (8,), [(2, 4, 4)], 1.5)
-    assert targets[0].places.shape[1] > 3 and targets[0].ignored.any()
+    assert targets[0].predictors.shape[1] > 3 and targets[0].ignored.any()
     with FakeTensorMode() as fake:
         raw = torch.zeros(2, 3, 4, 4, 5, requires_grad=True)
         given = [Assignment(*(fake.from_tensor(part) for part in vars(targets[0]).values() if part is not None))]

@@ -12,7 +12,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.train.network import build_network
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.detect.train.preview_images import preview_images
 from perilune_train.detect.train.task import DetectTask
 

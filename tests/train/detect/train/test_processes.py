@@ -14,7 +14,7 @@ from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import main
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import run_detect
 
 pytestmark = pytest.mark.slow
 

@@ -16,9 +16,8 @@ from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import load_detector
+from perilune_train.detect.train.detect_run import build_network, run_detect
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.network import build_network
-from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.transfer import start_from
 from perilune_train.training import runs
@@ -145,7 +144,7 @@ def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
 @pytest.fixture
 def no_evaluation(monkeypatch):
     """Train without evaluation, which takes most of the time of a small run."""
-    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
+    monkeypatch.setattr("perilune_train.detect.train.detect_run.evaluate", lambda *_: {})
 
 
 @pytest.mark.slow
@@ -170,7 +169,7 @@ def test_the_anchors_are_told_before_training(few, tmp_path, monkeypatch, capsys
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("perilune_train.detect.train.run.fit", stopped)
+    monkeypatch.setattr("perilune_train.detect.train.detect_run.fit", stopped)
     with pytest.raises(KeyboardInterrupt):
         run_detect(settings(), few, tmp_path, "a")
     assert "anchors: best possible recall" in capsys.readouterr().err

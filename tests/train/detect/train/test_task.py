@@ -12,8 +12,8 @@ from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.train.detect_run import build_network
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.task import DetectTask, learning_rate_factor, paired_tensors, update_average
 
 

@@ -16,8 +16,7 @@ from perilune_shared.errors import UserError
 from perilune_train.cli.main import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.split import load_split
-from perilune_train.detect.train.network import build_network
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import build_network, run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.transfer import darknet_content, rescale_input, start_from
 from perilune_train.models.darknet import AttentionDarknet53

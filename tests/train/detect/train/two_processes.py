@@ -10,7 +10,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import batches
 from perilune_train.detect.evaluate import report
 from perilune_train.detect.train import task
-from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.detect_run import run_detect
 from perilune_train.training import runs
 
 

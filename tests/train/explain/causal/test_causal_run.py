@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,11 +15,11 @@ from tests.helpers.terrain_record import store_record
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.explain.causal.run import CAPTIONS, causal_run
+from perilune_train.explain.causal.causal_run import CAPTIONS, CausalInputs, PoseInputs, causal_run
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
-from perilune_train.training.runs import save_weights
+from perilune_train.training.runs import NamedRun, save_weights
 
 _STACK = {
     "fusion": "stack",
@@ -52,14 +53,14 @@ def inputs(rendered, tmp_path_factory):
 
 
 def _run(rendered, detector, runs, **options):
-    settings = ExplainConfig(device="cpu")
-    return causal_run(settings, rendered.factual, rendered.without, detector, "B_11", runs, "t", **options)
+    inputs = CausalInputs(rendered.factual, rendered.without, **options)
+    return causal_run(ExplainConfig(device="cpu"), NamedRun(runs, "t"), detector, "B_11", inputs)
 
 
 @pytest.mark.slow
 def test_a_run_writes_effects_bins_claims_and_pictures(rendered, inputs, tmp_path):
     detector, stack, nav, without = inputs
-    run = _run(rendered, detector, tmp_path, turned=rendered.factual, pose=(nav, without, stack))
+    run = _run(rendered, detector, tmp_path, turned=rendered.factual, pose=PoseInputs(nav, without, stack))
     metrics = json.loads(run.metrics.read_text())
     moved = pd.read_parquet(run.root / "mask_effects.parquet")
     gates = moved["map"].unique()
@@ -87,7 +88,7 @@ def test_a_run_writes_effects_bins_claims_and_pictures(rendered, inputs, tmp_pat
     assert {path.name for path in run.root.glob("*.png")} == set(CAPTIONS)
     assert all(cv2.imread(str(run.root / name)).std() > 5 for name in CAPTIONS)
     before = {path: path.stat().st_mtime_ns for path in run.root.rglob("*")}
-    _run(rendered, detector, tmp_path, turned=rendered.factual, pose=(nav, without, stack))
+    _run(rendered, detector, tmp_path, turned=rendered.factual, pose=PoseInputs(nav, without, stack))
     assert {path: path.stat().st_mtime_ns for path in run.root.rglob("*")} == before
 
 
@@ -99,10 +100,10 @@ def test_faults_of_an_input_leave_no_run(rendered, inputs, tmp_path):
     with pytest.raises(UserError, match=r"more.*: frames: got 3 frames, 2 of them in"):
         _run(rendered, detector, runs, turned=more)
     with pytest.raises(UserError, match=r"fewer.*: frames: got 3 frames of s002/t002"):
-        _run(rendered, detector, runs, pose=(nav, fewer, stack))
+        _run(rendered, detector, runs, pose=PoseInputs(nav, fewer, stack))
     unseen = tmp_path / "unseen"
     shutil.copytree(rendered.without, unseen)
     rendered.removed.assign(crater_id=100_000).to_parquet(f"{unseen}.removed.parquet")
     with pytest.raises(UserError, match=r"craters of split test: got none of 24"):
-        causal_run(ExplainConfig(device="cpu"), rendered.factual, unseen, detector, "B_11", runs, "t")
+        _run(replace(rendered, without=unseen), detector, runs)
     assert not runs.exists()

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from perilune_train.explain.causal.claims import detection_claim, pose_claim, reaction_claim
-from perilune_train.explain.causal.figures import by_gate
+from perilune_train.explain.causal.pictures import by_gate
 
 _VIEWS = 8
 

@@ -13,8 +13,8 @@ from perilune_train.explain.causal.effects import (
     region,
     with_found,
 )
-from perilune_train.explain.causal.figures import by_gate
 from perilune_train.explain.causal.pairs import CraterPairs
+from perilune_train.explain.causal.pictures import by_gate
 
 CRATER = {
     "frame_id": "f0",

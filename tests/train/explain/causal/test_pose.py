@@ -6,8 +6,8 @@ from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.explain.causal import pose
-from perilune_train.explain.causal.pose import pose_effects
+from perilune_train.explain.causal import effects as pose
+from perilune_train.explain.causal.effects import pose_effects
 from perilune_train.motion.data.trajectories import load_split
 
 _NAV = {"splits": {"train": 1, "val": 1, "test": 2}, "scenes": 2, "n_frames": 4}

@@ -8,11 +8,11 @@ from tests.helpers.terrain_record import store_record, uses_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.explain.causal.run import causal_run
+from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_run
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.records.provenance import training_provenance
-from perilune_train.training.runs import save_weights
+from perilune_train.training.runs import NamedRun, save_weights
 
 _STACK = {
     "fusion": "stack",
@@ -39,14 +39,6 @@ def test_a_navigator_that_was_fitted_to_the_test_terrain_is_refused(dataset_dete
     removed.to_parquet(tmp_path / "without.removed.parquet")
     runs = tmp_path / "runs"
     with pytest.raises(UserError, match=r"s000 = elsewhere/s000"):
-        causal_run(
-            ExplainConfig(device="cpu"),
-            dataset_detect,
-            str(without),
-            detector,
-            "B_11",
-            runs,
-            "t",
-            pose=(dataset_nav, dataset_nav, stack),
-        )
+        inputs = CausalInputs(dataset_detect, str(without), pose=PoseInputs(dataset_nav, dataset_nav, stack))
+        causal_run(ExplainConfig(device="cpu"), NamedRun(runs, "t"), detector, "B_11", inputs)
     assert not runs.exists()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.explain.correlation.ground_truth import ground_truth_mask
+from perilune_train.explain.inputs import ground_truth_mask
 
 _RINGS = (1.1, 1.2, 1.3, 1.4)
 

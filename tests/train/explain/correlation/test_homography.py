@@ -5,7 +5,7 @@ import pytest
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import matrix_from_quaternion
-from perilune_train.explain.correlation.homography import true_homography, warped_to_first
+from perilune_train.explain.correlation.homography import moved_to_first, seen_in_second, true_homography
 from perilune_train.explain.correlation.pearson import pearson
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.motion.geometry import apply_homography
@@ -50,10 +50,11 @@ def test_warped_lower_images_correlate_with_upper_images(make_dataset, tmp_path)
         homography = true_homography(trajectory.camera, position[i], rotation[i], position[i + 1], rotation[i + 1])
         # In the last frame the noise of one grey level is a third of the contrast.
         upper, lower = (cv2.GaussianBlur(one, (0, 0), 1) for one in trajectory.images[i : i + 2].astype(np.float64))
-        warped, seen = warped_to_first(lower, homography)
-        moved.append(pearson(upper, warped, seen))
+        seen = seen_in_second(lower.shape, homography)
+        moved.append(pearson(upper, moved_to_first(lower, homography), seen))
         plain.append(pearson(upper, lower, seen))
-        swapped.append(pearson(upper, *warped_to_first(lower, np.linalg.inv(homography))))
+        inverse = np.linalg.inv(homography)
+        swapped.append(pearson(upper, moved_to_first(lower, inverse), seen_in_second(lower.shape, inverse)))
         assert 0.3 < seen.mean() < 1
     assert min(moved) > 0.95
     assert max(plain) < 0.2 and max(swapped) < 0.2
@@ -61,7 +62,8 @@ def test_warped_lower_images_correlate_with_upper_images(make_dataset, tmp_path)
 
 def test_seen_pixels_are_those_inside_the_second_frame():
     image = np.arange(48.0).reshape(6, 8)
-    warped, seen = warped_to_first(image, np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]]))
+    homography = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
+    warped, seen = moved_to_first(image, homography), seen_in_second(image.shape, homography)
     # Pixel (row, column) of frame 1 is pixel (row - 2, column + 3) of frame 2.
     np.testing.assert_array_equal(warped[2:, :5], image[:4, 3:])
     np.testing.assert_array_equal(seen, np.outer([0, 0, 1, 1, 1, 1], [1, 1, 1, 1, 1, 0, 0, 0]).astype(bool))

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from perilune_train.explain.correlation.ground_truth import ground_truth_mask
-from perilune_train.explain.correlation.homography import warped_to_first
-from perilune_train.explain.correlation.measures import COLUMNS, detector_values, pair_values
+from perilune_train.explain.correlation.homography import seen_in_second
+from perilune_train.explain.correlation.measures import COLUMNS, FrameTargets, PairTargets, detector_values, pair_values
 from perilune_train.explain.correlation.pearson import pearson
+from perilune_train.explain.inputs import ground_truth_mask
 
 _RINGS = (1.1, 1.2, 1.3, 1.4)
 
@@ -22,7 +22,7 @@ def _detector(masks, truth, scenes=None, **options):
     brightness, gradient = np.random.default_rng(9).random((2, *truth.shape))
     names = [f"s/t/{n}" for n in range(len(truth))]
     scenes = scenes or [f"s{n}" for n in range(len(truth))]
-    return detector_values(masks, truth, brightness, gradient, names, scenes, **options)
+    return detector_values(masks, FrameTargets(truth, brightness, gradient, names, scenes), **options)
 
 
 def _means(table):
@@ -48,7 +48,7 @@ def test_pcc1_partial_is_given_brightness_and_gradient():
     gradient = rng.random(truth.shape)
     mask = brightness + 0.05 * rng.standard_normal(truth.shape)
     names = list("abcd")
-    means = _means(detector_values({"B_11": mask}, truth, brightness, gradient, names, names))
+    means = _means(detector_values({"B_11": mask}, FrameTargets(truth, brightness, gradient, names, names)))
     assert means["pcc1_craterness"] > 0.6 and abs(means["pcc1_partial"]) < 0.05
 
 
@@ -67,7 +67,7 @@ def test_pcc2_pairs_all_other_frames_or_those_of_other_scenes():
 def test_a_wrong_number_of_names_is_refused():
     truth = _truth(2)
     with pytest.raises(ValueError, match="2 maps, 3 frame names"):
-        detector_values({"B_11": truth}, truth, truth, truth, list("abc"), list("ab"))
+        detector_values({"B_11": truth}, FrameTargets(truth, truth, truth, list("abc"), list("ab")))
 
 
 def _pattern(x, y):
@@ -82,10 +82,10 @@ def test_pcc3_and_pcc4_are_over_the_same_pixels():
     """The halves agree where both frames see the ground, even unmoved, and not outside: both measures are then 1."""
     down = np.array([[1.0, 0, 0], [0, 1, 20], [0, 0, 1]])
     lower = _pattern(_U, 0 * _V)
-    _, seen = warped_to_first(lower, down)
+    seen = seen_in_second(lower.shape, down)
     assert 0.6 < seen.mean() < 0.75
     upper = np.where(seen, lower, np.random.default_rng(0).normal(0, 3, (64, 64)))
-    values = _means(pair_values({"B_11": np.concatenate([upper, lower])[None]}, [down], ["a"], ["s"]))
+    values = _means(pair_values({"B_11": np.concatenate([upper, lower])[None]}, PairTargets([down], ["a"], ["s"])))
     assert values["pcc3"] == pytest.approx(1) and values["pcc4"] == pytest.approx(1)
     assert values["pcc4_minus_pcc3"] == pytest.approx(0)
     assert values["pcc3_all_pixels"] < 0.9 and values["pcc4_all_pixels"] < 0.9
@@ -97,7 +97,7 @@ def test_a_moved_pair_has_a_high_pcc4_and_constant_halves_have_none():
     upper = _pattern(x / w, y / w)
     stacked = np.concatenate([upper, _pattern(_U, _V)])
     flat = np.concatenate([upper, np.full((64, 64), 0.5)])
-    table = pair_values({"B_11": np.stack([stacked, flat])}, [homography] * 2, ["a", "b"], ["s", "s"])
+    table = pair_values({"B_11": np.stack([stacked, flat])}, PairTargets([homography] * 2, ["a", "b"], ["s", "s"]))
     values = table.pivot(index="frame_id", columns="measure", values="value")
     assert values.loc["a", "pcc4"] > 0.99 and values.loc["a", "pcc3"] < 0.5
     assert values.loc["a", "pcc4_minus_pcc3"] == pytest.approx(values.loc["a", "pcc4"] - values.loc["a", "pcc3"])
@@ -110,7 +110,9 @@ def test_all_pixels_take_zero_outside_the_overlap():
     upper, lower = _pattern(_U, _V) + 5, _pattern(_U, _V - 20) + 5
     moved = np.zeros((64, 64))
     moved[:44] = lower[20:]
-    values = _means(pair_values({"B_11": np.concatenate([upper, lower])[None]}, [homography], ["a"], ["s"]))
+    values = _means(
+        pair_values({"B_11": np.concatenate([upper, lower])[None]}, PairTargets([homography], ["a"], ["s"]))
+    )
     assert values["pcc4_all_pixels"] == pytest.approx(pearson(upper, moved))
     assert values["pcc3_all_pixels"] == pytest.approx(pearson(upper, lower))
     assert values["pcc4"] == pytest.approx(1)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from perilune_train.explain.correlation.measures import FrameTargets, PairTargets
 from perilune_train.explain.correlation.pearson import pearson
 from perilune_train.explain.evidence.nulls import detector_nulls, other_rows, pair_nulls, renamed
 from perilune_train.explain.maps.baselines import baseline_maps
@@ -26,8 +27,8 @@ def test_detector_nulls_have_every_null_and_the_values_of_their_maps():
     rng = np.random.default_rng(1)
     images, truth = _images(), rng.random((8, 64, 64))
     masks, untrained = ({"B_11": rng.random((8, 64, 64)), "B_31": rng.random((8, 64, 64))} for _ in range(2))
-    common = truth, *rng.random((2, 8, 64, 64)), _NAMES, _SCENES
-    table = detector_nulls(images, masks, untrained, *common, np.random.default_rng(5))
+    common = FrameTargets(truth, *rng.random((2, 8, 64, 64)), _NAMES, _SCENES)
+    table = detector_nulls(images, masks, untrained, common, np.random.default_rng(5))
     assert (table["kind"] == "null").all()
     stages = {f"{one}/stage_{k}" for one in ("edge", "contrast", "brightness") for k in range(1, 6)}
     gates = {f"{one}/{gate}" for one in ("untrained", "other frame") for gate in masks}
@@ -50,8 +51,8 @@ def test_pair_nulls_of_a_still_camera():
     images = _images(3)
     masks = {"B_11": np.tile(rng.random((8, 64, 64)), (1, 2, 1))}
     untrained = {"B_11": rng.random((8, 128, 64))}
-    homographies = [np.eye(3)] * 8
-    table = pair_nulls(images, images, masks, untrained, homographies, _NAMES, _SCENES, np.random.default_rng(5))
+    pairs, targets = np.concatenate([images, images], axis=1), PairTargets([np.eye(3)] * 8, _NAMES, _SCENES)
+    table = pair_nulls(pairs, masks, untrained, targets, np.random.default_rng(5))
     means = table.groupby(["map", "measure"])["value"].mean()
     # The same image twice, without motion; halves of different pairs are independent noise.
     assert means["edge/stage_1", "pcc3"] == pytest.approx(1) and means["brightness/stage_3", "pcc4"] == pytest.approx(1)
@@ -63,13 +64,13 @@ def test_one_frame_has_no_other_frame():
     """As the validation split of a tiny dataset: the null is undefined, and nothing fails."""
     rng = np.random.default_rng(1)
     masks = {"B_11": rng.random((1, 64, 64))}
-    common = rng.random((1, 64, 64)), *rng.random((2, 1, 64, 64)), ["s/t/0"], ["s"]
-    table = detector_nulls(_images(count=1), masks, masks, *common, rng)
+    common = FrameTargets(rng.random((1, 64, 64)), *rng.random((2, 1, 64, 64)), ["s/t/0"], ["s"])
+    table = detector_nulls(_images(count=1), masks, masks, common, rng)
     assert table.loc[table["map"] == "other frame/B_11", "value"].isna().all()
     assert table.loc[(table["map"] == "edge/stage_1") & (table["measure"] == "pcc1_craterness"), "value"].notna().all()
     stacked = {"B_11": rng.random((1, 128, 64))}
-    pair = _images(count=1), _images(seed=1, count=1), stacked, stacked, [np.eye(3)], ["s/t/0"], ["s"], rng
-    table = pair_nulls(*pair)
+    pair = np.concatenate([_images(count=1), _images(seed=1, count=1)], axis=1)
+    table = pair_nulls(pair, stacked, stacked, PairTargets([np.eye(3)], ["s/t/0"], ["s"]), rng)
     assert table.loc[table["map"] == "other pair/B_11", "value"].isna().all()
 
 

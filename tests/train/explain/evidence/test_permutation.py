@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.explain.correlation.measures import detector_values, pair_values
+from perilune_train.explain.correlation.measures import FrameTargets, PairTargets, detector_values, pair_values
 from perilune_train.explain.evidence.permutation import detector_permutations, pair_permutations, permuted
 
 _SCENES = [f"s{n}" for n in range(6) for _ in range(2)]
@@ -38,17 +38,17 @@ def test_p_is_uniform_without_a_relation():
 def test_detector_rows_have_the_values_of_the_gates_and_find_the_one_that_follows_craters():
     rng = np.random.default_rng(5)
     truth = (rng.random((12, 32, 32)) < 0.7).astype(np.float32)
-    maps = truth, *rng.random((2, 12, 32, 32))
+    targets = FrameTargets(truth, *rng.random((2, 12, 32, 32)), _NAMES, _SCENES)
     masks = {"B_11": 1 - truth + 0.5 * rng.random(truth.shape), "B_21": rng.random(truth.shape)}
-    values = detector_values(masks, *maps, _NAMES, _SCENES)
+    values = detector_values(masks, targets)
     signs = {("detect", measure, gate): 1.0 for measure in ("pcc1_craterness", "pcc1_partial") for gate in masks}
-    rows = detector_permutations(masks, *maps, _SCENES, signs, rng).set_index(["measure", "map"])
+    rows = detector_permutations(masks, targets, signs, rng).set_index(["measure", "map"])
     means = values.groupby(["measure", "map"])["value"].mean()
     for key, row in rows.iterrows():
         assert row["value"] == pytest.approx(means[key], abs=1e-9)
     assert rows["p"]["pcc1_craterness", "B_11"] < 0.01 < rows["p"]["pcc1_craterness", "B_21"]
     assert abs(rows["null_value"]["pcc1_craterness", "B_11"]) < 0.2
-    negative = detector_permutations(masks, *maps, _SCENES, {key: -1.0 for key in signs}, rng)
+    negative = detector_permutations(masks, targets, {key: -1.0 for key in signs}, rng)
     assert negative["p"].iloc[0] > 0.9
 
 
@@ -58,11 +58,12 @@ def test_pair_rows_find_halves_that_show_the_same_ground():
     moved = np.roll(rough, 16, axis=2)
     masks = {"same": np.concatenate([rough, moved], axis=1), "other": rng.random((12, 256, 128))}
     homographies = [np.array([[1.0, 0, 16], [0, 1, 0], [0, 0, 1]])] * 12
-    rows = pair_permutations(masks, homographies, _SCENES, rng).set_index(["measure", "map"])
+    targets = PairTargets(homographies, _NAMES, _SCENES)
+    rows = pair_permutations(masks, targets, rng).set_index(["measure", "map"])
     assert rows["value"]["pcc4", "same"] > 0.95
     assert rows["p"]["pcc4", "same"] < 0.01 < rows["p"]["pcc4", "other"]
     assert abs(rows["null_value"]["pcc4", "same"]) < 0.2
-    exact = pair_values(masks, homographies, _NAMES, _SCENES)
+    exact = pair_values(masks, targets)
     exact = exact[(exact["measure"] == "pcc3") & (exact["map"] == "same")]["value"].mean()
     assert rows["value"]["pcc3", "same"] == pytest.approx(exact, abs=0.03)
 
@@ -70,5 +71,5 @@ def test_pair_rows_find_halves_that_show_the_same_ground():
 def test_fewer_than_five_scenes_have_no_p():
     rng = np.random.default_rng(7)
     masks = {"B_11": rng.random((4, 64, 32))}
-    rows = pair_permutations(masks, [np.eye(3)] * 4, list("abcd"), rng)
+    rows = pair_permutations(masks, PairTargets([np.eye(3)] * 4, list("abcd"), list("abcd")), rng)
     assert rows["p"].isna().all()

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perilune_train.explain.evidence.stability import between, lens_map, noisy, shifted, stability
+from perilune_train.explain.evidence.stability import Changes, between, lens_map, noisy, shifted, stability
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_mask_that_follows_the_image_is_stable_under_shifts_and_one_fixed_to_t
         brightness = given.astype(np.float32) / 255
         return {"brightness": brightness, "fixed": np.stack([fixed] * len(given)), "flat": np.ones_like(brightness)}
 
-    table = stability(masks_of, images, rng, sigmas_dn=(10.0,), shifts_px=((3, -2),))
+    table = stability(masks_of, images, rng, Changes((10.0,), ((3, -2),)))
     assert list(table.columns) == ["map", "change", "frame_index", "pearson"]
     values = table.set_index(["map", "change"])["pearson"].sort_index()
     np.testing.assert_allclose(values["brightness", "shift 3 -2 px"], 1)
@@ -52,12 +52,16 @@ def test_a_mask_that_follows_the_image_is_stable_under_shifts_and_one_fixed_to_t
 def test_both_frames_of_a_stacked_pair_are_shifted(images):
     pairs = np.concatenate([images, images[::-1]], axis=1)
     table = stability(
-        lambda given: {"half": given.astype(np.float32)}, pairs, np.random.default_rng(0), (), ((0, 5),), (), stacked=2
+        lambda given: {"half": given.astype(np.float32)}, pairs, np.random.default_rng(0), Changes((), ((0, 5),), ()), 2
     )
     np.testing.assert_allclose(table["pearson"], 1)
     seen = []
     stability(
-        lambda given: {"half": seen.append(given) or given}, pairs, np.random.default_rng(0), (), ((0, 5),), (), 2
+        lambda given: {"half": seen.append(given) or given},
+        pairs,
+        np.random.default_rng(0),
+        Changes((), ((0, 5),), ()),
+        2,
     )
     np.testing.assert_array_equal(seen[1][:, 69:], pairs[:, 64:-5])
     np.testing.assert_array_equal(seen[1][:, 64:69], np.repeat(pairs[:, 64:65], 5, axis=1))
@@ -80,7 +84,7 @@ def test_a_mask_that_follows_the_image_is_stable_under_another_lens_and_one_fixe
         doubled = np.concatenate([fixed, fixed])
         return {"brightness": given.astype(np.float32), "fixed": np.stack([doubled] * len(given))}
 
-    table = stability(masks_of, pairs, np.random.default_rng(0), (), (), (-0.08, 0.08), stacked=2)
+    table = stability(masks_of, pairs, np.random.default_rng(0), Changes((), (), (-0.08, 0.08)), 2)
     assert set(table["change"]) == {"lens -8 %", "lens +8 %"}
     values = table.groupby("map")["pearson"]
     assert values.min()["brightness"] > 0.99

@@ -10,13 +10,11 @@ from torch import nn
 
 from perilune_train.explain.maps.attributions import (
     DetectorTarget,
-    NavigatorTarget,
     grad_cam,
     integrated_gradients,
     last_of_stage,
     occlusion,
 )
-from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
 
 
@@ -71,15 +69,6 @@ def detector():
         nn.init.zeros_(head[-1].bias)
     batch = torch.from_numpy(smooth_noise(np.random.default_rng(1), 8))[:, None]
     return calibrated(network, lambda network: network(batch))
-
-
-@pytest.fixture(scope="module")
-def navigator():
-    torch.manual_seed(1)
-    network = StackNavigator(3, 0.125, "cbam_identity", 16)
-    nn.init.normal_(network.recurrent.output.weight)
-    first, second = torch.from_numpy(smooth_noise(np.random.default_rng(2), 8)).reshape(2, 4, 1, 64, 64)
-    return calibrated(network, lambda network: network(first, second))
 
 
 def test_attributions_of_a_linear_target_by_hand():
@@ -142,23 +131,6 @@ def test_grad_cam_equals_plain_autograd_without_in_place_modules(detector, frame
     np.testing.assert_allclose(found[0], cv2.resize(cam, (64, 64)), rtol=1e-3, atol=1e-5 * cam.max())
     assert found.shape == frames.shape and found.dtype == np.float32
     assert (found.std(axis=(1, 2)) > 0).all()
-
-
-def test_maps_of_the_navigator_are_of_the_stacked_pair(navigator, frames):
-    target = NavigatorTarget(navigator)
-    pair = np.concatenate([frames[0], frames[1]])[None]
-    first, second = (torch.from_numpy(one)[None, None] for one in frames)
-    with torch.no_grad():
-        motion, _ = navigator(first, second)
-        norm = np.linalg.norm(motion[0, 0, :3].numpy())
-        grey = torch.from_numpy(pair)[:, None]
-        assert target(grey).item() == pytest.approx(norm, rel=1e-5)
-        change = norm - target(torch.zeros_like(grey)).item()
-    signed = integrated_gradients(target, pair, n_steps=64, signed=True)
-    assert abs(change) > 1e-3
-    assert signed.sum() == pytest.approx(change, rel=0.05)
-    for found in (signed, grad_cam(target, pair, 3), occlusion(target, pair, 32, 32)):
-        assert found.shape == (1, 128, 64) and found.std() > 0
 
 
 def test_grad_cam_is_on_the_last_unit_without_attention():

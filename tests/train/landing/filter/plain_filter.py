@@ -32,7 +32,7 @@ def propagated(state, end_s, rate, force, noise, relief_m):
     change[3:6, 6:9], change[3:6, 9:12], change[3:6, 12:15] = by_turn * step, -by_turn * step**2 / 2, -middle * step
     change[6:9, 6:9], change[6:9, 9:12] = (half @ half).T, -step * one
     kept = np.exp(-step / GROUND_S)
-    change[26, 26], added[26] = kept, relief_m**2 * (1 - kept**2)
+    change[20, 20], added[20] = kept, relief_m**2 * (1 - kept**2)
     added[:15] = step * np.repeat([0, noise.velocity, noise.turn, noise.gyro_bias, noise.force_bias], 3)
     return replace(
         state,
@@ -69,6 +69,6 @@ def ranged(state, range_m, ground_m, sigma_m):
     """The state after a range."""
     rotation, height_m = state.rotation_site_from_body, state.position_m[2] - ground_m - state.ground_m
     cosine, by_error = rotation[2, 2], np.zeros((1, N_ERRORS))
-    by_error[0, 2], by_error[0, 26] = 1 / cosine, -1 / cosine
+    by_error[0, 2], by_error[0, 20] = 1 / cosine, -1 / cosine
     by_error[0, 6:8] = height_m / cosine**2 * np.array([rotation[2, 1], -rotation[2, 0]])
     return updated(state, np.array([range_m - height_m / cosine]), by_error, np.array([[sigma_m**2]]))

@@ -27,8 +27,8 @@ def draw(scenario="nominal", seed=0, n=30):
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_a_seed_gives_a_draw_and_another_seed_another(scenario):
     (_, first), (_, again), (_, other) = draw(scenario), draw(scenario), draw(scenario, seed=1)
-    np.testing.assert_array_equal(first.off, again.off)
-    assert not np.isclose(first.off, other.off).any()
+    np.testing.assert_array_equal(first.start_error, again.start_error)
+    assert not np.isclose(first.start_error, other.start_error).any()
     one, two = first.instruments.inertial, again.instruments.inertial
     np.testing.assert_array_equal(one.angular_rate_radps, two.angular_rate_radps)
     assert [len(one) for one in first.descent.sightings] == [len(one) for one in again.descent.sightings]
@@ -38,7 +38,7 @@ def test_inertial_errors_and_starts_have_the_stated_size():
     offs, turns, pushes = [], [], []
     for seed in range(200):
         _, one = draw(seed=seed, n=2)
-        offs.append(one.off)
+        offs.append(one.start_error)
         turns.append(one.instruments.inertial.angular_rate_radps.mean(axis=0))
         pushes.append(one.instruments.inertial.specific_force_mps2.mean(axis=0) - [0, 0, 1.62])
     np.testing.assert_allclose(np.std(offs, axis=0), SIGMAS[:9], rtol=0.2)
@@ -67,8 +67,8 @@ def test_an_outage_takes_ten_seconds_of_detections():
 
 def test_a_wrong_prior_is_300_m_off_over_ground():
     _, found = draw("wrong-prior")
-    assert np.isclose(np.hypot(*found.off[:2]), 300)
-    assert abs(found.off[2]) < 250
+    assert np.isclose(np.hypot(*found.start_error[:2]), 300)
+    assert abs(found.start_error[2]) < 250
 
 
 def test_half_of_the_detections_are_false():

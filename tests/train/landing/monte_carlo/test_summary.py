@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from perilune_train.landing.monte_carlo.summary import by_trajectory, run_summary
+from perilune_train.landing.monte_carlo.page import by_trajectory, run_summary
 
 
 def rows():

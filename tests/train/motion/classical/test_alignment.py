@@ -7,6 +7,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
 from perilune_train.motion.classical.alignment import Prior, State, align
 from perilune_train.motion.classical.contrast import local_contrast, pyramid, sampled
+from perilune_train.motion.classical.estimate import ExpectedMotion, GroundPlane
 from perilune_train.motion.classical.ground import carried, ground_points, node_pixels, node_weights, unknown_heights
 from perilune_train.motion.classical.klt import NOMINAL_TURN_SIGMA_RAD
 
@@ -40,14 +41,15 @@ TURN = matrix_from_rotation_vector([0.003, -0.002, 0.004])
 
 def _prior(turn_sigma_rad=NOMINAL_TURN_SIGMA_RAD):
     heights = unknown_heights(CAMERA, DOWN, ALTITUDE_M)
-    return Prior(MOTION + np.array([1.5, -1, 2]), np.eye(3), turn_sigma_rad, DOWN, ALTITUDE_M, heights)
+    motion = ExpectedMotion(MOTION + np.array([1.5, -1, 2]), np.eye(3), turn_sigma_rad)
+    return Prior(motion, GroundPlane(DOWN, ALTITUDE_M), heights)
 
 
 def _aligned(seed, prior):
     rng = np.random.default_rng(seed)
     first = pyramid(_picture(np.zeros(3), np.eye(3), rng), CAMERA, 2)
     second = pyramid(_picture(MOTION, TURN, rng), CAMERA, 2)
-    start = State(prior.translation_m, prior.rotation_c2_from_c1, np.zeros(2), prior.heights.mean_m)
+    start = State(prior.motion.translation_m, prior.motion.rotation_c2_from_c1, np.zeros(2), prior.heights.mean_m)
     return align(first, second, prior, start)
 
 
@@ -66,7 +68,7 @@ def test_motion_and_heights_are_found():
 
 def test_a_known_rotation_makes_the_shift_better():
     prior = _prior()
-    known = Prior(prior.translation_m, TURN, 1e-5, DOWN, ALTITUDE_M, prior.heights)
+    known = Prior(ExpectedMotion(prior.motion.translation_m, TURN, 1e-5), prior.plane, prior.heights)
     (free, loose), (held, tight) = _aligned(1, prior), _aligned(1, known)
     assert np.linalg.norm(held.translation_m - MOTION) < 0.1
     assert np.linalg.norm(held.translation_m - MOTION) < np.linalg.norm(free.translation_m - MOTION)
@@ -76,9 +78,9 @@ def test_a_known_rotation_makes_the_shift_better():
 def test_a_featureless_ground_gives_the_prior():
     blank = pyramid(np.full((160, 160), 90, np.uint8), CAMERA, 2)
     prior = _prior()
-    start = State(prior.translation_m, np.eye(3), np.zeros(2), prior.heights.mean_m)
+    start = State(prior.motion.translation_m, np.eye(3), np.zeros(2), prior.heights.mean_m)
     found, covariance = align(blank, blank, prior, start)
-    np.testing.assert_allclose(found.translation_m, prior.translation_m)
+    np.testing.assert_allclose(found.translation_m, prior.motion.translation_m)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)[:3]), NOMINAL_TURN_SIGMA_RAD)
 
 

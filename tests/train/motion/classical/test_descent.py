@@ -1,10 +1,10 @@
 import pytest
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_train.motion.classical.descent import aligned_trajectory
+from perilune_train.motion.classical.alignment import aligned_trajectory
 from perilune_train.motion.classical.klt import klt_trajectory
 from perilune_train.motion.data.trajectories import load_split
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 
 
 @pytest.fixture(scope="module")

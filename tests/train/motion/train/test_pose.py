@@ -10,11 +10,11 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.data.frames import normalised
-from perilune_train.models.navigator import Recurrent, StackNavigator, cell_means
+from perilune_train.models.navigator import Recurrent, StackNavigator, StackOptions, cell_means
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.data.trajectories import load_trajectories
+from perilune_train.motion.metrics.errors import pose_errors, pose_summary
 from perilune_train.motion.metrics.floors import Known, mean_poses, ridge_poses
-from perilune_train.motion.metrics.metrics import pose_errors, pose_summary
 from perilune_train.motion.metrics.report import worse_than_floor
 from perilune_train.motion.network import Scales
 from perilune_train.motion.pose import (
@@ -22,8 +22,8 @@ from perilune_train.motion.pose import (
     normalised_frames,
     pose_of,
 )
-from perilune_train.motion.train.task import NavigationTask, axis_weights, learning_rate_factor
-from perilune_train.motion.train.windows import Windows, truth
+from perilune_train.motion.train.task import Initial, NavigationTask, axis_weights, learning_rate_factor
+from perilune_train.motion.train.windows import OutputUnits, Windows, truth
 
 
 def settings(fusion="stack", **changes):
@@ -57,7 +57,7 @@ def test_the_truth_as_output_gives_the_pose(trajectories):
     np.testing.assert_allclose(scales.mean_m, position.mean(0))
     np.testing.assert_allclose(scales.spread_m, position.std(0))
     own = trajectories[-1]
-    standardised, angles = truth(own, scales, "pose")
+    standardised, angles = truth(own, OutputUnits("pose", scales))
     assert standardised.shape == angles.shape == (7, 3)
     turned = own.pose[1] @ np.array(scales.mean_rotation).T
     columns = np.concatenate([turned[:, :, 0] - [1, 0, 0], turned[:, :, 1] - [0, 1, 0]], axis=1) / scales.rotation_rad
@@ -103,7 +103,7 @@ def test_causal_windows_are_those_of_a_loop(n_pairs):
 
 def test_positions_keep_their_digits_under_autocast():
     torch.manual_seed(0)
-    network = StackNavigator(1, 0.125, "none", 16, pool=2, standardised=True).eval()
+    network = StackNavigator(1, 0.125, "none", 16, StackOptions(pool=2, standardised=True)).eval()
     torch.nn.init.normal_(network.recurrent.output.weight, std=0.1)
     torch.nn.init.constant_(network.recurrent.output.bias, 1.5)
     pooled = torch.randn(6, network.feature_mean.numel())
@@ -120,14 +120,14 @@ def test_windows_gather_what_the_trajectories_have(trajectories):
     training = [one.shrunk(64) for one in trajectories if one.split == "train"]
     scales = Scales.measured(training, "stack", "pose")
     # This process has the second and the fourth trajectory.
-    windows = Windows(training, [1, 3], 3, scales, "pose", torch.device("cpu"))
+    windows = Windows(training, [1, 3], 3, OutputUnits("pose", scales), torch.device("cpu"))
     places = torch.tensor([[3, 2], [1, 0]])
     first, second = windows.pictures(places)
     np.testing.assert_allclose(first[0], normalised(training[3].images[2:5]), atol=1e-5)
     np.testing.assert_allclose(second[1], normalised(training[1].images[1:4]), atol=1e-5)
     pairs = windows.pairs(places)
     assert pairs.tolist() == [[9, 10, 11], [0, 1, 2]]
-    position, angles = truth(training[3], scales, "pose")
+    position, angles = truth(training[3], OutputUnits("pose", scales))
     assert torch.equal(windows.position[pairs][0], position[2:5]) and torch.equal(windows.angles[pairs][0], angles[2:5])
 
 
@@ -135,7 +135,7 @@ def _step(task, places, monkeypatch):
     """The gradients of a training step of the coarse stage."""
     for name in ("log", "log_dict"):
         monkeypatch.setattr(task, name, lambda *_, **__: None)
-    place = task.training_trajectories, range(4), 4, task.scales, "pose", torch.device("cpu")
+    place = task.training_trajectories, range(4), 4, OutputUnits("pose", task.scales), torch.device("cpu")
     task.windows = Windows(*place, task.views)
     task.zero_grad()
     task.training_step(places, 0).backward()
@@ -147,7 +147,7 @@ def test_a_step_on_stored_features_is_that_of_the_whole_network(trajectories, de
     torch.manual_seed(1)
     content = torch.load(detector, weights_only=True)["state_dict"]
     backbone = {key.removeprefix("backbone."): value for key, value in content.items() if key.startswith("backbone.")}
-    task = NavigationTask(settings(dropout=0.0, views=views), "stack", trajectories, backbone)
+    task = NavigationTask(settings(dropout=0.0, views=views), "stack", trajectories, initial=Initial(backbone))
     assert task.stores and task.coarse
     torch.nn.init.normal_(task.network.recurrent.output.weight)
     task._store()
@@ -167,7 +167,7 @@ def test_no_step_needs_a_value(trajectories, monkeypatch):
     task = NavigationTask(settings(coarse_epochs=0, dropout=0.0, views=1), "stack", trajectories)
     for name in ("log", "log_dict"):
         monkeypatch.setattr(task, name, lambda *_, **__: None)
-    place = task.training_trajectories, range(4), 4, task.scales, "pose", torch.device("cpu")
+    place = task.training_trajectories, range(4), 4, OutputUnits("pose", task.scales), torch.device("cpu")
     windows = Windows(*place, task.views)
     windows.pictures(torch.tensor([[0, 0]]))
     task.windows = windows

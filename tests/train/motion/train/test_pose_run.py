@@ -24,10 +24,11 @@ from perilune_train.motion.pose import (
     predict_pose,
     predict_pose_by_pairs,
 )
-from perilune_train.motion.train.run import navigate_run
+from perilune_train.motion.train.navigate_run import navigate_run
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.report.navigation import navigation_section
 from perilune_train.report.sources import read_run
+from perilune_train.training.runs import NamedRun
 
 
 def settings(fusion="stack", **changes):
@@ -48,7 +49,7 @@ def detector(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(dataset_nav, tmp_path_factory, detector):
     """A finished run, with views; its files stay."""
-    (own,) = navigate_run(settings(views=1), dataset_nav, tmp_path_factory.mktemp("runs"), "p", detector)
+    (own,) = navigate_run(settings(views=1), dataset_nav, NamedRun(tmp_path_factory.mktemp("runs"), "p"), detector)
     return own
 
 
@@ -59,7 +60,7 @@ def call(*arguments):
 def test_several_landing_areas_are_refused_before_training(make_dataset, tmp_path):
     data = make_dataset(tmp_path / "data", "nav", n_frames=2)
     with pytest.raises(UserError, match=r"scenes: got 5, expected 1, the landing area") as error:
-        navigate_run(settings(), data, tmp_path / "runs", "p", None)
+        navigate_run(settings(), data, NamedRun(tmp_path / "runs", "p"), None)
     assert "\n" not in str(error.value) and not (tmp_path / "runs").exists()
 
 
@@ -110,13 +111,13 @@ def test_a_killed_run_goes_on_to_the_same_weights(run, dataset_nav, tmp_path, de
 
     monkeypatch.setattr(NavigationTask, "training_step", dies)
     with pytest.raises(KeyError):
-        navigate_run(own, dataset_nav, tmp_path, "b", detector)
+        navigate_run(own, dataset_nav, NamedRun(tmp_path, "b"), detector)
     monkeypatch.undo()
     done = []
     monkeypatch.setattr(
         NavigationTask, "training_step", lambda self, given, i: done.append(i) or original(self, given, i)
     )
-    (resumed,) = navigate_run(own, dataset_nav, tmp_path, "b", detector)
+    (resumed,) = navigate_run(own, dataset_nav, NamedRun(tmp_path, "b"), detector)
     assert done[0] == batch
     first, again = (torch.load(one.last, weights_only=True)["state_dict"] for one in (run, resumed))
     assert all(torch.equal(first[key], again[key]) for key in first)
@@ -141,7 +142,7 @@ def test_short_coarse_epochs_are_validated_ten_times(dataset_nav, tmp_path, dete
         lambda self: validated.append(self.current_epoch + 1) or original(self),
     )
     own = settings(coarse_epochs=25, fine_epochs=1, batch_sequences=8)
-    navigate_run(own, dataset_nav, tmp_path, "a", detector)
+    navigate_run(own, dataset_nav, NamedRun(tmp_path, "a"), detector)
     assert validated == [*range(2, 25, 2), 25, 26]
 
 

@@ -20,7 +20,7 @@ from perilune_train.motion.network import Scales
 from perilune_train.motion.pose import normalised_frames, warped_frames
 from perilune_train.motion.train.task import NavigationTask
 from perilune_train.motion.train.views import other_views, view_homographies
-from perilune_train.motion.train.windows import WindowPlaces, Windows, truth
+from perilune_train.motion.train.windows import OutputUnits, WindowPlaces, Windows, truth
 
 LEVEL = np.diag([1.0, -1.0, -1.0])
 CPU = torch.device("cpu")
@@ -128,7 +128,7 @@ def test_level_descents_have_level_views(training):
 def test_windows_gather_the_views_with_their_poses(training):
     scales, views = Scales.measured(training, "stack", "pose"), other_views(training, 2, 1.0, 0)
     # This process has the second and the fourth trajectory.
-    windows = Windows(training, [1, 3], 3, scales, "pose", CPU, views)
+    windows = Windows(training, [1, 3], 3, OutputUnits("pose", scales), CPU, views)
     # The fourth trajectory itself, its second view, and the first view of the second trajectory.
     places = torch.tensor([[3, 2], [8 + 3, 1], [4 + 1, 0]])
     first, second = windows.pictures(places)
@@ -140,7 +140,7 @@ def test_windows_gather_the_views_with_their_poses(training):
         expected = normalised_frames(warped_frames(frames, view_homographies(training[number], version)[span]))
         torch.testing.assert_close(first[i], expected[:-1])
         torch.testing.assert_close(second[i], expected[1:])
-        position, angles = truth(version, scales, "pose")
+        position, angles = truth(version, OutputUnits("pose", scales))
         assert torch.equal(windows.position[pairs[i]], position[start : start + 3])
         assert torch.equal(windows.angles[pairs[i]], angles[start : start + 3])
     mean, spread = np.array(scales.mean_m), np.array(scales.spread_m)
@@ -150,7 +150,7 @@ def test_windows_gather_the_views_with_their_poses(training):
 
 
 def places(training, views, share=ALONE):
-    found = WindowPlaces(training, 3, warp=False, augmented=False, jitter=None, seed=5, share=share)
+    found = WindowPlaces(training, 3, warp=False, jitter=None, seed=5, share=share)
     found.views = views
     return [[found[key] for key in found.keys(epoch)] for epoch in range(30)]
 

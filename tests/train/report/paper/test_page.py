@@ -31,10 +31,10 @@ from perilune_train.report.paper.prose import lead
 from perilune_train.report.paper.runs import (
     ATTENTION,
     CAUSES,
+    CURVE,
     NAVIGATORS,
     READINGS,
     PaperRuns,
-    curve_name,
     detect_name,
     navigate_name,
     nearest_share,
@@ -194,7 +194,7 @@ def write_motion_only(root):
         (lambda root: write_detector(root, "yolov3", 0.8), {"Table II: crater detection"}),
         (lambda root: write_detector(root, "lunar-yolov3", 0.8), {"Table II: crater detection"}),
         (lambda root: write_halves(root, "yolov3", (0.8,)), {"Table II: crater detection"}),
-        (lambda root: write_detector(root, curve_name("0.2"), 0.8), {"Density of craters"}),
+        (lambda root: write_detector(root, f"{CURVE}-0.2", 0.8), {"Density of craters"}),
         (write_motion_only, {"Table III: navigation"}),
         (lambda root: write_metrics(PaperRuns(root).explained, explained(scenes=1)), {"Attention"}),
     ],
@@ -264,7 +264,7 @@ def test_a_network_that_does_not_beat_the_best_floor_is_called_so(tmp_path, read
 
 def test_the_headline_ground_is_never_our_usual_one(tmp_path):
     for share, ap in (("0.05", 0.99), ("0.8", 0.5), ("lunar", 0.895)):
-        write_detector(tmp_path, curve_name(share), ap)
+        write_detector(tmp_path, f"{CURVE}-{share}", ap)
     curve = PaperRuns(tmp_path).curve()
     assert list(curve) == ["0.05", "0.8", "lunar"] and nearest_share(curve) == "0.05" and nearest_share({}) is None
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.report.paper.runs import (
     ATTENTION,
+    CURVE,
     NAVIGATORS,
     READINGS,
     SEEDS,
     PaperRuns,
-    curve_name,
     detect_name,
     navigate_name,
 )
@@ -82,7 +82,7 @@ def write_all(root: Path) -> None:
             write_detector(root, detect_name(network, ground), ap)
         write_halves(root, network, (ap, ap + 0.01, ap + 0.02))
     for share, ap in {"0.1": 0.97, "0.4": 0.90, "0.8": 0.6, "lunar": 0.3}.items():
-        write_detector(root, curve_name(share), ap)
+        write_detector(root, f"{CURVE}-{share}", ap)
     for reading in READINGS:
         write_navigators(root, (7.0, 1.0), (200.0, 204.0), reading)
     write_metrics(PaperRuns(root).explained, explained())

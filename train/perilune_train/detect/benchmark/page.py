@@ -2,48 +2,48 @@
 
 from collections.abc import Sequence
 
-from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, Score
+from perilune_train.detect.benchmark.score import MATCH_IOU, SCORING_RULES, SELECTIONS, Score
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.report import bin_tables, spread_cell, spread_note
 from perilune_train.records.benchmark_parts import part_names
 from perilune_train.records.markdown import number, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
-_RULES = {
+_SELECTIONS = {
     "visible": "`visible`: craters that a person can see in the frame",
     "paper": "`paper`: all craters with a radius of 2 to 50 px, however faint",
 }
 
 
 def page_of(score: Score, about: Sequence[str]) -> str:
-    """The page as Markdown: headline, all accounts, regions, bins. `about` says what was scored, in Markdown."""
-    ap_rule, ap_account, ap = score.least("ap50_paper")
-    spread = score.evaluations[ap_rule].spreads[f"{ACCOUNTS[ap_account]}ap50_paper"]
-    f1_rule, f1_account, f1 = score.least("f1")
+    """The page as Markdown: headline, all scoring rules, regions, bins. `about` says what was scored, in Markdown."""
+    ap_selection, ap_rule, ap = score.least("ap50_paper")
+    spread = score.evaluations[ap_selection].spreads[f"{SCORING_RULES[ap_rule]}ap50_paper"]
+    f1_selection, f1_rule, f1 = score.least("f1")
     lines = [
         "# Locked benchmark of crater detection",
         "",
-        f"**AP {spread.text(ap)}, F1 {f1:.3f}** by the least favourable account "
-        f"(AP: labels by `{ap_rule}`, {ap_account} account; F1: `{f1_rule}`, {f1_account}).",
+        f"**AP {spread.text(ap)}, F1 {f1:.3f}** by the least favourable scoring rule "
+        f"(AP: labels by `{ap_selection}`, {ap_rule} rule; F1: `{f1_selection}`, {f1_rule}).",
         "",
         *[f"- {line}" for line in about],
         *[f"- {line}" for line in _coverage(score)],
         "",
-        "## Accounts",
+        "## Scoring rules",
         "",
-        *_accounts(score),
+        *_scoring_rules(score),
         "",
-        *[f"- {text}" for text in _RULES.values()],
+        *[f"- {text}" for text in _SELECTIONS.values()],
         "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored",
         f"- edge: detections down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater",
         "- strict: every unmatched detection is a false positive",
-        f"- {spread_note(score.evaluations[RULES[0]].resamples)}; a match needs an IoU of {MATCH_IOU:g}",
+        f"- {spread_note(score.evaluations[SELECTIONS[0]].resamples)}; a match needs an IoU of {MATCH_IOU:g}",
         "",
     ]
-    for rule in RULES:
-        lines += [f"## By region, labels by `{rule}`", "", *_regions(score, rule), ""]
-        lines += [f"## By radius, altitude, Sun and freshness, labels by `{rule}`", ""]
-        lines += [line.replace("## ", "### ", 1) for line in bin_tables(score.evaluations[rule])]
+    for selection in SELECTIONS:
+        lines += [f"## By region, labels by `{selection}`", "", *_regions(score, selection), ""]
+        lines += [f"## By radius, altitude, Sun and freshness, labels by `{selection}`", ""]
+        lines += [line.replace("## ", "### ", 1) for line in bin_tables(score.evaluations[selection])]
     return "\n".join(lines)
 
 
@@ -55,17 +55,17 @@ def _coverage(score: Score) -> list[str]:
     return lines + [f"`{part}`: **not scored**" for part in part_names("detect") if part not in score.frames_of]
 
 
-def _accounts(score: Score) -> list[str]:
+def _scoring_rules(score: Score) -> list[str]:
     rows = []
-    for rule, evaluation in score.evaluations.items():
+    for selection, evaluation in score.evaluations.items():
         figures, spreads = evaluation.figures(), evaluation.spreads
-        for account, prefix in ACCOUNTS.items():
+        for rule, prefix in SCORING_RULES.items():
             cells = [spread_cell(figures, spreads, f"{prefix}{key}") for key in _COLUMNS]
-            rows.append([f"`{rule}`", account, *cells, str(figures["labels"])])
-    return table(["labels", "account", *_COLUMNS.values(), "selected labels"], rows)
+            rows.append([f"`{selection}`", rule, *cells, str(figures["labels"])])
+    return table(["labels", "scoring rule", *_COLUMNS.values(), "selected labels"], rows)
 
 
-def _regions(score: Score, rule: str) -> list[str]:
+def _regions(score: Score, selection: str) -> list[str]:
     rows = [
         [
             region.name,
@@ -75,6 +75,6 @@ def _regions(score: Score, rule: str) -> list[str]:
             number(region.edge_ap50_paper),
             number(region.f1),
         ]
-        for region in score.regions[rule]
+        for region in score.regions[selection]
     ]
     return table(["region", "scenes", "labels", "AP", "edge AP", "F1"], rows)

@@ -1,4 +1,4 @@
-"""Score detections on all parts of the benchmark: every account, bins, regions, and the least favourable account."""
+"""Score detections on all parts of the benchmark: every scoring rule, bins, regions, and the least favourable rule."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import EDGE, Detections, Matches
+from perilune_train.detect.evaluate.matching import EDGE, Criteria, Detections, Matches
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.records.benchmark_parts import Part
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Spread, spreads
 
-RULES = ("visible", "paper")
-"""Selections of labels; the second is the paper's rule."""
-ACCOUNTS = {"usual": "", "edge": "edge/", "strict": "strict/"}
-"""Accounts of false positives (matching.py), and their prefix in the figures."""
+SELECTIONS = ("visible", "paper")
+"""Selections of labels; the second is the paper's."""
+SCORING_RULES = {"usual": "", "edge": "edge/", "strict": "strict/"}
+"""Rules that decide which detections are false positives (matching.py), and their prefix in the figures."""
 MATCH_IOU = 0.5
 SEED = 1
 """Random seed of the intervals."""
@@ -30,7 +30,7 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Region:
-    """Figures of one region by one rule, in the usual account."""
+    """Figures of one region with one selection of labels, by the usual scoring rule."""
 
     name: str
     """See `Part.region`."""
@@ -43,7 +43,7 @@ class Region:
     spread: Spread
     """Spread of it over the scenes."""
     edge_ap50_paper: float
-    """AP in the edge account."""
+    """AP by the edge scoring rule."""
     f1: float
     """F1 at the threshold."""
 
@@ -53,48 +53,54 @@ class Score:
     """All figures of a set of detections."""
 
     evaluations: dict[str, Evaluation]
-    """Evaluation of all frames, by rule."""
+    """Evaluation of all frames, by selection of labels."""
     regions: dict[str, list[Region]]
-    """Figures by region, by rule."""
+    """Figures of each region, by selection of labels."""
     images: list[NDArray[np.uint8]]
     """The frames (height, width), for pictures."""
     frames_of: dict[str, tuple[int, int]]
     """Number of frames scored and number of frames of the locked manifest, by part."""
 
     def least(self, metric: str) -> tuple[str, str, float]:
-        """Rule, account and value of the lowest `metric` (ap50_paper, f1) of all accounts of all rules."""
+        """Selection, scoring rule and value of the lowest `metric` (ap50_paper, f1) over all of both."""
         values = {
-            (rule, account): float(evaluation.figures()[f"{prefix}{metric}"] or 0.0)
-            for rule, evaluation in self.evaluations.items()
-            for account, prefix in ACCOUNTS.items()
+            (selection, rule): float(evaluation.figures()[f"{prefix}{metric}"] or 0.0)
+            for selection, evaluation in self.evaluations.items()
+            for rule, prefix in SCORING_RULES.items()
         }
-        rule, account = min(values, key=lambda key: values[key])
-        return rule, account, values[rule, account]
+        selection, rule = min(values, key=lambda key: values[key])
+        return selection, rule, values[selection, rule]
 
     def figures(self) -> Metrics:
-        """Flat keys for benchmark.json: headline/..., <rule>/<key of an evaluation>, <rule>/region/<name>/..."""
-        found: Metrics = {}
+        """Flat keys for benchmark.json.
+
+        headline/..., <selection>/<key of an evaluation>, <selection>/region/<name>/...
+        """
+        figures: Metrics = {}
         for metric in ("ap50_paper", "f1"):
-            rule, account, value = self.least(metric)
-            found |= {f"headline/{metric}": value, f"headline/{metric}_account": f"{rule}, {account}"}
-        for rule, evaluation in self.evaluations.items():
-            found |= {f"{rule}/{key}": value for key, value in evaluation.figures().items()}
-            for region in self.regions[rule]:
-                prefix = f"{rule}/region/{region.name.replace(' ', '_')}"
+            selection, rule, value = self.least(metric)
+            figures |= {f"headline/{metric}": value, f"headline/{metric}_account": f"{selection}, {rule}"}
+        for selection, evaluation in self.evaluations.items():
+            figures |= {f"{selection}/{key}": value for key, value in evaluation.figures().items()}
+            for region in self.regions[selection]:
+                prefix = f"{selection}/region/{region.name.replace(' ', '_')}"
                 for name in ("scenes", "labels", "ap50_paper", "edge_ap50_paper", "f1"):
-                    found[f"{prefix}/{name}"] = getattr(region, name)
-                found |= region.spread.keys(f"{prefix}/ap50_paper")
+                    figures[f"{prefix}/{name}"] = getattr(region, name)
+                figures |= region.spread.keys(f"{prefix}/ap50_paper")
         for part, (n_frames, n_locked) in self.frames_of.items():
-            found |= {f"frames/{part}": n_frames, f"locked_frames/{part}": n_locked}
-        return found
+            figures |= {f"frames/{part}": n_frames, f"locked_frames/{part}": n_locked}
+        return figures
 
 
 def load_parts(parts: Sequence[Part]) -> dict[str, dict[str, DetectSplit]]:
-    """Frames and labels of each part, by rule. Raises UserError if the parts have frames of different sizes."""
-    settings = {rule: LabelSettings(selection=rule) for rule in RULES}
+    """Frames and labels of each part, by selection of labels.
+
+    Raises UserError if the parts have different ranges of radii.
+    """
+    settings = {selection: LabelSettings(selection=selection) for selection in SELECTIONS}
     loaded = {
-        rule: {part.name: load_split(part.dataset, "test", own, (1.0, 1 / EDGE)) for part in parts}
-        for rule, own in settings.items()
+        selection: {part.name: load_split(part.dataset, "test", labels, (1.0, 1 / EDGE)) for part in parts}
+        for selection, labels in settings.items()
     }
     ranges = {split.radius_px for split in loaded["paper"].values()}
     if len(ranges) > 1:
@@ -105,23 +111,22 @@ def load_parts(parts: Sequence[Part]) -> dict[str, dict[str, DetectSplit]]:
 def score(
     parts: Sequence[Part],
     loaded: Mapping[str, Mapping[str, DetectSplit]],
-    found: Mapping[str, list[Detections]],
+    detections_by_part: Mapping[str, list[Detections]],
     threshold: float,
 ) -> Score:
-    """Score detections, by part one entry for each frame; `loaded` is from `load_parts`."""
+    """Score detections, by part of the benchmark with one entry for each frame; `loaded` is the result of
+    `load_parts`."""
     evaluations, regions = {}, {}
-    splits = loaded[RULES[0]]
+    splits = loaded[SELECTIONS[0]]
     facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})
     of_frame = [part.region for part in parts for _ in range(len(splits[part.name]))]
-    detections = [each for part in parts for each in found[part.name]]
-    for rule, by_part in loaded.items():
+    detections = [each for part in parts for each in detections_by_part[part.name]]
+    for selection, by_part in loaded.items():
         labels: list[FrameLabels] = [each for part in parts for each in by_part[part.name].labels]
         radius_px = next(iter(by_part.values())).radius_px
-        evaluation = evaluate_detections(
-            detections, labels, facts, threshold, radius_px=radius_px, match_iou=MATCH_IOU, seed=SEED
-        )
-        evaluations[rule] = evaluation
-        regions[rule] = [_region(evaluation, name, of_frame) for name in dict.fromkeys(of_frame)]
+        evaluation = evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px, MATCH_IOU), SEED)
+        evaluations[selection] = evaluation
+        regions[selection] = [_region(evaluation, name, of_frame) for name in dict.fromkeys(of_frame)]
     images = [image for part in parts for image in splits[part.name].frames.images]
     return Score(evaluations, regions, images, {part.name: (len(splits[part.name]), part.n_locked) for part in parts})
 

@@ -19,35 +19,36 @@ COLUMNS: dict[str, Kind] = {
     "y1_px": "number",
     "score": "number",
 }
-"""Columns of a submission. A box holds the whole ellipse, also off the image; pixel 0 is from 0 to 1."""
+"""Columns of a submission. A box contains the whole ellipse, also off the image; the first pixel extends from 0 to
+1."""
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 
 
 def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[Detections]]:
-    """Detections by dataset, one entry for each of its frames; `frames` holds the frame_ids of each dataset.
+    """Read detections by dataset, one entry for each frame; `frames` has the frame_ids of each dataset.
 
     Frames without rows have no detections. Raises UserError if the file cannot be read, lacks a column, names another
-    dataset or frame, or holds a number that is not finite, a box without area, or a score outside 0 to 1.
+    dataset or frame, or contains a number that is not finite, a box without area, or a score outside 0 to 1.
     """
     table = read_table(path, DETECTIONS, COLUMNS)
     _check_numbers(table)
     datasets, ids = table.texts("dataset"), table.texts("frame_id")
     of_dataset = _known(datasets, list(frames))
     table.check("dataset", of_dataset >= 0, f"one of {', '.join(sorted(frames))}")
-    found = {}
-    for place, (name, own_ids) in enumerate(frames.items()):
-        rows = np.flatnonzero(of_dataset == place)
+    by_dataset = {}
+    for number, (name, own_ids) in enumerate(frames.items()):
+        rows = np.flatnonzero(of_dataset == number)
         at = _known(ids, own_ids)[rows]
         if (at < 0).any():
             raise table.fault(int(rows[(at < 0).argmax()]), "frame_id", f"a frame of {name}")
-        found[name] = _of_dataset(table, rows, at, len(own_ids))
-    return found
+        by_dataset[name] = _of_dataset(table, rows, at, len(own_ids))
+    return by_dataset
 
 
 def _known(texts: Texts, names: list[str]) -> np.ndarray:
-    """Place in `names` of each row's text; -1 for others."""
-    place = {name: k for k, name in enumerate(names)}
-    return np.array([*(place.get(word, -1) for word in texts.words), -1], np.int64)[texts.codes]
+    """Index in `names` of each row's text; -1 for other texts."""
+    number_of = {name: k for k, name in enumerate(names)}
+    return np.array([*(number_of.get(word, -1) for word in texts.words), -1], np.int64)[texts.codes]
 
 
 def _check_numbers(table: Columns) -> None:
@@ -58,10 +59,10 @@ def _check_numbers(table: Columns) -> None:
 
 
 def _of_dataset(table: Columns, rows: np.ndarray, at: np.ndarray, n_frames: int) -> list[Detections]:
-    """Detections of each frame, best first, of rows (n,) and their frames (n,)."""
+    """Detections of each frame, best first; `rows` (n,) are the rows of a dataset and `at` (n,) their frames."""
     boxes = np.column_stack([table.numbers(name)[rows] for name in _BOX]).reshape(-1, 4)
     scores = table.numbers("score")[rows]
     order = np.lexsort((-scores, at))
     bounds = np.searchsorted(at[order], np.arange(n_frames + 1))
     parts = (order[start:stop] for start, stop in pairwise(bounds))
-    return [Detections(boxes[own], scores[own]) for own in parts]
+    return [Detections(boxes[chosen], scores[chosen]) for chosen in parts]

@@ -1,6 +1,13 @@
 """Assignment of predictors to labels.
 
-The number of positive predictors depends on the labels. A GPU would make the process wait for that number, so that the
+For each scale:
+
+1. `matching_anchors` compares the sizes of anchors and labels.
+2. Predictors in the cell of a label's centre, and in its nearest neighbours, become positive.
+3. Predictors whose cells touch the middle of an ignored label become ignored (`_cells_touched`).
+4. All other predictors are negative.
+
+The number of positive predictors depends on the labels. On a GPU the process would have to wait for that number, so the
 loader assigns on the CPU, and the loss only gathers.
 """
 
@@ -29,7 +36,7 @@ class BatchLabels:
 class Assignment:
     """Positive predictors of one scale with their labels, and ignored predictors."""
 
-    places: Tensor
+    predictors: Tensor
     """Frame, anchor, row and column of each positive predictor (4, P)."""
     boxes: Tensor
     """Box of its label: x0, y0, x1, y1 in pixels (P, 4)."""
@@ -43,27 +50,27 @@ class Assignment:
         """The positive predictors (N, 3, h, w), bool."""
         if self.counted is None:
             mask = torch.zeros_like(self.ignored)
-            mask[tuple(self.places)] = True
+            mask[tuple(self.predictors)] = True
             return mask
-        flat = flat_places(self.places, self.ignored.shape)
+        flat = flat_predictors(self.predictors, self.ignored.shape)
         counts = torch.zeros(self.ignored.numel(), device=flat.device)
         return (counts.scatter_reduce(0, flat, self.counted.float(), "amax") > 0).view_as(self.ignored)
 
     def pin_memory(self) -> "Assignment":
-        """The same in page-locked memory; a DataLoader calls it."""
+        """The assignment in page-locked memory; a DataLoader calls this."""
         return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Assignment":
-        """The same on another device; from page-locked memory without waiting."""
+        """The assignment on another device; from page-locked memory without waiting."""
         return self._each(lambda part: part.to(device, non_blocking=True))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Assignment":
         return Assignment(**{name: change(part) for name, part in vars(self).items() if part is not None})
 
 
-def flat_places(places: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Indices (P,) into a flattened tensor (N, 3, h, w) of places (4, P): frame, anchor, row and column."""
-    frame, anchor, row, column = places
+def flat_predictors(predictors: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Indices (P,) into a flattened tensor (N, 3, h, w) of predictors (4, P): frame, anchor, row and column."""
+    frame, anchor, row, column = predictors
     _, anchors, height, width = shape
     return ((frame * anchors + anchor) * height + row) * width + column
 
@@ -75,8 +82,8 @@ Targets = list[Assignment]
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float | None) -> Tensor:
     """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
 
-    True for every anchor whose width and height are within the factor `ratio`, and always for the one of highest IoU
-    (all boxes centred on one point). Without `ratio` only for that one.
+    True for every anchor whose width and height are within the factor `ratio`, and always for the anchor of highest IoU
+    (all boxes centred on one point). Without `ratio`, only for the latter.
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors
@@ -133,9 +140,9 @@ def assign(
         label, anchor = label.repeat(len(steps)), anchor.repeat(len(steps))
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
-        places = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
-        made = Assignment(places, labels.boxes[label], ignored)
-        result.append(replace(made, ignored=ignored & ~made.positive))
+        predictors = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
+        assignment = Assignment(predictors, labels.boxes[label], ignored)
+        result.append(replace(assignment, ignored=ignored & ~assignment.positive))
     return result
 
 
@@ -154,7 +161,7 @@ def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shap
     cells = at.floor()[..., None] + offsets
     limit = at.new_tensor([shape[3], shape[2]])[:, None]
     near = ((cells + 0.5 - at[..., None]).abs() < reach[..., None]) & (cells >= 0) & (cells < limit)
-    which, row, column = (near[:, 1, :, None] & near[:, 0, None, :]).nonzero(as_tuple=True)
+    box, row, column = (near[:, 1, :, None] & near[:, 0, None, :]).nonzero(as_tuple=True)
     cells = cells.long()
-    touched[frame[which], anchor[which], cells[which, 1, row], cells[which, 0, column]] = True
+    touched[frame[box], anchor[box], cells[box, 1, row], cells[box, 0, column]] = True
     return touched

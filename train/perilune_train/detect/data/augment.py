@@ -26,14 +26,14 @@ def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
     return image, np.stack([x0, y0, x1, y1], axis=1)
 
 
-def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, float]) -> tuple[NDArray, Array]:
+def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, float]) -> tuple[NDArray, Array]:
     """Enlarge or shrink a frame (height, width) and its boxes (M, 4) within the same image size.
 
-    `place` in [0, 1] selects, in x and y, the part of an enlarged frame to keep or the position of a shrunk one. A
+    `offset` in [0, 1] selects, in x and y, the part of an enlarged frame to keep or the position of a shrunk one. A
     shrunk frame is surrounded by its mean grey.
     """
     height, width = image.shape
-    shift = np.array([width, height]) * (1 - 1 / factor) * np.array(place)
+    shift = np.array([width, height]) * (1 - 1 / factor) * np.array(offset)
     if factor < 1:
         image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / factor**2 - 1))
     # OpenCV counts from the centre of the first pixel, boxes from its edge.

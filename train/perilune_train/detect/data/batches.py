@@ -34,8 +34,8 @@ class TrainingFrames(torch_data.Dataset):
     def keys(self, epoch: int) -> list[Key]:
         """Keys of the share's frames in the order of an epoch, which depends on seed and epoch only."""
         order = np.random.default_rng([self.seed, epoch]).permutation(self.split.n_frames)
-        own = order[self.split.share.owns(order)] // self.split.share.processes
-        return [(epoch, int(number)) for number in own]
+        numbers = order[self.split.share.owns(order)] // self.split.share.processes
+        return [(epoch, int(number)) for number in numbers]
 
     def __getitem__(self, key: Key) -> Sample:
         epoch, number = key
@@ -96,10 +96,10 @@ class Collate:
 def training_loader(
     split: DetectSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> torch_data.DataLoader:
-    """Training batches of a share, in every epoch in its order; the first one, `epoch`, from batch `start` on.
+    """Training batches of a share, in every epoch in its order; the first epoch, `epoch`, starts at batch `start`.
 
-    `anchors` (scales, 3, 2) are those of the network. All processes have the same number of batches: each frame is seen
-    once in an epoch, except at most processes - 1 frames, different ones in each epoch.
+    `anchors` (scales, 3, 2) are the anchors of the network. All processes have the same number of batches: each frame
+    is seen once in an epoch, except at most processes - 1 frames, which differ from epoch to epoch.
     """
     frames = TrainingFrames(split, config)
     fewest = split.n_frames // split.share.processes

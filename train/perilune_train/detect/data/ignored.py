@@ -57,30 +57,32 @@ def unlabelled_craters(
     The columns are box (x0, y0, x1, y1), radius and ellipse (centre x and y, semi-axes, all in pixels, and direction in
     radians).
 
-    A crater of 1.9 px looks like one of 2.1 px. If the first were background, training would lower the scores of both,
-    and a detection of the first would be a false positive. So two kinds of crater are ignored, as COCO ignores objects
-    outside its area range: craters within a factor of sqrt(2) of the range (others cannot reach an IoU of 0.5 with a
-    box in the range) and craters with their centre off the image. If frames will be enlarged or shrunk (`scale`, see
-    load_split), smaller and larger ones are ignored too. `frame` is a row of the table, `labelled` the ids of the
-    craters that have a label in it.
+    A crater of 1.9 px looks like a crater of 2.1 px. If the first were background, training would lower the scores of
+    both, and a detection of the first would be a false positive. So two kinds of crater are ignored, as COCO ignores
+    objects outside its area range: craters within a factor of sqrt(2) of the range (others cannot reach an IoU of 0.5
+    with a box in the range) and craters with their centre off the image. If frames will be enlarged or shrunk by the
+    factors `scale`, smaller and larger craters are ignored too. `frame` is a row of the table frames, `labelled` are
+    the ids of the craters that have a label in it.
     """
     low, high = radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
-    rotation = matrix_from_quaternion(frame["rotation_wxyz"])
-    # First select by size: a scene has a hundred thousand craters, and the other checks cost more.
-    rows = _right_size(craters, camera, rotation[2], frame["position_m"], (low, high))
-    centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation)
+    rotation_camera_from_site = matrix_from_quaternion(frame["rotation_wxyz"])
+    # Select by size first: a scene has a hundred thousand craters, and the other checks cost more.
+    rows = _right_size(craters, camera, rotation_camera_from_site[2], frame["position_m"], (low, high))
+    centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation_camera_from_site)
     radius_m = craters.diameter_m[rows] / 2
     (u, v), reach_px = camera.project(centre).T, 2 * camera.fx_px * radius_m / centre[:, 2]
     near = (u > -reach_px) & (u < camera.width_px + reach_px) & (v > -reach_px) & (v < camera.height_px + reach_px)
     if labelled is not None:
         near &= ~np.isin(craters.crater_id[rows], labelled)
     near = np.flatnonzero(near)
-    shapes = project_circles(camera, centre[near], craters.normal[rows[near]] @ rotation.T, radius_m[near])
+    shapes = project_circles(
+        camera, centre[near], craters.normal[rows[near]] @ rotation_camera_from_site.T, radius_m[near]
+    )
     box, radius = shapes.bounding_boxes(), shapes.radius_px()
-    seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
-    seen &= (radius >= low) & (radius <= high)
+    in_view = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
+    in_view &= (radius >= low) & (radius <= high)
     ellipse = [shapes.cx_px, shapes.cy_px, shapes.a_px, shapes.b_px, shapes.theta_rad]
-    return np.column_stack([box, radius, *ellipse])[seen]
+    return np.column_stack([box, radius, *ellipse])[in_view]
 
 
 def _right_size(

@@ -43,7 +43,20 @@ class FrameLabels:
     depth_ratio: Array | None = None
     """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
     crowd: NDArray[np.bool_] | None = None
-    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if none is."""
+    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if there is no such
+    label."""
+
+
+@dataclass(frozen=True, slots=True)
+class LabelLimits:
+    """Which craters are labels, which of them are selected, and which craters are ignored."""
+
+    selection: Selection
+    """Thresholds of the selected labels."""
+    radius_px: tuple[float, float]
+    """Range of radii that are labelled and evaluated, pixels."""
+    zoom: tuple[float, float]
+    """Smallest and largest factor by which frames will be resized; it widens the range of ignored craters."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +78,17 @@ class SplitLabels(Sequence[FrameLabels]):
         return len(self.bounds) - 1
 
     @overload
-    def __getitem__(self, place: int) -> FrameLabels: ...
+    def __getitem__(self, index: int) -> FrameLabels: ...
     @overload
-    def __getitem__(self, place: slice) -> list[FrameLabels]: ...
-    def __getitem__(self, place: int | slice) -> FrameLabels | list[FrameLabels]:
-        if isinstance(place, slice):
-            return [self[i] for i in range(*place.indices(len(self)))]
-        place = range(len(self))[place]
-        own = slice(self.bounds[place], self.bounds[place + 1])
-        shape = self.shape[own]
+    def __getitem__(self, index: slice) -> list[FrameLabels]: ...
+    def __getitem__(self, index: int | slice) -> FrameLabels | list[FrameLabels]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        index = range(len(self))[index]
+        rows = slice(self.bounds[index], self.bounds[index + 1])
+        shape = self.shape[rows]
         return FrameLabels(
-            shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[own], self.labelled[own], self.depth_ratio[own]
+            shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[rows], self.labelled[rows], self.depth_ratio[rows]
         )
 
 
@@ -83,45 +96,45 @@ def read_split_labels(
     dataset: Dataset,
     table: pd.DataFrame,
     share: Share,
-    selection: Selection,
-    radius_px: tuple[float, float],
-    scale: tuple[float, float],
+    limits: LabelLimits,
 ) -> tuple[SplitLabels, Array]:
     """Labels and ignored craters of the share's frames, and sizes (S, 2) of the selected labels of all frames.
 
-    `table` has all frames of the split (`frame_table`). Only the craters and labels of one scene are in memory at a
-    time, beside the result. Raises UserError if a part cannot be read or keys are broken.
+    `table` has all frames of the split (`frame_table`). Memory holds the result and the craters and labels of one scene
+    at a time. Raises UserError if a part cannot be read or keys are broken.
     """
     rows = dataset.table("frames", FRAME_COLUMNS)
     check = KeyCheck(dataset, rows)
-    place_of_row = (
+    frame_of_row = (
         pc.index_in(rows["frame_id"], pa.array(table["frame_id"].tolist(), rows["frame_id"].type))
         .fill_null(-1)
         .to_numpy()
     )
     names = list(dict.fromkeys([*_KEYS, *_THRESHOLDED, *_SHAPE]))
-    frames, sizes, own_places = _Joined(), [], share.of(len(table))
+    frames, sizes, share_frames = _Joined(), [], share.of(len(table))
     with dataset.parts_kept_open():
-        for scene_id, places in table.groupby("scene_id").indices.items():
+        for scene_id, scene_frames in table.groupby("scene_id").indices.items():
             labels = dataset.table("labels", names, scene_id=str(scene_id))
-            frame = place_of_row[check.add_labels(labels)]
-            wrong = (frame >= 0) & ~np.isin(frame, places)
+            frame = frame_of_row[check.add_labels(labels)]
+            wrong = (frame >= 0) & ~np.isin(frame, scene_frames)
             if wrong.any():
                 found = labels["frame_id"][int(wrong.argmax())].as_py()
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
                 raise UserError(dataset.store, "labels: frame_id", found, expected)
             craters = read_craters(dataset, str(scene_id))
-            # Labels of another split have the place -1.
+            # Labels of another split have the index -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
-            labels, bounds = labels.take(order), np.searchsorted(frame[order], [*places, places[-1] + 1])
-            own = _SceneLabels.of(labels, craters, selection)
-            sizes.append((own.shape[:, 2:4] - own.shape[:, :2])[own.selected])
-            for place, start, stop in zip(places, bounds, bounds[1:], strict=False):
-                if place in own_places:
-                    part, row = slice(start, stop), table.iloc[place].to_dict()
-                    ids = own.crater_id[part]
-                    ignored = unlabelled_craters(craters, dataset.camera, row, radius_px, scale, ids)
-                    frames.add(own.shape[part], own.selected[part], own.depth_ratio[part], ignored)
+            labels, bounds = labels.take(order), np.searchsorted(frame[order], [*scene_frames, scene_frames[-1] + 1])
+            scene_labels = _SceneLabels.of(labels, craters, limits.selection)
+            sizes.append((scene_labels.shape[:, 2:4] - scene_labels.shape[:, :2])[scene_labels.selected])
+            for frame_index, start, stop in zip(scene_frames, bounds, bounds[1:], strict=False):
+                if frame_index in share_frames:
+                    part, row = slice(start, stop), table.iloc[frame_index].to_dict()
+                    ids = scene_labels.crater_id[part]
+                    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, ids)
+                    frames.add(
+                        scene_labels.shape[part], scene_labels.selected[part], scene_labels.depth_ratio[part], ignored
+                    )
     check.finish()
     return frames.joined(), np.concatenate(sizes)
 
@@ -131,9 +144,7 @@ def frame_labels(
     row: dict[str, Any],
     labels: pa.Table,
     craters: Craters,
-    selection: Selection,
-    radius_px: tuple[float, float],
-    scale: tuple[float, float],
+    limits: LabelLimits,
 ) -> FrameLabels:
     """Labels and ignored craters of one frame, given its row, its rows of the table labels and its scene's craters.
 
@@ -144,10 +155,10 @@ def frame_labels(
     if not known.all():
         found = f"{ids[known.argmin()]} in {row['frame_id']}"
         raise UserError(dataset.store, "labels: crater_id", found, "craters; see `perilune-manifest validate`")
-    own = _SceneLabels.of(labels, craters, selection)
-    ignored = unlabelled_craters(craters, dataset.camera, row, radius_px, scale, own.crater_id)
+    scene_labels = _SceneLabels.of(labels, craters, limits.selection)
+    ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, scene_labels.crater_id)
     frames = _Joined()
-    frames.add(own.shape, own.selected, own.depth_ratio, ignored)
+    frames.add(scene_labels.shape, scene_labels.selected, scene_labels.depth_ratio, ignored)
     return frames.joined()[0]
 
 

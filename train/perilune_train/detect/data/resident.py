@@ -1,8 +1,8 @@
-"""Training frames and their assignments on the GPU, for batches without work of the processor.
+"""Training frames and their assignments on the GPU, so that batches need no work of the processor.
 
 A GPU trains a detector faster than a process can prepare its batches. Without augmentation a frame is the same in every
 epoch, so frames and assignments are moved to the GPU once, and a batch is gathered there. All batches of one size have
-the same shapes, which a captured step needs (`detect/train/captured.py`).
+equal shapes, which a captured step needs (`detect/train/captured.py`).
 """
 
 from dataclasses import dataclass
@@ -29,22 +29,22 @@ _PORTION = 256
 
 @dataclass(frozen=True)
 class ResidentScale:
-    """Assignments of all F frames for one scale, K rows each; frames with fewer are filled up."""
+    """Assignments of all F frames for one scale, K rows each; frames with fewer rows are padded."""
 
-    places: Tensor
+    predictors: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
     boxes: Tensor
     """Box of its label: x0, y0, x1, y1 in pixels (F, K, 4)."""
     counted: Tensor
-    """False for the rows that fill up (F, K)."""
+    """False for rows of padding (F, K)."""
     ignored: Tensor
     """Predictors that are neither positive nor negative (F, 3, h, w), bool."""
 
     def batch(self, numbers: Tensor) -> Assignment:
         """The assignment of a batch of frames (B,)."""
-        places, boxes = self.places[numbers], self.boxes[numbers]
-        frame = torch.arange(len(numbers), device=numbers.device)[:, None].expand(places.shape[:2])
-        rows = torch.cat([frame[..., None], places], -1).flatten(0, 1).T
+        predictors, boxes = self.predictors[numbers], self.boxes[numbers]
+        frame = torch.arange(len(numbers), device=numbers.device)[:, None].expand(predictors.shape[:2])
+        rows = torch.cat([frame[..., None], predictors], -1).flatten(0, 1).T
         return Assignment(rows, boxes.flatten(0, 1), self.ignored[numbers], self.counted[numbers].flatten())
 
 
@@ -66,9 +66,11 @@ class ResidentFrames:
         for start in range(0, len(split), _PORTION):
             labels = split.labels[start : start + _PORTION]
             rows = BatchLabels(
-                torch.cat([torch.as_tensor(one.boxes, dtype=torch.float32) for one in labels]),
-                torch.repeat_interleave(torch.arange(len(labels)), torch.tensor([len(one.boxes) for one in labels])),
-                torch.cat([torch.as_tensor(one.selected) for one in labels]),
+                torch.cat([torch.as_tensor(frame.boxes, dtype=torch.float32) for frame in labels]),
+                torch.repeat_interleave(
+                    torch.arange(len(labels)), torch.tensor([len(frame.boxes) for frame in labels])
+                ),
+                torch.cat([torch.as_tensor(frame.selected) for frame in labels]),
             )
             shapes = [(len(labels), height // stride, width // stride) for stride in config.strides]
             parts.append(assign(rows, anchors.cpu(), config.strides, shapes, ratio))
@@ -88,17 +90,17 @@ class ResidentFrames:
 
 def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
     """Assignments of portions of the frames as arrays of constant length."""
-    places, boxes = [], []
+    predictors, boxes = [], []
     for part in parts:
-        order = torch.argsort(part.places[0], stable=True)
-        counts = torch.bincount(part.places[0], minlength=len(part.ignored)).tolist()
-        places += list(part.places[1:, order].T.split(counts))
+        order = torch.argsort(part.predictors[0], stable=True)
+        counts = torch.bincount(part.predictors[0], minlength=len(part.ignored)).tolist()
+        predictors += list(part.predictors[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
-    counted = pad_sequence([torch.ones(len(one), dtype=torch.bool) for one in boxes], batch_first=True)
-    # A box with an area, since the loss is computed for all rows.
-    filled = pad_sequence([one - one.new_tensor([0, 0, 1, 1]) for one in boxes], batch_first=True)
+    counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
+    # Pad with a box that has an area, since the loss is computed for all rows.
+    filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
     return ResidentScale(
-        pad_sequence(places, batch_first=True).to(device),
+        pad_sequence(predictors, batch_first=True).to(device),
         (filled + filled.new_tensor([0, 0, 1, 1])).to(device),
         counted.to(device),
         torch.cat([part.ignored for part in parts]).to(device),
@@ -118,7 +120,7 @@ def fits(split: DetectSplit, device: torch.device) -> bool:
 
 
 class _Numbers(torch_data.Dataset):
-    """The number of a frame in place of the frame."""
+    """A data set whose items are the numbers of the frames."""
 
     def __getitem__(self, key: tuple[int, int]) -> int:
         return key[1]

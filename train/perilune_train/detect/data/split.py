@@ -13,7 +13,7 @@ from perilune_shared.labels.selection import label_bound_px
 from perilune_train.data.frames import FrameStore, frame_table, load_frames
 from perilune_train.data.shares import ALONE, Share
 from perilune_train.detect.config import COARSEST_STRIDE, LabelSettings
-from perilune_train.detect.data.labels import FrameLabels, read_split_labels
+from perilune_train.detect.data.labels import FrameLabels, LabelLimits, read_split_labels
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class DetectSplit:
         return len(self.labels)
 
     def first(self, count: int) -> "DetectSplit":
-        """A split of the first `count` frames of this one, which is whole."""
+        """The first `count` frames of this split, as a split of its own."""
         frames = FrameStore(self.frames.table.iloc[:count], self.frames.images[:count])
         labels = self.labels[:count]
         boxes = np.concatenate([part.boxes[part.selected] for part in labels])
@@ -60,7 +60,7 @@ def load_split(
     Raises UserError on damaged files, on frame sizes unfit for the network and on fewer frames than processes.
 
     `scale` has the smallest and the largest zoom factor that will be applied to frames; the range of ignored craters is
-    extended accordingly. The edge account needs a largest factor of 1 / EDGE.
+    extended accordingly. The edge scoring rule needs a largest factor of 1 / EDGE.
     """
     check_frame_size(dataset)
     table = frame_table(dataset, split)
@@ -69,12 +69,12 @@ def load_split(
         raise UserError(dataset.store, f"{split} frames", len(table), expected)
     frames = load_frames(dataset, split, share, table)
     radius_px = evaluated_range(dataset, settings)
-    labels, sizes_px = read_split_labels(dataset, table, share, settings, radius_px, scale)
+    labels, sizes_px = read_split_labels(dataset, table, share, LabelLimits(settings, radius_px, scale))
     return DetectSplit(frames, labels, radius_px, sizes_px, len(table), share)
 
 
 def check_frame_size(dataset: Dataset) -> None:
-    """Raise UserError if the sides of the frames are no multiples of the network's coarsest stride."""
+    """Raise UserError if a side of the frames is not a multiple of the network's coarsest stride."""
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
         if size % COARSEST_STRIDE:
@@ -84,7 +84,7 @@ def check_frame_size(dataset: Dataset) -> None:
 
 
 def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
-    """Smallest and largest selected radius, pixels; limits that the selection does not set are those of the labels."""
+    """Smallest and largest selected radius, pixels; a limit that the selection does not set is that of all labels."""
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()
         least, largest = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))

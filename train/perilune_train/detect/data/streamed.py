@@ -10,12 +10,12 @@ from torch import Tensor
 from perilune_shared.dataset.manifest import Dataset
 from perilune_train.data.frames import decode, normalised
 from perilune_train.data.shares import Share
-from perilune_train.data.stream import FrameStream, StreamedFrame, StreamLoader
+from perilune_train.data.stream import FrameContent, FrameStream, StreamedFrame, StreamLoader
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.augment import augment
 from perilune_train.detect.data.batches import Batch, Collate, Sample, collate_of, pinned
 from perilune_train.detect.data.ignored import Craters, read_craters
-from perilune_train.detect.data.labels import FrameLabels, frame_labels
+from perilune_train.detect.data.labels import FrameLabels, LabelLimits, frame_labels
 from perilune_train.detect.data.split import check_frame_size, evaluated_range
 
 _COLUMNS = ("frame_id", "scene_id", "position_m", "rotation_wxyz", "png_bytes")
@@ -43,18 +43,16 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
     """
     check_frame_size(dataset)
     radius_px = evaluated_range(dataset, config.labels)
-    sampled = FrameStream(dataset, "train", 64, config.seed, columns=_COLUMNS, images=False)
+    sampled = FrameStream(dataset, "train", 64, config.seed, content=FrameContent(_COLUMNS, images=False))
     labels = _Labels(dataset, config, radius_px)
     sizes = []
     for batch in sampled:
-        boxes = [own.boxes[own.selected] for own in map(labels, batch)]
-        sizes += [own[:, 2:] - own[:, :2] for own in boxes]
+        boxes = [frame.boxes[frame.selected] for frame in map(labels, batch)]
+        sizes += [frame[:, 2:] - frame[:, :2] for frame in boxes]
         if len(sizes) >= _SAMPLED_FRAMES:
             break
-    stream = FrameStream(
-        dataset, "train", config.batch_size, config.seed, share.process, share.processes, columns=_COLUMNS
-    )
-    # A resumed run checks it before there is a loader.
+    stream = FrameStream(dataset, "train", config.batch_size, config.seed, share, FrameContent(_COLUMNS))
+    # A resumed run compares the number of workers before it creates a loader.
     stream.workers = max(config.workers, 1)
     return StreamedSplit(stream, radius_px, np.concatenate(sizes))
 
@@ -62,9 +60,9 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
 def streamed_loader(
     split: StreamedSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> StreamLoader:
-    """Training batches of a stream, in every epoch in its order; the first one, `epoch`, from batch `start` on.
+    """Training batches of a stream, in every epoch in its order; the first epoch, `epoch`, starts at batch `start`.
 
-    `anchors` (scales, 3, 2) are those of the network.
+    `anchors` (scales, 3, 2) are the anchors of the network.
     """
     stream = split.stream
     stream.make = _Batches(_Labels(stream.dataset, config, split.radius_px), collate_of(config, anchors))
@@ -90,8 +88,9 @@ class _Labels:
         while len(self.scenes) >= _MAX_SCENES:
             del self.scenes[next(iter(self.scenes))]
         self.scenes[scene_id] = craters
-        labels, scale = pa.Table.from_struct_array(frame.labels), self.config.augment.scale
-        return frame_labels(self.dataset, frame.row, labels, craters, self.config.labels, self.radius_px, scale)
+        labels = pa.Table.from_struct_array(frame.labels)
+        limits = LabelLimits(self.config.labels, self.radius_px, self.config.augment.scale)
+        return frame_labels(self.dataset, frame.row, labels, craters, limits)
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,9 @@ def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engi
 
     @torch.inference_mode()
     def run(images: Array) -> tuple[Array, Array]:
-        given = torch.as_tensor(images).contiguous(memory_format=torch.channels_last)
+        inputs = torch.as_tensor(images).contiguous(memory_format=torch.channels_last)
         with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
-            boxes, scores = network(given)
+            boxes, scores = network(inputs)
         return boxes.float().numpy(), scores.float().numpy()
 
     return run
@@ -57,7 +57,7 @@ def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
     onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or _within_quota()
-    # A thread that spins keeps a core from other programs.
+    # A spinning thread would block a core for other programs.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     with _readable(path):
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
@@ -92,14 +92,15 @@ def openvino_engine(
     request = core.compile_model(model, "CPU", settings).create_infer_request()
 
     def run(images: Array) -> tuple[Array, Array]:
-        found = request.infer({"images": images})
-        return found["boxes"].copy(), found["scores"].copy()
+        outputs = request.infer({"images": images})
+        return outputs["boxes"].copy(), outputs["scores"].copy()
 
     return run
 
 
 def _within_quota() -> int:
-    """Threads for an engine that reads no container's quota; 0, its own choice, if the quota is no limit."""
+    """Number of threads for an engine that ignores a container's quota; 0 (the engine decides) if the quota is no
+    limit."""
     return usable_cores() if usable_cores() < cores_in_affinity() else 0
 
 
@@ -110,7 +111,7 @@ def has_bf16() -> bool:
 
 @contextlib.contextmanager
 def _readable(path: Path) -> Any:
-    """Raise UserError if an engine cannot read a file; the engines raise their own kinds of RuntimeError."""
+    """Raise UserError if an engine cannot read a file; each engine raises its own kind of RuntimeError."""
     if not path.is_file():
         raise UserError(path, "network", "no such file", _EXPECTED)
     if path.stat().st_size > MOST_WEIGHT_BYTES:
@@ -126,7 +127,8 @@ def _readable(path: Path) -> Any:
 
 
 def _check_no_other_files(path: Path) -> None:
-    """Raise UserError if an ONNX file names files with its tensors: any file of the disk could be read as weights."""
+    """Raise UserError if an ONNX file refers to other files for its tensors: any file of the disk could be read as
+    weights."""
     model = package("onnx").load(str(path), load_external_data=False)
     names = [f"a tensor in the file {each.value!r}" for tensor in _tensors(model) for each in tensor.external_data]
     if names:
@@ -134,7 +136,7 @@ def _check_no_other_files(path: Path) -> None:
 
 
 def _tensors(message: Any) -> Iterator[Any]:
-    """All tensors of a message of protobuf, at any depth."""
+    """All tensors of a protobuf message, at any depth."""
     if message.DESCRIPTOR.name == "TensorProto":
         yield message
         return

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from perilune_shared.console.terminal import say, say_page
 from perilune_shared.dataset.manifest import Dataset, open_single
@@ -16,10 +17,8 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.data.split import load_split
-from perilune_train.detect.deploy.compare import check, noise_frames
-from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, package
-from perilune_train.detect.deploy.files import write_onnx, write_openvino
-from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.engines import Array, Engine, onnxruntime_engine, openvino_engine, package
+from perilune_train.detect.deploy.files import FlightDetector, write_onnx, write_openvino
 from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
@@ -37,8 +36,48 @@ from perilune_train.records.provenance import (
 )
 from perilune_train.training.runs import RunFolder, load_weights
 
+MAX_DIFFERENCE_PX = 1e-3
+"""Largest allowed difference of a coordinate of a compared box from torch's float32, pixels."""
+MAX_DIFFERENCE_SCORE = 1e-3
+"""Largest allowed difference of any predictor's score."""
+_CHECKED_BOXES = 100
 FORMATS = ("onnx", "openvino")
 _CHECKED_FRAMES = 8
+
+
+@torch.no_grad()
+def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
+    """Largest differences from torch's float32: of box coordinates in pixels, and of scores.
+
+    Compares all scores, and the boxes with a score of at least `min_score` or among the best 100 of their image.
+    """
+    boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
+    found_boxes, found_scores = engine(images)
+    if found_boxes.shape != boxes.shape or found_scores.shape != scores.shape:
+        return float("inf"), float("inf")
+    # Always compare some boxes, even if the network detects nothing in these frames.
+    best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
+    counts = scores >= np.minimum(best, min_score)
+    apart = np.abs(found_boxes - boxes)[counts]
+    return float(apart.max(initial=0.0)), float(np.abs(found_scores - scores).max())
+
+
+def check(path: Path, name: str, network: YOLOv3, engine: Engine, images: Array, min_score: float) -> dict[str, float]:
+    """Largest differences of a file's outputs from torch's. Raises UserError if one exceeds its limit."""
+    px, score = difference(network, engine, images, min_score)
+    if not (px <= MAX_DIFFERENCE_PX and score <= MAX_DIFFERENCE_SCORE):
+        raise UserError(
+            path.name,
+            name,
+            f"boxes {px:.2g} px and scores {score:.2g} from torch's",
+            f"at most {MAX_DIFFERENCE_PX} px and {MAX_DIFFERENCE_SCORE}",
+        )
+    return {"frames": len(images), "largest_px": px, "largest_score": score}
+
+
+def noise_frames(count: int, size_px: int) -> np.ndarray:
+    """Grey frames (count, size_px, size_px) of seeded noise, used if there are no real frames to compare on."""
+    return np.random.default_rng(0).integers(0, 256, (count, size_px, size_px)).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -56,7 +95,7 @@ class Trained:
 
 
 def load_trained(root: Path) -> Trained:
-    """Load a finished run's network, settings and threshold. Raises UserError if it is not one."""
+    """Load a finished run's network, settings and threshold. Raises UserError if the folder is not a finished run."""
     config, threshold, best = config_of_run(root), chosen_threshold(root), RunFolder(root).best
     return Trained(load_detector(best), config, threshold, best)
 
@@ -94,25 +133,36 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """Terrain record of the exported network, with the terrain of the int8 calibration, and the check of the latter."""
+    """Terrain record of the exported network, including the terrain of the int8 calibration, and the check of the
+    latter."""
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None
-    own = split_terrain(calibration, "train", "calibrated") | split_terrain(calibration, "val", "calibrated")
-    check = check_calibration(provenance, own, calibration, allow_overlap)
-    return Provenance(provenance.uses | own, provenance.known), check
+    calibrated = split_terrain(calibration, "train", "calibrated") | split_terrain(calibration, "val", "calibrated")
+    check = check_calibration(provenance, calibrated, calibration, allow_overlap)
+    return Provenance(provenance.uses | calibrated, provenance.known), check
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedFiles:
+    """Files to export."""
+
+    formats: tuple[str, ...] = FORMATS
+    """Names of the formats, from `FORMATS`."""
+    size_px: int = 256
+    """Width and height of the network's input, pixels."""
+    int8: bool = False
+    """Whether to try quantisation to 8-bit integers."""
 
 
 def export_run(
     root: Path,
     out: Path,
-    formats: tuple[str, ...] = FORMATS,
-    size_px: int = 256,
+    files: ExportedFiles,
     dataset: Address | None = None,
-    int8: bool = False,
     allow_overlap: bool = False,
 ) -> Int8Verdict | None:
-    """Export a run's detector to the new folder `out`, and check the files; with `int8` also try quantisation.
+    """Export a run's detector to the new folder `out`, and check the files.
 
     Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (metadata)
     and README.md. Compares on frames of the dataset's validation split, or on noise without a dataset.
@@ -121,6 +171,7 @@ def export_run(
     int8 would be calibrated on terrain of a test split, the run's or the dataset's. With `allow_overlap` such terrain
     is allowed, and detector.json and README.md are marked.
     """
+    formats, size_px, int8 = files.formats, files.size_px, files.int8
     for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
         package(name)
     trained = load_trained(root)

@@ -41,7 +41,7 @@ class Int8Verdict:
     ap50_paper_int8: float
     """AP of the int8 network, with its other parts in `precision`."""
     float_s: float
-    """Median time of one image before quantisation, in `precision`, seconds."""
+    """Median time of one image before quantisation, seconds, in `precision`."""
     int8_s: float
     """Median time of one image in int8, seconds."""
     precision: EnginePrecision
@@ -71,8 +71,8 @@ def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config
     Calibrated on 64 frames spread over the training split.
     """
     frames = load_frames(dataset, "train").images
-    some = frames[np.linspace(0, len(frames) - 1, min(_CALIBRATION_FRAMES, len(frames))).astype(int)]
-    quantise(source, out, network_input(normalised(some), config.in_channels).contiguous().numpy())
+    chosen = frames[np.linspace(0, len(frames) - 1, min(_CALIBRATION_FRAMES, len(frames))).astype(int)]
+    quantise(source, out, network_input(normalised(chosen), config.in_channels).contiguous().numpy())
     precision: EnginePrecision = "bf16" if has_bf16() else "f32"
     quick = {"float": openvino_engine(source, precision, batch=1), "int8": openvino_engine(out, precision, batch=1)}
     image = network_input(normalised(val.frames.images[:1]), config.in_channels).contiguous().numpy()
@@ -127,15 +127,15 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
     """The paper's AP, at the run's IoU, of an engine on a split: image by image, at scale 1 only, as in flight."""
     import torch
 
-    found = []
+    detections = []
     with progress_bar() as bar:
         task = bar.add_task(label, total=len(split), unit="frames", note="")
         for frame in split.frames.images:
             image = network_input(normalised(frame[None]), config.in_channels).contiguous().numpy()
             boxes, scores = (torch.as_tensor(part) for part in engine(image))
-            found += detections_of(boxes, scores, config.evaluation)
+            detections += detections_of(boxes, scores, config.evaluation)
             bar.advance(task)
-    return curve(match_detections(split, found, config)).ap_paper()
+    return curve(match_detections(split, detections, config)).ap_paper()
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:

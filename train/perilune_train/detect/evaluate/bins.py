@@ -8,13 +8,14 @@ positive has none, so only recall is defined.
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.data.frame_facts import FrameFacts
 from perilune_train.detect.evaluate.bootstrap import at_threshold_resampled, average_precisions
-from perilune_train.detect.evaluate.matching import Matches, Overlaps
+from perilune_train.detect.evaluate.matching import Criteria, Matches, Overlaps
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.records.spread import Resamples, Spread, spreads
 
@@ -50,7 +51,7 @@ class BinFigures:
     ap50_paper_spread: Spread
     """Spread of ap50_paper over the units with selected labels in the bin."""
     precision: float
-    """Precision in the usual account (matching.py)."""
+    """Precision by the usual scoring rule (matching.py)."""
     recall: float
     """Fraction of the selected labels that were found."""
     recall_spread: Spread
@@ -79,40 +80,48 @@ def figures_by_bin(
     overlaps: Overlaps,
     matches: Matches,
     facts: FrameFacts,
-    match_iou: float,
-    radius_px: tuple[float, float],
-    threshold: float,
+    criteria: Criteria,
     resamples: Resamples,
 ) -> list[BinFigures]:
-    """Metrics of every bin that holds selected labels. `matches` are at `match_iou` and the evaluated `radius_px`.
+    """Metrics of every bin that holds selected labels; `matches` are by the same criteria.
 
     The outer altitude bins include frames up to a tenth beyond the first and the last altitude, because trajectories
     end near the nominal altitude, not exactly at it.
     """
-    made = []
+    bins, threshold, radius_px = [], criteria.threshold, criteria.radius_px
     for low, high in pairwise(RADIUS_BINS_PX):
         # A radius of exactly 50 px belongs to the paper's largest bin.
-        own = within(overlaps.label_radius_px, low, high, high == _PAPER_MAX_RADIUS_PX)
-        own &= (low < _PAPER_MAX_RADIUS_PX) | (overlaps.label_radius_px > low)
+        in_bin = within(overlaps.label_radius_px, low, high, high == _PAPER_MAX_RADIUS_PX)
+        in_bin &= (low < _PAPER_MAX_RADIUS_PX) | (overlaps.label_radius_px > low)
         evaluated = max(low, radius_px[0]), min(high, radius_px[1])
-        part = overlaps.match(match_iou, evaluated, overlaps.label_selected & own)
-        made.append(_of_matches("radius", "px", low, high, part, threshold, resamples))
+        part = overlaps.match(criteria.match_iou, evaluated, overlaps.label_selected & in_bin)
+        bins.append(_of_matches(_Bin("radius", "px", low, high), part, threshold, resamples))
     margins = {ALTITUDE_BINS_M[0]: 1 - _ALTITUDE_MARGIN, ALTITUDE_BINS_M[-1]: 1 + _ALTITUDE_MARGIN}
     for low, high in pairwise(ALTITUDE_BINS_M):
         chosen = within(facts.altitude_m, low * margins.get(low, 1), high * margins.get(high, 1), high in margins)
-        made.append(_of_matches("altitude", "m", low, high, matches.of_frames(chosen), threshold, resamples))
+        limits = _Bin("altitude", "m", low, high)
+        bins.append(_of_matches(limits, matches.of_frames(chosen), threshold, resamples))
     for low, high in pairwise(SUN_BINS_DEG):
         chosen = within(facts.sun_elevation_deg, low, high, high == SUN_BINS_DEG[-1])
-        made.append(_of_matches("sun", "deg", low, high, matches.of_frames(chosen), threshold, resamples))
+        limits = _Bin("sun", "deg", low, high)
+        bins.append(_of_matches(limits, matches.of_frames(chosen), threshold, resamples))
     for low, high in pairwise(DEPTH_RATIO_BINS):
-        own = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_selected
-        made.append(_of_labels(low, high, own, overlaps, matches, threshold, resamples))
-    return [one for one in made if one.labels]
+        in_bin = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_selected
+        bins.append(_of_labels(_Bin("depth_ratio", "", low, high), in_bin, overlaps, matches, threshold, resamples))
+    return [part_bin for part_bin in bins if part_bin.labels]
 
 
-def _of_matches(
-    by: str, unit: str, low: float, high: float, matches: Matches, threshold: float, resamples: Resamples
-) -> BinFigures:
+class _Bin(NamedTuple):
+    """Limits of a bin, as in `BinFigures`."""
+
+    by: str
+    unit: str
+    low: float
+    high: float
+
+
+def _of_matches(limits: _Bin, matches: Matches, threshold: float, resamples: Resamples) -> BinFigures:
+    """All metrics of the matches in a bin."""
     precision, recall, f1 = at_threshold(matches, threshold)
     spread = spreads(
         lambda drawn: {
@@ -123,10 +132,7 @@ def _of_matches(
         resamples,
     )
     return BinFigures(
-        by,
-        unit,
-        low,
-        high,
+        *limits,
         len(np.unique(matches.selected_frame)),
         len(matches.selected_frame),
         curve(matches).ap_paper(),
@@ -139,30 +145,26 @@ def _of_matches(
 
 
 def _of_labels(
-    low: float,
-    high: float,
-    own: Flags,
+    limits: _Bin,
+    in_bin: Flags,
     overlaps: Overlaps,
     matches: Matches,
     threshold: float,
     resamples: Resamples,
 ) -> BinFigures:
-    """Recall of the labels `own` (L,) in the matching with all labels."""
-    hit = np.zeros(len(own), np.bool_)
+    """Recall of the labels `in_bin` (L,) in the matching with all labels."""
+    hit = np.zeros(len(in_bin), np.bool_)
     hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
-    frames = overlaps.label_frame[own]
+    frames = overlaps.label_frame[in_bin]
 
     def recalls(drawn: Resamples) -> dict[str, Array]:
-        found, n_labels = drawn.totals(overlaps.label_frame[own & hit]), drawn.totals(frames)
-        return {"recall": np.divide(found, n_labels, out=np.full(len(n_labels), np.nan), where=n_labels > 0)}
+        n_found, n_labels = drawn.totals(overlaps.label_frame[in_bin & hit]), drawn.totals(frames)
+        return {"recall": np.divide(n_found, n_labels, out=np.full(len(n_labels), np.nan), where=n_labels > 0)}
 
     nan = float("nan")
-    recall = float(hit[own].mean()) if own.any() else nan
+    recall = float(hit[in_bin].mean()) if in_bin.any() else nan
     return BinFigures(
-        "depth_ratio",
-        "",
-        low,
-        high,
+        *limits,
         len(np.unique(frames)),
         len(frames),
         nan,

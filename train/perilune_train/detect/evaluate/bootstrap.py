@@ -22,11 +22,11 @@ def average_precisions(matches: Matches, resamples: Resamples) -> Array:
     n_scores = int(rank[-1]) + 1 if len(rank) else 0
     n_groups = min(_GROUPS, n_scores)
     group = rank * n_groups // max(n_scores, 1)
-    place = resamples.of_row[matches.frame[order]], group
+    cell = resamples.of_row[matches.frame[order]], group
     shape = (resamples.count, n_groups)
     hits, every = np.zeros(shape), np.zeros(shape)
-    np.add.at(hits, place, matches.outcome[order] == FOUND)
-    np.add.at(every, place, 1.0)
+    np.add.at(hits, cell, matches.outcome[order] == FOUND)
+    np.add.at(every, cell, 1.0)
     hits, every = (np.cumsum(resamples.weights @ part, axis=1) for part in (hits, every))
     n_labels = resamples.totals(matches.selected_frame)
     precision = hits / np.maximum(every, 1)

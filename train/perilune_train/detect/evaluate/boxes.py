@@ -36,9 +36,9 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
     """Non-maximum suppression: indices of the kept boxes, best first, at most `max_count`.
 
     A box is removed if its IoU with a kept box of a higher score exceeds `threshold_iou`; equal scores keep their
-    order. Scores are above 0. The result is OpenCV's (`cv2.dnn.NMSBoxes`), which compares scores and overlaps as
-    float32. No limit on candidates cuts it short: several hundred craters with a dozen predictors each would exceed any
-    usual one.
+    order. Scores are above 0. The result is that of OpenCV (`cv2.dnn.NMSBoxes`), which compares scores and overlaps as
+    float32. There is no limit on candidates: several hundred craters with a dozen predictors each would exceed any
+    usual limit.
     """
     boxes, scores = np.asarray(boxes, np.float64).reshape(-1, 4), np.asarray(scores, np.float64)
     if not len(boxes):
@@ -50,11 +50,12 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
 
 @compiled
 def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
-    """Places of the boxes (N, 4), x, y, width and height, best first, that suppression keeps, at most `max_count`.
+    """Indices of the boxes (N, 4) that suppression keeps, at most `max_count`; boxes are x, y, width, height, best
+    first.
 
-    Kept boxes are listed in the cells of a grid that they touch, so that a box is compared only with those near it.
-    Two boxes that overlap touch a common cell, also where the grid's edge takes what lies beyond. A box that touches
-    more than `most` cells, or has no area, is kept in a list of its own, and compared with all.
+    Kept boxes are listed in the cells of a grid that they touch, so that a box is compared only with nearby boxes. Two
+    boxes that overlap touch a common cell; cells at the edge of the grid include everything beyond. A box that touches
+    more than `most` cells, or has no area, is kept in a separate list and compared with all.
     """
     side, most = 32, 64
     n, low, high = len(boxes), np.empty(2), np.empty(2)
@@ -76,7 +77,7 @@ def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np
             first[axis] = min(max((start - low[axis]) / cell[axis], 0.0), side - 1.0)
             last[axis] = min(max((stop - low[axis]) / cell[axis], 0.0), side - 1.0)
         touched = (last[0] - first[0] + 1) * (last[1] - first[1] + 1)
-        # OpenCV gives two boxes without area, wherever they are, an overlap of 1.
+        # OpenCV gives two boxes without area an overlap of 1, wherever they are.
         everywhere = touched > most or boxes[k, 2] * boxes[k, 3] <= 0
         removed = False
         if everywhere:

@@ -2,11 +2,11 @@
 
 Use it for rendered datasets and real images alike:
 
-    evaluation = evaluate_detections(found, labels, facts, threshold, radius_px=(2.0, 50.0))
+    evaluation = evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px=(2.0, 50.0)))
     figures = evaluation.figures()                       # flat keys, for metrics.json
     write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
 
-`found` is a list of Detections, `labels` a list of FrameLabels (real images: all selected and labelled, with the
+`detections` is a list of Detections, `labels` a list of FrameLabels (real images: all selected and labelled, with the
 ellipses inscribed in the boxes) and `facts` a FrameFacts (`unknown_facts` if nothing is known). Each has one entry per
 frame.
 """
@@ -26,13 +26,14 @@ from perilune_train.detect.evaluate.matching import (
     COCO_IOUS,
     FALSE,
     FOUND,
+    Criteria,
     Detections,
     Matches,
     Overlaps,
     edge_range,
     find_overlaps,
 )
-from perilune_train.detect.evaluate.metrics import figures, figures_of_account, figures_over_ious
+from perilune_train.detect.evaluate.metrics import figures, figures_of_rule, figures_over_ious
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
@@ -58,14 +59,14 @@ class Evaluation:
     matches: Matches
     """Matches at match_iou."""
     at_edge: Matches
-    """Matches at match_iou in the edge account (matching.py)."""
+    """Matches at match_iou by the edge scoring rule (matching.py)."""
     by_iou: list[Matches]
     """Matches at each of COCO_IOUS."""
     bins: list[BinFigures]
     """By radius, altitude, Sun elevation and freshness; only bins that hold labels."""
     spreads: dict[str, Spread]
-    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper in the edge and strict
-    accounts."""
+    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper by the edge and
+    strict scoring rules."""
     resamples: Resamples
     """Resamples of the bootstrap intervals."""
 
@@ -82,7 +83,7 @@ class Evaluation:
         """
         result: Metrics = {
             **figures(self.matches, self.threshold),
-            **figures_of_account(self.at_edge, self.threshold, "edge/"),
+            **figures_of_rule(self.at_edge, self.threshold, "edge/"),
             **figures_over_ious(self.by_iou),
             "threshold": self.threshold,
             "match_iou": self.match_iou,
@@ -119,21 +120,19 @@ class Evaluation:
 
 
 def evaluate_detections(
-    found: list[Detections],
+    detections: list[Detections],
     labels: Sequence[FrameLabels],
     facts: FrameFacts,
-    threshold: float,
-    *,
-    radius_px: tuple[float, float],
-    match_iou: float = 0.5,
+    criteria: Criteria,
     seed: int = 0,
 ) -> Evaluation:
-    """Evaluate the detections of all frames; `radius_px` is the range of labelled radii.
+    """Evaluate the detections of all frames.
 
-    The edge account is valid only if `labels` include craters, as ignored ones, well below that range. `threshold` must
-    be chosen on other frames (validation). `seed` is the random seed of the bootstrap only.
+    The edge scoring rule is valid only if `labels` include, as ignored ones, craters well below the range of radii.
+    `seed` is the random seed of the bootstrap.
     """
-    overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
+    match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
+    overlaps = find_overlaps(detections, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
     matches = overlaps.match(match_iou, radius_px)
     at_edge = overlaps.match(match_iou, edge_range(radius_px))
     by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
@@ -149,7 +148,7 @@ def evaluate_detections(
         }
 
     return Evaluation(
-        found,
+        detections,
         labels,
         facts,
         threshold,
@@ -158,7 +157,7 @@ def evaluate_detections(
         matches,
         at_edge,
         by_iou,
-        figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
+        figures_by_bin(overlaps, matches, facts, criteria, resamples),
         spreads(statistics, matches.selected_frame, resamples),
         resamples,
     )
@@ -171,8 +170,8 @@ def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> d
     a rotated ellipse it is slightly larger than sqrt(a b), which a box does not determine. Bias is the mean of detected
     minus true.
     """
-    own = (matches.label >= 0) & (matches.scores >= threshold)
-    ours, truth = overlaps.boxes[own], overlaps.label_boxes[matches.label[own]]
+    hits = (matches.label >= 0) & (matches.scores >= threshold)
+    ours, truth = overlaps.boxes[hits], overlaps.label_boxes[matches.label[hits]]
     radius, true_radius = (np.sqrt(np.prod(box[:, 2:] - box[:, :2], axis=1)) / 2 for box in (ours, truth))
     centre_error = np.linalg.norm((ours[:, :2] + ours[:, 2:] - truth[:, :2] - truth[:, 2:]) / 2, axis=1)
     difference = radius - true_radius

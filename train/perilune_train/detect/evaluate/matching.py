@@ -7,14 +7,14 @@ Evaluate detections against labels of rendered or real images with:
     curve(matches).ap_paper()                                  # metrics.py
 
 Detections are matched in order of score. Each takes the unmatched selected label of highest IoU, if that is at least
-the given IoU. Only selected labels count in recall. Three accounts differ in which unmatched detections are false
+the given IoU. Only selected labels count in recall. Three scoring rules differ in which unmatched detections are false
 positives:
 
 - Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
   labelled range), if its radius sqrt(w h) / 2 is outside the labelled range, or if its centre is off the image. The
   labels cannot decide whether such a detection is right.
 - Edge (`edge_range`): a detection somewhat below the smallest radius is a false positive too, unless it overlaps a
-  crater, selected or not. In the usual account a detector can report boxes just below the smallest radius everywhere:
+  crater, selected or not. By the usual rule a detector can report boxes just below the smallest radius everywhere:
   some of them match a label and count, and the others are ignored.
 - Strict: every unmatched detection is a false positive.
 
@@ -42,14 +42,26 @@ Rows = NDArray[np.intp]
 FOUND, FALSE, IGNORED = 1, 0, -1
 NO_LABEL, ON_IGNORED = -1, -2
 EDGE = 0.75
-"""The edge account counts false positives down to this fraction of the smallest radius."""
+"""The edge scoring rule counts false positives down to this fraction of the smallest radius."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
 """The IoUs over which COCO averages, bit-identical to COCO's."""
 
 
 def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
-    """Range of radii, pixels, in which the edge account counts unmatched detections as false positives."""
+    """Range of radii, pixels, in which the edge scoring rule counts unmatched detections as false positives."""
     return radius_px[0] * EDGE, radius_px[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """Which detections and labels an evaluation counts."""
+
+    threshold: float
+    """Minimum score of the detections that count in precision, recall and F1; choose it on other frames."""
+    radius_px: tuple[float, float]
+    """Range of the evaluated radii, pixels."""
+    match_iou: float = 0.5
+    """Minimum IoU of a match."""
 
 
 @dataclass(frozen=True)
@@ -78,17 +90,17 @@ class Matches:
     """Frame of each selected label (L,)."""
 
     def strict(self) -> "Matches":
-        """The same matches with every ignored detection counted as a false positive."""
+        """The matches with every ignored detection counted as a false positive."""
         return replace(self, outcome=np.where(self.outcome == IGNORED, FALSE, self.outcome).astype(np.int8))
 
     def of_frames(self, chosen: Flags) -> "Matches":
-        """The matches in the frames that are True in `chosen` (N,)."""
-        own = chosen[self.frame]
+        """The matches in the frames for which `chosen` (N,) is True."""
+        kept = chosen[self.frame]
         return Matches(
-            self.scores[own],
-            self.outcome[own],
-            self.label[own],
-            self.frame[own],
+            self.scores[kept],
+            self.outcome[kept],
+            self.label[kept],
+            self.frame[kept],
             self.selected_frame[chosen[self.selected_frame]],
         )
 
@@ -139,12 +151,12 @@ class Overlaps:
         detection, other = self.pair_detection[enough], self.pair_label[enough]
         on_selected = selected[other]
         label[detection[~on_selected]] = ON_IGNORED
-        found, taken = {}, set()
-        for one, its_label in zip(detection[on_selected].tolist(), other[on_selected].tolist(), strict=True):
-            if one not in found and its_label not in taken:
-                found[one] = its_label
+        label_of, taken = {}, set()
+        for candidate, its_label in zip(detection[on_selected].tolist(), other[on_selected].tolist(), strict=True):
+            if candidate not in label_of and its_label not in taken:
+                label_of[candidate] = its_label
                 taken.add(its_label)
-        label[list(found.keys())] = list(found.values())
+        label[list(label_of.keys())] = list(label_of.values())
         radius = self.radius_px()
         ignored = (label == ON_IGNORED) | (radius < radius_px[0]) | (radius > radius_px[1]) | self.off_image
         outcome = np.where(label >= 0, FOUND, np.where(ignored, IGNORED, FALSE)).astype(np.int8)
@@ -152,11 +164,11 @@ class Overlaps:
 
 
 def find_overlaps(
-    found: list[Detections], labels: Sequence[FrameLabels], sizes_px: NDArray, min_iou: float = 0.5
+    detections: list[Detections], labels: Sequence[FrameLabels], sizes_px: NDArray, min_iou: float = 0.5
 ) -> Overlaps:
     """All pairs with an IoU of at least `min_iou`, for frames of the widths and heights `sizes_px` (N, 2)."""
-    boxes, scores, detections, others, values, n_found, n_labels = [], [], [], [], [], 0, 0
-    for ours, truth in zip(found, labels, strict=True):
+    boxes, scores, pair_detections, pair_labels, pair_ious, n_found, n_labels = [], [], [], [], [], 0, 0
+    for ours, truth in zip(detections, labels, strict=True):
         order = np.argsort(-ours.scores, kind="stable")
         boxes.append(ours.boxes[order].reshape(-1, 4))
         scores.append(ours.scores[order])
@@ -166,12 +178,12 @@ def find_overlaps(
         row, column = np.nonzero(overlap >= min_iou)
         iou = overlap[row, column]
         sort = np.lexsort((-column, -iou, row))
-        detections.append(row[sort] + n_found)
-        others.append(column[sort] + n_labels)
-        values.append(iou[sort])
+        pair_detections.append(row[sort] + n_found)
+        pair_labels.append(column[sort] + n_labels)
+        pair_ious.append(iou[sort])
         n_found, n_labels = n_found + len(ours.scores), n_labels + len(truth.boxes)
     box = np.concatenate(boxes) if boxes else np.empty((0, 4))
-    frame = np.repeat(np.arange(len(found)), [len(part.scores) for part in found])
+    frame = np.repeat(np.arange(len(detections)), [len(part.scores) for part in detections])
     centre = (box[:, :2] + box[:, 2:]) / 2
     size = np.asarray(sizes_px).reshape(-1, 2)[frame]
     return Overlaps(
@@ -184,26 +196,26 @@ def find_overlaps(
         _joined([_depth_ratio(part) for part in labels]),
         _joined([part.selected for part in labels]).astype(np.bool_),
         np.repeat(np.arange(len(labels)), [len(part.boxes) for part in labels]),
-        _joined(detections).astype(np.intp),
-        _joined(others).astype(np.intp),
-        _joined(values),
+        _joined(pair_detections).astype(np.intp),
+        _joined(pair_labels).astype(np.intp),
+        _joined(pair_ious),
     )
 
 
 def match_split(
-    found: list[Detections],
+    detections: list[Detections],
     labels: Sequence[FrameLabels],
     image_size_px: tuple[int, int],
     match_iou: float,
     radius_px: tuple[float, float],
 ) -> Matches:
     """Match the detections of frames of one size (width, height) at one IoU."""
-    sizes = np.tile(image_size_px, (len(found), 1))
-    return find_overlaps(found, labels, sizes, match_iou).match(match_iou, radius_px)
+    sizes = np.tile(image_size_px, (len(detections), 1))
+    return find_overlaps(detections, labels, sizes, match_iou).match(match_iou, radius_px)
 
 
 def joined(parts: Sequence[Matches]) -> Matches:
-    """The matches in the frames of several processes, which each took every n-th frame; sorted by frame.
+    """Join the matches of several processes, which each had every n-th frame; sorted by frame.
 
     Rows of labels (`label`) are not unique in the result.
     """

@@ -92,12 +92,13 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
 
 
 def figures(matches: Matches, threshold: float) -> dict[str, float]:
-    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key, and the same under "strict/"."""
-    return figures_of_account(matches, threshold, "") | figures_of_account(matches.strict(), threshold, "strict/")
+    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key; with the prefix "strict/" by the strict
+    rule."""
+    return figures_of_rule(matches, threshold, "") | figures_of_rule(matches.strict(), threshold, "strict/")
 
 
-def figures_of_account(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
-    """The six metrics of one account by key, with a prefix."""
+def figures_of_rule(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
+    """The six metrics by one scoring rule, by key with a prefix."""
     points = curve(matches)
     precision, recall, f1 = at_threshold(matches, threshold)
     return {

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from perilune_shared.storage.files import written_aside
 from perilune_train.detect.evaluate.bins import BinFigures
 from perilune_train.detect.evaluate.evaluation import Evaluation
-from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
+from perilune_train.detect.evaluate.pictures import draw_bins, draw_curves, draw_frames
 from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 
@@ -79,7 +79,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         "",
     ]
     rows = [
-        [title, *(spread_cell(figures, spreads, f"{account}{key}") for account in ("", "edge/", "strict/"))]
+        [title, *(spread_cell(figures, spreads, f"{prefix}{key}") for prefix in ("", "edge/", "strict/"))]
         for key, title in _ROWS.items()
     ]
     rows += [
@@ -93,8 +93,8 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     lines += ["## Errors of detected craters", ""]
     errors = evaluation.errors
     rows = [
-        [name, *(number(errors[f"{key}_{ending}{which}"]) for ending in ("px", "relative"))]
-        for name, key, which in (
+        [name, *(number(errors[f"{key}_{ending}{statistic}"]) for ending in ("px", "relative"))]
+        for name, key, statistic in (
             ("centre, median", "centre_error", "_median"),
             ("centre, 95th percentile", "centre_error", "_p95"),
             ("radius, median", "radius_error", "_median"),

@@ -13,7 +13,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import Detections, Matches, match_split
+from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, match_split
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import protocol_of
 
@@ -28,23 +28,18 @@ WRITTEN = (
 """Files that an evaluation writes in addition to metrics.json."""
 
 
-def match_detections(split: DetectSplit, found: list[Detections], config: DetectConfig) -> Matches:
+def match_detections(split: DetectSplit, detections: list[Detections], config: DetectConfig) -> Matches:
     """Match the detections of a split to its labels."""
     height, width = split.frames.images.shape[1:]
-    return match_split(found, split.labels, (width, height), config.evaluation.match_iou, split.radius_px)
+    return match_split(detections, split.labels, (width, height), config.evaluation.match_iou, split.radius_px)
 
 
-def evaluate_split(split: DetectSplit, found: list[Detections], config: DetectConfig, threshold: float) -> Evaluation:
+def evaluate_split(
+    split: DetectSplit, detections: list[Detections], config: DetectConfig, threshold: float
+) -> Evaluation:
     """Compute all metrics of a split's detections."""
-    return evaluate_detections(
-        found,
-        split.labels,
-        facts_of(split.frames),
-        threshold,
-        radius_px=split.radius_px,
-        match_iou=config.evaluation.match_iou,
-        seed=config.seed,
-    )
+    criteria = Criteria(threshold, split.radius_px, config.evaluation.match_iou)
+    return evaluate_detections(detections, split.labels, facts_of(split.frames), criteria, config.seed)
 
 
 def selection_entries(config: DetectConfig, split: DetectSplit) -> Metrics:
@@ -85,12 +80,12 @@ def at_scales(scales: tuple[float, ...]) -> str:
     return "at scale " + " and ".join(f"{factor:g}" for factor in scales)
 
 
-def write_detections(path: Path, split: DetectSplit, found: list[Detections]) -> None:
+def write_detections(path: Path, split: DetectSplit, detections: list[Detections]) -> None:
     """Write the table frame_id, x0_px, y0_px, x1_px, y1_px, score, one row per detection."""
-    boxes = np.concatenate([part.boxes for part in found])
-    names = np.repeat(split.frames.table["frame_id"].to_numpy(), [len(part.scores) for part in found])
+    boxes = np.concatenate([part.boxes for part in detections])
+    names = np.repeat(split.frames.table["frame_id"].to_numpy(), [len(part.scores) for part in detections])
     columns = {"frame_id": pa.array(names, pa.string())}
     columns |= {name: pa.array(boxes[:, k]) for k, name in enumerate(("x0_px", "y0_px", "x1_px", "y1_px"))}
-    columns["score"] = pa.array(np.concatenate([part.scores for part in found]))
+    columns["score"] = pa.array(np.concatenate([part.scores for part in detections]))
     with written_aside(path) as aside:
         pq.write_table(pa.table(columns), aside, compression="zstd")

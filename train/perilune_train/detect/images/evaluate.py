@@ -24,7 +24,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import unknown_facts
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections
+from perilune_train.detect.evaluate.matching import FALSE, FOUND, Criteria, Detections
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import check_output, chosen_threshold
@@ -50,11 +50,11 @@ class ImageSettings:
     """How to read and evaluate labelled images."""
 
     tiling: Tiling
-    """How to cut images."""
+    """How to cut images into tiles."""
     min_size_px: float = 8.0
     """Minimum size of a crater to find, sqrt(w h), pixels."""
     threshold: float | None = None
-    """Score threshold; None for that of the run."""
+    """Score threshold; None for the threshold of the run."""
     nodata: float | None = None
     """Value of pixels without data."""
     request: Request = field(default_factory=Request)
@@ -62,7 +62,7 @@ class ImageSettings:
 
 
 class _Pictures(Sequence[NDArray[np.uint8]]):
-    """Pictures that are read when they are needed: together they may not fit into memory."""
+    """Pictures that are read when needed: all of them may not fit into memory."""
 
     def __init__(self, images: Sequence[LabelledImage], nodata: float | None):
         self._images, self._nodata, self._told = images, nodata, set[int]()
@@ -71,15 +71,15 @@ class _Pictures(Sequence[NDArray[np.uint8]]):
         return len(self._images)
 
     @overload
-    def __getitem__(self, place: int) -> NDArray[np.uint8]: ...
+    def __getitem__(self, index: int) -> NDArray[np.uint8]: ...
     @overload
-    def __getitem__(self, place: slice) -> list[NDArray[np.uint8]]: ...
-    def __getitem__(self, place: int | slice) -> NDArray[np.uint8] | list[NDArray[np.uint8]]:
-        if isinstance(place, slice):
-            return [self[k] for k in range(*place.indices(len(self)))]
-        quiet = place in self._told
-        self._told.add(place)
-        return read_grey(self._images[place].path, self._nodata, quiet)
+    def __getitem__(self, index: slice) -> list[NDArray[np.uint8]]: ...
+    def __getitem__(self, index: int | slice) -> NDArray[np.uint8] | list[NDArray[np.uint8]]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        quiet = index in self._told
+        self._told.add(index)
+        return read_grey(self._images[index].path, self._nodata, quiet)
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
         return (self[k] for k in range(len(self)))
@@ -96,18 +96,20 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
     tiling.check()
     if not 0 < min_size_px < np.inf:
         raise UserError("--min-size", "pixels", min_size_px, "above 0")
-    given = read_images(source, settings.request)
-    if not any(image.selected(min_size_px).any() for image in given.images):
+    image_set = read_images(source, settings.request)
+    if not any(image.selected(min_size_px).any() for image in image_set.images):
         raise UserError(source, "boxes", f"none of {min_size_px:g} px or more", "at least one")
     threshold_source = (
         "of the run, chosen on its validation split" if threshold is None else "given on the command line"
     )
     threshold = chosen_threshold(run) if threshold is None else threshold
-    images = _Pictures(given.images, settings.nodata)
+    images = _Pictures(image_set.images, settings.nodata)
     for _ in images:
         pass  # a damaged image is refused before hours of detection
-    found = _detect(open_detector(runs.RunFolder(run).best, config), given, images, tiling)
-    evaluation = evaluate_detections_in_images(given, found, threshold, min_size_px, config.evaluation.match_iou)
+    detections = _detect(open_detector(runs.RunFolder(run).best, config), image_set, images, tiling)
+    evaluation = evaluate_detections_in_images(
+        image_set, detections, threshold, min_size_px, config.evaluation.match_iou
+    )
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
@@ -119,14 +121,14 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
         f"oracle: with the threshold of highest F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
-    about += [for_markdown(text) for text in (given.split, given.categories) if text]
+    about += [for_markdown(text) for text in (image_set.split, image_set.categories) if text]
     write_evaluation(out, evaluation, images, about)
-    table = pd.concat(table_of(image.name, part) for image, part in zip(given.images, found, strict=True))
+    table = pd.concat(table_of(image.name, part) for image, part in zip(image_set.images, detections, strict=True))
     with written_aside(out / "detections.parquet") as aside:
         table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
-    figures: Metrics = {"images/name": source.resolve().name, "images/categories": given.categories}
-    figures |= {"images/split": given.split} | evaluation.figures()
+    figures: Metrics = {"images/name": source.resolve().name, "images/categories": image_set.categories}
+    figures |= {"images/split": image_set.split} | evaluation.figures()
     figures |= {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
     figures |= {
@@ -148,33 +150,32 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
 
 
 def evaluate_detections_in_images(
-    given: ImageSet, found: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
+    image_set: ImageSet, detections: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
-    """Evaluate the detections of all images; clips their boxes at the image's edge if those of labels are clipped."""
-    sizes = np.array([[image.width_px, image.height_px] for image in given.images])
-    if given.clipped:
+    """Evaluate the detections of all images; boxes are clipped at the image edge if the boxes of labels are clipped."""
+    sizes = np.array([[image.width_px, image.height_px] for image in image_set.images])
+    if image_set.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)
-        found = [
-            Detections(np.clip(part.boxes, 0, limit), part.scores) for part, limit in zip(found, limits, strict=True)
+        detections = [
+            Detections(np.clip(part.boxes, 0, limit), part.scores)
+            for part, limit in zip(detections, limits, strict=True)
         ]
     return evaluate_detections(
-        found,
-        [frame_labels(image, min_size_px) for image in given.images],
-        unknown_facts([image.name for image in given.images], sizes),
-        threshold,
-        radius_px=(min_size_px / 2, np.inf),
-        match_iou=match_iou,
+        detections,
+        [frame_labels(image, min_size_px) for image in image_set.images],
+        unknown_facts([image.name for image in image_set.images], sizes),
+        Criteria(threshold, (min_size_px / 2, np.inf), match_iou),
     )
 
 
-def _detect(detector: Detector, given: ImageSet, images: _Pictures, tiling: Tiling) -> list[Detections]:
-    found = []
+def _detect(detector: Detector, image_set: ImageSet, images: _Pictures, tiling: Tiling) -> list[Detections]:
+    detections = []
     with progress_bar() as progress:
-        total = sum(count_tiles(image.height_px, image.width_px, tiling) for image in given.images)
+        total = sum(count_tiles(image.height_px, image.width_px, tiling) for image in image_set.images)
         bar = progress.add_task("detect", total=total, unit="tiles", note="")
         for image in images:
-            found.append(detect_image(detector, image, tiling, lambda n: progress.advance(bar, n)))
-    return found
+            detections.append(detect_image(detector, image, tiling, lambda n: progress.advance(bar, n)))
+    return detections
 
 
 def write_crops(path: Path, images: Sequence[NDArray[np.uint8]], evaluation: Evaluation) -> None:

@@ -31,7 +31,7 @@ from perilune_train.training.runs import RunFolder
 ImageLike = str | PathLike[str] | NDArray[Any] | Image.Image
 """A file, pixels (height, width) or (height, width, 3), or a Pillow image."""
 Images = list[Any] | tuple[Any, ...]
-"""Several of these."""
+"""Several such images."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,8 +100,8 @@ class CraterDetector:
 
     def _craters(self, image: ImageLike, threshold: float) -> Craters:
         name, grey = _read(image)
-        found = above(detect_image(self._detector, grey, self._tiling), threshold)
-        return Craters(_with_ellipses(table_of(name, found), found), grey)
+        detections = above(detect_image(self._detector, grey, self._tiling), threshold)
+        return Craters(_with_ellipses(table_of(name, detections), detections), grey)
 
     def __repr__(self) -> str:
         where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"
@@ -134,12 +134,12 @@ def load_detector(run_or_file: str | PathLike[str] | None = None) -> CraterDetec
 
 
 def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
-    """The name of an image and its pixels as 8-bit grey. Raises UserError on anything that is none."""
+    """The name of an image and its pixels as 8-bit grey. Raises UserError if it is not an image."""
     if isinstance(image, str | PathLike):
         path = Path(image)
         return path.name, read_grey(path)
     if isinstance(image, Image.Image):
-        # As in a file: pixels and craters are those of the upright image.
+        # As in a file, pixels and craters refer to the upright image.
         image = ImageOps.exif_transpose(image)
         deep = image.mode.startswith(("I", "F"))
         return "image", grey_of_array(np.asarray(image if deep else image.convert("L")))
@@ -149,9 +149,9 @@ def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
     raise UserError("detector", "image", type(image).__name__, expected)
 
 
-def _with_ellipses(table: pd.DataFrame, found: Detections) -> pd.DataFrame:
-    """The table with the axis-aligned ellipses inside the boxes, by the columns and rules of labels."""
-    x0, y0, x1, y1 = found.boxes.T
+def _with_ellipses(table: pd.DataFrame, detections: Detections) -> pd.DataFrame:
+    """The table with the axis-aligned ellipses inside the boxes, in the columns of the table `labels`."""
+    x0, y0, x1, y1 = detections.boxes.T
     width, height = x1 - x0, y1 - y0
     columns = [(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(width, height) / 2, np.minimum(width, height) / 2]
     # The direction of the longer axis.

@@ -26,7 +26,8 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 _LARGEST_PRJ = 2**16
 _CORNERS = 32
 _GRID = 17
-"""Number of sample points per side, to test whether an image is on its map; a full disc's corners are not."""
+"""Number of sample points per side that test whether an image is on its map: the corners of a full disc are off the
+map."""
 _DECIMALS = 8
 """Decimals of degrees: 0.3 mm on the ground."""
 
@@ -45,7 +46,7 @@ class Georeference:
     def lon_lat_deg(self, pixels: Array) -> Array:
         """East longitude and latitude (N, 2), degrees, of pixel coordinates (N, 2); infinite off the map.
 
-        Raises UserError if the projection is not one of the Moon.
+        Raises UserError if the projection is not on the Moon.
         """
         from pyproj.exceptions import ProjError
 
@@ -68,7 +69,7 @@ def _lon_lat_from_map(projection: str) -> Any:
 def read_georeference(path: Path) -> Georeference | None:
     """Read the georeference of an image; None if its transform or projection is missing. Needs rasterio.
 
-    Raises UserError if it is not one of the Moon.
+    Raises UserError if the projection is not on the Moon.
     """
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
@@ -83,15 +84,15 @@ def read_georeference(path: Path) -> Georeference | None:
             raise UserError(beside, "georeference", error, "a projection as text (.prj)") from None
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
-    # A georeference places the stored pixels, and detections are in pixels of the upright picture.
+    # A georeference refers to the stored pixels, detections to the pixels of the upright picture.
     stored, place = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
     a, b, c, d, e, f = (place[:, :2] @ stored + place * [0, 0, 1]).ravel().tolist()
     size = picture_size(path)
-    found = Georeference((a, b, c, d, e, f), projection.to_wkt(), path)
+    reference = Georeference((a, b, c, d, e, f), projection.to_wkt(), path)
     grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in size)), axis=-1).reshape(-1, 2)
-    if not np.isfinite(found.lon_lat_deg(grid)).all(axis=1).any():
+    if not np.isfinite(reference.lon_lat_deg(grid)).all(axis=1).any():
         raise UserError(path, "projection", "none of its pixels on the map", "an image of a place on the Moon")
-    return found
+    return reference
 
 
 def _prj_text(path: Path) -> str:
@@ -104,7 +105,7 @@ def can_read_georeferences() -> bool:
     return all(importlib.util.find_spec(name) is not None for name in ("rasterio", "pyproj"))
 
 
-def features(name: str, found: Detections, reference: Georeference) -> list[dict[str, Any]]:
+def features(name: str, detections: Detections, reference: Georeference) -> list[dict[str, Any]]:
     """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
 
     Longitudes continue past 180 degrees if a polygon crosses it. A polygon around a pole is not valid in longitude and
@@ -113,37 +114,40 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
     """
     from pyproj import Geod
 
-    if not len(found.boxes):
+    if not len(detections.boxes):
         return []
-    centre, half = (found.boxes[:, :2] + found.boxes[:, 2:]) / 2, (found.boxes[:, 2:] - found.boxes[:, :2]) / 2
+    centre, half = (
+        (detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2,
+        (detections.boxes[:, 2:] - detections.boxes[:, :2]) / 2,
+    )
     angle = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     pixels = np.concatenate([centre[:, None], centre[:, None] + half[:, None] * ring], axis=1)
-    places = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
-    on_map = np.isfinite(places).all(axis=(1, 2))
-    places, centre, half, scores = places[on_map], centre[on_map], half[on_map], found.scores[on_map]
-    places[:, 1:, 0] -= 360 * np.round((places[:, 1:, 0] - places[:, :1, 0]) / 360)
+    lon_lat_deg = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    on_map = np.isfinite(lon_lat_deg).all(axis=(1, 2))
+    lon_lat_deg, centre, half, scores = lon_lat_deg[on_map], centre[on_map], half[on_map], detections.scores[on_map]
+    lon_lat_deg[:, 1:, 0] -= 360 * np.round((lon_lat_deg[:, 1:, 0] - lon_lat_deg[:, :1, 0]) / 360)
     quarter = _CORNERS // 4
     sphere = Geod(a=MOON_RADIUS_M, b=MOON_RADIUS_M)
-    ends = ((places[:, 1 + k], places[:, 1 + k + 2 * quarter]) for k in (0, quarter))
+    ends = ((lon_lat_deg[:, 1 + k], lon_lat_deg[:, 1 + k + 2 * quarter]) for k in (0, quarter))
     along, across = (sphere.inv(*start.T, *end.T)[2] for start, end in ends)
-    rows = zip(places, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
+    rows = zip(lon_lat_deg, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
     return [
         {
             "type": "Feature",
-            "geometry": {"type": "Polygon", "coordinates": [_ring(place[1:])]},
+            "geometry": {"type": "Polygon", "coordinates": [_ring(position[1:])]},
             "properties": {
                 "image": name,
                 "score": round(float(score), 6),
-                "longitude_deg": round(float(place[0, 0]), _DECIMALS),
-                "latitude_deg": round(float(place[0, 1]), _DECIMALS),
+                "longitude_deg": round(float(position[0, 0]), _DECIMALS),
+                "latitude_deg": round(float(position[0, 1]), _DECIMALS),
                 "diameter_m": round(float(diameter_m), 3),
                 "diameter_px": round(float(diameter_px), 3),
                 "centre_x_px": round(float(middle[0]), 3),
                 "centre_y_px": round(float(middle[1]), 3),
             },
         }
-        for place, diameter_m, diameter_px, score, middle in rows
+        for position, diameter_m, diameter_px, score, middle in rows
     ]
 
 

@@ -57,16 +57,16 @@ class Request:
 def read_images(source: Path, request: Request = Request()) -> ImageSet:
     """Read the labelled images of a folder or a label file. Raises UserError, naming file and line."""
     if source.is_dir():
-        found, split = _of_folder(source, request)
+        label_file, split = _of_folder(source, request)
     elif source.is_file():
-        found, split = _of_file(source, request)
+        label_file, split = _of_file(source, request)
     else:
         raise UserError(source, "--images", "no such folder", "a folder of images with labels, or a label file")
     if request.split is not None and not split:
         raise UserError("--split", "split", request.split, f"a source with splits; {source.name} has none")
     if split:
         say(f"{source.name}: {split}")
-    return replace(image_set(found, request.categories), split=split)
+    return replace(image_set(label_file, request.categories), split=split)
 
 
 def _of_file(path: Path, request: Request) -> tuple[LabelFile, str]:
@@ -102,7 +102,8 @@ def _of_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
 
 
 def _split(by_split: dict[str, Path], paths: list[Path], request: Request, source: Path) -> tuple[Path, str]:
-    """One of several splits, and a text that names it; "" if there is only one part without a split's name."""
+    """Choose one of several splits; returns its path and a text that names it, "" for a single part without a split's
+    name."""
     named = {split: path for split, path in by_split.items() if split}
     if len(paths) == 1 and not (named and request.split):
         return paths[0], ""
@@ -114,23 +115,23 @@ def _split(by_split: dict[str, Path], paths: list[Path], request: Request, sourc
 
 
 def _split_of(name: str) -> str:
-    """train, val or test for the name of a folder or the ending of a file's; "" for others."""
+    """train, val or test from the name of a folder or the ending of a file name; "" for other names."""
     return next((split for split, names in yolo.SPLIT_KEYS.items() if name.lower().rstrip("0123456789") in names), "")
 
 
 def _coco_files(folder: Path) -> list[Path]:
-    """The JSON files of a folder, or of its folder annotations, that hold COCO; not those of LabelMe."""
-    for place in (folder, folder / "annotations"):
-        paths = sorted(place.glob("*.json")) if place.is_dir() else []
-        stems = {path.stem for path in pictures_of(place)} if paths else set()
-        found = [path for path in paths if path.stem not in stems and not path.name.startswith(".")]
-        found = [path for path in found if '"shapes"' not in (head := _head(path)) and "{" in head]
-        # Beside them COCO has files of captions and key points.
-        found = [path for path in found if path.stem.startswith("instances")] or found
-        if len(found) == 1:
-            return found if is_coco(read_content(found[0])) else []
-        if found and all(_split_of(path.stem.rpartition("_")[2]) for path in found):
-            return found
+    """The JSON files of a folder, or of its folder annotations, that contain COCO annotations, not LabelMe."""
+    for parent in (folder, folder / "annotations"):
+        paths = sorted(parent.glob("*.json")) if parent.is_dir() else []
+        stems = {path.stem for path in pictures_of(parent)} if paths else set()
+        candidates = [path for path in paths if path.stem not in stems and not path.name.startswith(".")]
+        candidates = [path for path in candidates if '"shapes"' not in (head := _head(path)) and "{" in head]
+        # COCO's own downloads also contain files of captions and key points.
+        candidates = [path for path in candidates if path.stem.startswith("instances")] or candidates
+        if len(candidates) == 1:
+            return candidates if is_coco(read_content(candidates[0])) else []
+        if candidates and all(_split_of(path.stem.rpartition("_")[2]) for path in candidates):
+            return candidates
     return []
 
 
@@ -152,7 +153,7 @@ def _of_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
 
 
 def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFile:
-    """Pictures with the texts that the layout of YOLO gives them; without a text a picture has no objects."""
+    """Pictures with their YOLO label files; a picture without a file has no objects."""
     root = source.resolve().parent if source.is_file() else source.resolve()
     entries, n_absent = [], 0
     for picture in pictures:
@@ -171,35 +172,35 @@ def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFil
 
 
 def _numbers_as_names(entries: Sequence[Entry]) -> dict[str, str]:
-    return {one.category: one.category for entry in entries for one in entry.objects}
+    return {item.category: item.category for entry in entries for item in entry.objects}
 
 
 def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
-    """Images with a label file each, beside them or in another folder."""
-    own = pictures_of(folder)
+    """Images that have a label file each, next to them or in another folder."""
+    images = pictures_of(folder)
     root = folder
-    if not own:
-        places = [folder / name for name in _PICTURE_FOLDERS if (folder / name).is_dir()]
-        root = places[0] if places else folder
-        own = pictures_of(root, recursive=True) if places else []
-    if not own:
+    if not images:
+        picture_folders = [folder / name for name in _PICTURE_FOLDERS if (folder / name).is_dir()]
+        root = picture_folders[0] if picture_folders else folder
+        images = pictures_of(root, recursive=True) if picture_folders else []
+    if not images:
         raise UserError(folder, "--images", "no PNG, TIFF or JPEG", "images with labels beside them")
     labels = [root, *(folder / name for name in _LABEL_FOLDERS if (folder / name).is_dir())]
     by_suffix = {suffix: {} for suffix in _LABEL_SUFFIXES}  # type: dict[str, dict[Path, Path]]
-    for picture in own:
-        for place in labels:
+    for picture in images:
+        for label_folder in labels:
             for suffix in _LABEL_SUFFIXES:
-                path = (place / picture.relative_to(root)).with_suffix(suffix)
-                if path.is_file() and path not in own:
+                path = (label_folder / picture.relative_to(root)).with_suffix(suffix)
+                if path.is_file() and path not in images:
                     by_suffix[suffix].setdefault(picture, path)
     kinds = [suffix for suffix, files in by_suffix.items() if files]
     if not kinds:
-        missing = own[0].with_suffix(".txt")
+        missing = images[0].with_suffix(".txt")
         raise UserError(missing, "boxes", "no such file", "a file of labels for each image (.txt, .xml or .json)")
     if len(kinds) > 1:
         raise UserError(folder, "labels", f"files of {len(kinds)} kinds: {', '.join(kinds)}", "one kind")
     files = by_suffix[kinds[0]]
-    return _of_pairs(folder, root, files, len(own) - len(files)), ""
+    return _of_pairs(folder, root, files, len(images) - len(files)), ""
 
 
 def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: int) -> LabelFile:
@@ -234,7 +235,7 @@ def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: i
 
 
 def _reader_of_texts(paths: list[Path]) -> tuple[Callable[[Path, Path], list[LabelledObject]], bool]:
-    """The reader of YOLO or of tables, by the first text that is not empty, and whether boxes are clipped."""
+    """Choose the reader of YOLO or of tables by the first text that is not empty; also whether boxes are clipped."""
     first = next((text for path in paths if (text := read_text(path, "boxes")).strip()), "")
     if yolo.is_yolo(first):
         return yolo.read_yolo_text, True
@@ -247,7 +248,7 @@ def _table_objects(path: Path, picture: Path) -> list[LabelledObject]:
 
 
 def _names_beside(folder: Path) -> dict[str, str]:
-    """Names of YOLO's classes from classes.txt, as labelImg writes it; {} without one."""
+    """Names of YOLO's classes from classes.txt, as labelImg writes it; {} if there is none."""
     for path in (folder / "classes.txt", folder / "labels" / "classes.txt"):
         if path.is_file():
             lines = [line.strip() for line in read_text(path, "names").splitlines()]

@@ -1,7 +1,7 @@
-"""Orientation of a picture: the EXIF or TIFF tag 274, which says how the stored rows turn into the upright picture.
+"""Orientation of a picture: the EXIF or TIFF tag 274, which says how stored rows turn into the upright picture.
 
-One rule holds for all formats: the tag is obeyed, so pixels, labels and detections are those of the upright picture.
-Without this, a photograph that a camera or phone has marked as turned would be compared with labels drawn on what every
+All formats follow one rule: the tag is obeyed, so pixels, labels and detections refer to the upright picture. Otherwise
+a photograph that a camera marked as rotated would be compared with labels drawn on the upright picture that every
 viewer shows.
 """
 
@@ -17,18 +17,18 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 UPRIGHT = 1
 ORIENTATION_TAG = 274
 _MIRRORED, _HALF_TURNED, _TRANSPOSED = (2, 3, 6, 7), (3, 4, 7, 8), (5, 6, 7, 8)
-"""Orientations whose columns run backwards, whose rows run backwards, and whose rows become columns first."""
+"""Orientations with reversed columns, with reversed rows, and with rows and columns exchanged first."""
 _LARGEST_EXIF = 2**20
 _BIG_TIFF = (b"II\x2b\x00", b"MM\x00\x2b")
 
 
 def is_turned(orientation: int) -> bool:
-    """Whether width and height change places."""
+    """Whether the orientation exchanges width and height."""
     return orientation in _TRANSPOSED
 
 
 def upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
-    """Turn stored pixels (height, width) upright; returns the same object if they are."""
+    """Turn stored pixels (height, width) upright; returns the input if they are upright already."""
     if orientation == UPRIGHT:
         return pixels
     turned = pixels.T if is_turned(orientation) else pixels
@@ -37,7 +37,8 @@ def upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
 
 
 def stored_coordinates(orientation: int, width_px: int, height_px: int) -> NDArray[np.float64]:
-    """The matrix (2, 3) from pixel coordinates of the upright picture to stored ones, of the stored width and height.
+    """The matrix (2, 3) from pixel coordinates of the upright picture to stored ones; takes the stored width and
+    height.
 
     Coordinates begin at the outer corner of the top-left pixel.
     """
@@ -50,7 +51,7 @@ def stored_coordinates(orientation: int, width_px: int, height_px: int) -> NDArr
 def orientation_of(picture: Any, path: Path) -> int:
     """The orientation of a PNG or JPEG that Pillow has opened; 1 without a valid tag. Reads no pixels."""
     try:
-        # PngImageFile.getexif decodes the whole picture, to find an eXIf chunk after the pixels.
+        # PngImageFile.getexif would decode the whole picture to find an eXIf chunk after the pixels.
         exif = Image.Image.getexif(picture)
         if not len(exif) and picture.format == "PNG":
             exif.load(_late_exif(path))
@@ -86,7 +87,7 @@ def _valid(value: Any) -> int:
 
 
 def _late_exif(path: Path) -> bytes:
-    """The eXIf chunk of a PNG, wherever it is; empty without one."""
+    """The eXIf chunk of a PNG, at any position; empty if there is none."""
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(8)) == 8:

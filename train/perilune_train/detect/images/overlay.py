@@ -10,18 +10,18 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.records.pictures import save_image
 
 MOST_DRAWN = 1000
-"""Maximum number of craters in an overlay. Lines of more than that hide the ground."""
+"""Maximum number of craters in an overlay: more lines would hide the ground."""
 _LARGEST_PX = 4096
 _SMALLEST_PX = 1600
 _LINE_OPACITY = 0.8
-"""Lines are one pixel wide, the least that OpenCV draws; the ground shows through them."""
+"""Lines are one pixel wide, OpenCV's minimum, so that the ground shows through."""
 _DARKEST = 80
-"""First entry of the colour map that is used, of 256: the darker ones cannot be seen on grey."""
+"""First of the 256 entries of the colour map that is used: darker ones are invisible on grey."""
 _STRIP_SHARE = 0.02
 """Height of the strip below the image, as a share of the image's longer side."""
 
 
-def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections, threshold: float) -> None:
+def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, threshold: float) -> None:
     """Draw the detections as ellipses over the image; small images are enlarged, large ones reduced.
 
     Colours go from purple (the threshold) to yellow (a score of 1). At most MOST_DRAWN detections are drawn, those of
@@ -32,14 +32,14 @@ def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections, thres
     size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
-    # The strongest are drawn last, above the others.
-    drawn = np.argsort(found.scores, kind="stable")[-MOST_DRAWN:]
+    # Draw the strongest last, on top of the others.
+    drawn = np.argsort(detections.scores, kind="stable")[-MOST_DRAWN:]
     lines = canvas.copy()
-    for k, colour in zip(drawn, _colours(found.scores[drawn], threshold), strict=True):
-        draw_boxes(lines, found.boxes[k : k + 1] * factor, colour)
+    for k, colour in zip(drawn, _colours(detections.scores[drawn], threshold), strict=True):
+        draw_boxes(lines, detections.boxes[k : k + 1] * factor, colour)
     canvas = cv2.addWeighted(lines, _LINE_OPACITY, canvas, 1 - _LINE_OPACITY, 0)
-    count = f"{len(found.scores)} craters"
-    if len(drawn) < len(found.scores):
+    count = f"{len(detections.scores)} craters"
+    if len(drawn) < len(detections.scores):
         count += f", drawn: the {len(drawn)} with the highest scores"
     save_image(path, np.vstack([canvas, _strip(canvas.shape[1], max(size), threshold, count)]))
 

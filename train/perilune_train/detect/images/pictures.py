@@ -1,4 +1,4 @@
-"""The pictures of a folder, without what only looks like one."""
+"""The pictures of a folder, without files that are not pictures of their own."""
 
 from pathlib import Path
 
@@ -17,10 +17,10 @@ def is_picture(path: Path) -> bool:
 
 
 def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
-    """The pictures of a folder, sorted; a line names what is left out.
+    """The pictures of a folder, sorted; a message names the files that are left out.
 
-    Left out are hidden files (`._x.png` of macOS), masks and overlays of other pictures (`x_mask.png` beside `x.png`),
-    and the data of a detached PDS3 label, which is listed in their place. Raises UserError on a name that is not UTF-8.
+    Left out are hidden files (`._x.png` of macOS), masks and overlays of other pictures (`x_mask.png` with `x.png`),
+    and the data file of a detached PDS3 label, which is listed instead. Raises UserError on a name that is not UTF-8.
     """
     paths = sorted(path for path in (folder.rglob("*") if recursive else folder.iterdir()) if path.is_file())
     shown = [path for path in paths if not _is_hidden(path, folder)]
@@ -35,16 +35,16 @@ def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
     if masks or hidden:
         parts = [f"{hidden} hidden files"] * bool(hidden) + [f"{len(masks)} masks or overlays"] * bool(masks)
         say(f"{folder.name}: {' and '.join(parts)} are left out")
-    found = []
+    images = []
     for path in named:
         if path not in masks:
             label = labels.get(path.with_suffix("").as_posix().lower()) if path.suffix.lower() == ".img" else None
-            found.append(label or path)
-    return found
+            images.append(label or path)
+    return images
 
 
 def check_names(paths: list[Path], names: list[str]) -> None:
-    """Raise UserError if two pictures have one name, by which tables and overlays name them."""
+    """Raise UserError if two pictures have equal names: tables and overlays identify pictures by name."""
     seen: set[str] = set()
     for path, name in zip(paths, names, strict=True):
         if name in seen:
@@ -58,7 +58,7 @@ def _is_hidden(path: Path, folder: Path) -> bool:
 
 
 def _is_mask(path: Path, stems: set[str]) -> bool:
-    """Whether the name is that of another picture with an ending as `_mask`."""
+    """Whether the name is that of another picture with a suffix such as `_mask`."""
     stem = path.with_suffix("").as_posix()
     return any(
         stem.lower().endswith(f"{sign}{ending}") and stem[: -len(ending) - 1] in stems

@@ -36,9 +36,9 @@ class PredictSettings:
     """How to find craters in images."""
 
     tiling: Tiling
-    """How to cut images."""
+    """How to cut images into tiles."""
     threshold: float | None = None
-    """Minimum score; None for that of the run."""
+    """Minimum score; None for the threshold of the run."""
     min_size_px: float = 0.0
     """Minimum size of a crater, sqrt(w h), pixels."""
     nodata: float | None = None
@@ -47,7 +47,7 @@ class PredictSettings:
     """Maximum number of craters in an image, those of the highest scores; None for all."""
 
 
-def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
+def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
     """Find craters in images and folders of images; returns their number.
 
     Writes all output to the new folder `out`, or nothing. Raises UserError on the first image that cannot be read,
@@ -55,7 +55,7 @@ def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path
     """
     tiling, nodata = settings.tiling, settings.nodata
     tiling.check()
-    paths = expanded(given)
+    paths = expanded(sources)
     check_names(paths, [path.name for path in paths])
     with new_folder(out) as folder, progress_bar() as progress:
         check = progress.add_task("check", total=len(paths), unit="images", note="")
@@ -74,15 +74,15 @@ def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
-            found = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
-            found = strongest(of_size(above(found, threshold), settings.min_size_px), settings.top)
-            tables.append(table_of(path.name, found))
-            write_overlay(folder / f"{path.name}.overlay.png", image, found, threshold)
+            detections = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
+            detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
+            tables.append(table_of(path.name, detections))
+            write_overlay(folder / f"{path.name}.overlay.png", image, detections, threshold)
             if reference is not None:
-                own = features(path.name, found, reference)
-                shapes += own
-                if len(own) < len(found.boxes):
-                    left_out = len(found.boxes) - len(own)
+                located = features(path.name, detections, reference)
+                shapes += located
+                if len(located) < len(detections.boxes):
+                    left_out = len(detections.boxes) - len(located)
                     message = f"{path.name}: {left_out} craters are off the map and not in detections.geojson"
                     say(message)
         table = pd.concat(tables, ignore_index=True)
@@ -107,45 +107,45 @@ def _reference(path: Path) -> Georeference | None:
     return None
 
 
-def above(found: Detections, threshold: float) -> Detections:
+def above(detections: Detections, threshold: float) -> Detections:
     """The detections with at least this score."""
-    strong = found.scores >= threshold
-    return Detections(found.boxes[strong], found.scores[strong])
+    strong = detections.scores >= threshold
+    return Detections(detections.boxes[strong], detections.scores[strong])
 
 
-def of_size(found: Detections, min_size_px: float) -> Detections:
+def of_size(detections: Detections, min_size_px: float) -> Detections:
     """The detections of at least this size, sqrt(w h), pixels."""
-    large = np.sqrt(np.prod(found.boxes[:, 2:] - found.boxes[:, :2], axis=1)) >= min_size_px
-    return Detections(found.boxes[large], found.scores[large])
+    large = np.sqrt(np.prod(detections.boxes[:, 2:] - detections.boxes[:, :2], axis=1)) >= min_size_px
+    return Detections(detections.boxes[large], detections.scores[large])
 
 
-def strongest(found: Detections, top: int | None) -> Detections:
-    """The `top` detections of the highest scores, in their order; all if None."""
-    if top is None or len(found.scores) <= top:
-        return found
-    best = np.sort(np.argsort(-found.scores, kind="stable")[:top])
-    return Detections(found.boxes[best], found.scores[best])
+def strongest(detections: Detections, top: int | None) -> Detections:
+    """The `top` detections with the highest scores, in their order; all if None."""
+    if top is None or len(detections.scores) <= top:
+        return detections
+    best = np.sort(np.argsort(-detections.scores, kind="stable")[:top])
+    return Detections(detections.boxes[best], detections.scores[best])
 
 
-def expanded(given: list[Path]) -> list[Path]:
-    """The images that are given, and those of given folders. Raises UserError on a folder without images."""
+def expanded(sources: list[Path]) -> list[Path]:
+    """The given images and the images of given folders. Raises UserError on a folder without images."""
     paths = []
-    for path in given:
+    for path in sources:
         if not path.is_dir():
             paths.append(path)
             continue
-        own = pictures_of(path)
-        if not own:
+        images = pictures_of(path)
+        if not images:
             raise UserError(path, "images", "a folder without images", "PNG, TIFF, JPEG or others, not in its folders")
-        paths += own
+        paths += images
     return paths
 
 
-def table_of(name: str, found: Detections) -> pd.DataFrame:
+def table_of(name: str, detections: Detections) -> pd.DataFrame:
     """Detections as rows: image, box, centre and radius in pixels (sqrt(w h) / 2), score."""
-    x0, y0, x1, y1 = found.boxes.T
+    x0, y0, x1, y1 = detections.boxes.T
     columns: dict[str, Any] = {
-        "image": pd.Series([name] * len(found.scores), dtype="str"),
+        "image": pd.Series([name] * len(detections.scores), dtype="str"),
         "x0_px": x0,
         "y0_px": y0,
         "x1_px": x1,
@@ -153,6 +153,6 @@ def table_of(name: str, found: Detections) -> pd.DataFrame:
         "centre_x_px": (x0 + x1) / 2,
         "centre_y_px": (y0 + y1) / 2,
         "radius_px": np.sqrt((x1 - x0) * (y1 - y0)) / 2,
-        "score": found.scores,
+        "score": detections.scores,
     }
     return pd.DataFrame(columns)

@@ -38,7 +38,7 @@ LARGEST_PIXELS = 2**29
 """Largest number of pixels of an image: twice a whole Narrow Angle Camera image. The header of a small file can state
 any size."""
 LARGEST_DECODED = 2**30
-"""Largest number of bytes of a picture that is decoded as a whole, which is all that rasterio does not read."""
+"""Largest size, bytes, of a picture that is decoded as a whole; only rasterio reads larger ones."""
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _BITS_TAG, _PHOTOMETRIC_TAG, _SAMPLE_FORMAT_TAG, _NODATA_TAG = 258, 262, 339, 42113
 _WHITE_IS_ZERO, _SIGNED = 0, 2
@@ -53,8 +53,6 @@ class _Picture:
 
     path: Path
     """The file."""
-    kind: str
-    """PNG, TIFF, JPEG or the name of a raster's format."""
     width_px: int
     """Width as decoded, pixels."""
     height_px: int
@@ -62,13 +60,13 @@ class _Picture:
     orientation: int
     """See orientation.py."""
     is_upright: bool
-    """Whether the decoder turns the pixels, as Pillow does those of TIFF."""
+    """Whether the decoder turns the pixels upright, as Pillow does for TIFF."""
     white_is_zero: bool
     """Whether larger values are darker, and the decoder has not inverted them."""
     nodata: float | None
-    """The value that the file gives to pixels without data."""
+    """The value of pixels without data, as the file states it."""
     strips: Callable[[], Iterator[NDArray]]
-    """Reads the bands (1 or 3, rows, width) from top to bottom; uint8 is grey as it is."""
+    """Reads the bands (1 or 3, rows, width) from top to bottom; uint8 is used unchanged."""
 
     def size_px(self, upright: bool) -> tuple[int, int]:
         """Width and height, pixels, of the upright or the stored picture."""
@@ -77,15 +75,10 @@ class _Picture:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of the upright picture, pixels, from the header. Raises UserError if it is none or too large."""
+    """Width and height of the upright picture, pixels, from the header. Raises UserError if it is not a picture or too
+    large."""
     with _opened(path) as picture:
         return picture.size_px(upright=True)
-
-
-def picture_format(path: Path) -> str:
-    """PNG, TIFF, JPEG or another format, by content. Raises UserError if it is none of these."""
-    with _opened(path) as picture:
-        return picture.kind
 
 
 def stored_from_upright(path: Path) -> NDArray[np.float64]:
@@ -193,7 +186,7 @@ def _luma(bands: NDArray) -> NDArray:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Picture]:
-    """Open a picture by its content. Raises UserError on other files, and on damage in the block too."""
+    """Open a picture by its content. Raises UserError on other files, and on damage that is found within the block."""
     driver = raster_files(path, PICTURE_DRIVERS, "image").driver
     by_pillow = driver in ("GTiff", "PNG", "JPEG")
     has_rasterio = importlib.util.find_spec("rasterio") is not None
@@ -215,12 +208,13 @@ def _opened(path: Path) -> Iterator[_Picture]:
 
 
 def _pillow_image(path: Path, stack: contextlib.ExitStack) -> Any:
-    """An image opened by Pillow; None if it is of a kind that Pillow does not decode."""
+    """An image opened by Pillow; None if Pillow does not decode its kind."""
     stack.enter_context(warnings.catch_warnings())
-    # Serious errors raise an exception; warnings are about metadata only.
+    # Serious errors raise an exception; warnings concern metadata only.
     warnings.simplefilter("ignore")
     Image.MAX_IMAGE_PIXELS = None
-    # From a file object: Pillow would map an uncompressed TIFF of a given name, and a turned one wrongly.
+    # Open from a file object: Pillow would memory-map an uncompressed TIFF given by name, and read a rotated one
+    # wrongly.
     file = stack.enter_context(path.open("rb"))
     try:
         return stack.enter_context(Image.open(file, formats=_FORMATS))
@@ -229,13 +223,13 @@ def _pillow_image(path: Path, stack: contextlib.ExitStack) -> Any:
 
 
 def _bits(tags: dict[int, Any]) -> tuple[int, ...]:
-    found = tags.get(_BITS_TAG, (1,))
-    found = found if isinstance(found, tuple) else (found,)
-    return tuple(value for value in found if isinstance(value, int)) or (1,)
+    bits = tags.get(_BITS_TAG, (1,))
+    bits = bits if isinstance(bits, tuple) else (bits,)
+    return tuple(value for value in bits if isinstance(value, int)) or (1,)
 
 
 def _is_deep_or_signed(tags: dict[int, Any]) -> bool:
-    """Whether a TIFF has more than 8 bits, or signed numbers: of these Pillow reads only some."""
+    """Whether a TIFF has more than 8 bits, or signed numbers: Pillow reads only some of these."""
     kinds = tags.get(_SAMPLE_FORMAT_TAG, (1,))
     return max(_bits(tags)) > 8 or _SIGNED in (kinds if isinstance(kinds, tuple) else (kinds,))
 
@@ -273,12 +267,12 @@ def _by_pillow(path: Path, opened: Any, tags: dict[int, Any]) -> _Picture:
     inverted = deep_tiff and tags.get(_PHOTOMETRIC_TAG) == _WHITE_IS_ZERO
     # Pillow gives the upright size of a TIFF, and turns its pixels when it loads them.
     size = opened.width, opened.height
-    return _Picture(path, kind, *size, orientation, kind == "TIFF", inverted, _nodata(tags), strips)
+    return _Picture(path, *size, orientation, kind == "TIFF", inverted, _nodata(tags), strips)
 
 
 def _deep_colours(path: Path) -> NDArray:
     """16-bit colours (height, width, 3 or 4), blue first, as OpenCV reads them."""
-    # Pillow has loaded the file before: it raises an error on damage, OpenCV only prints to standard error.
+    # Pillow has loaded the file before: it raises an error on damage, whereas OpenCV only prints to standard error.
     deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
         raise ValueError("16-bit colours that cannot be decoded")
@@ -292,28 +286,27 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
     from rasterio.windows import Window
 
     files = raster_files(path, PICTURE_DRIVERS, "image")
-    # GDAL's cache is by default 5 % of the machine's memory.
+    # By default GDAL's cache takes 5 % of the machine's memory.
     with rasterio.Env(GDAL_CACHEMAX=_CACHE_MB), opened_raster(files, "image") as raster:
         colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
         kinds = list(raster.colorinterp)
-        found = all(colour in kinds for colour in colours)
-        indexes = [kinds.index(colour) + 1 for colour in colours] if found else [1]
+        is_colour = all(colour in kinds for colour in colours)
+        indexes = [kinds.index(colour) + 1 for colour in colours] if is_colour else [1]
         width, height = raster.width, raster.height
-        # OpenJPEG decodes whole tiles, of which there may be one, to 4 bytes.
+        # OpenJPEG decodes whole tiles, of which there may be only one, at 4 bytes per pixel.
         _check_size(path, width, height, 4 if driver == "JP2OpenJPEG" else 1)
         block_rows = raster.block_shapes[0][0]
-        some = max(_STRIP_PIXELS // width, 1)
-        rows = max(some // block_rows, 1) * block_rows
+        n_rows = max(_STRIP_PIXELS // width, 1)
+        rows = max(n_rows // block_rows, 1) * block_rows
 
         def strips() -> Iterator[NDArray]:
             for top in range(0, height, rows):
                 bands = raster.read(indexes, window=Window(0, top, width, min(rows, height - top)))
-                for start in range(0, bands.shape[1], some):
-                    yield bands[:, start : start + some]
+                for start in range(0, bands.shape[1], n_rows):
+                    yield bands[:, start : start + n_rows]
 
         yield _Picture(
             path,
-            _KINDS.get(driver, driver),
             width,
             height,
             tiff_orientation(tags),
@@ -331,7 +324,7 @@ def _check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> No
 
 
 def _nodata(tags: dict[int, Any]) -> float | None:
-    """The value that GDAL's tag of a TIFF gives to pixels without data."""
+    """The no-data value in GDAL's tag of a TIFF."""
     try:
         return float(str(tags.get(_NODATA_TAG)).strip("\0 "))
     except ValueError:

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 PERCENT = (0.05, 99.95)
-"""99.9 % of the values are within 0..255."""
+"""The percentiles between which 99.9 % of the values lie."""
 SAMPLE = 1_000_000
 LARGEST_VALUE = 1e30
-"""Larger values are no measurements: ISIS marks missing data by values near the end of float32's range."""
+"""Larger values are not measurements: ISIS marks missing data by values near the end of float32's range."""
 _FILL_SHARE = PERCENT[0] / 100
-"""A fill value of a smaller share does not reach the stretch."""
+"""A fill value with a smaller share does not affect the stretch."""
 _MOST_FILLS = 8
 
 
@@ -40,17 +40,17 @@ class Stretch:
 def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
     """The stretch of a sample of finite values.
 
-    A few values at an end of the range that many pixels share and that are far from all others (-9999, 65535, the
-    special pixels of ISIS) are taken as missing data where the file declares none: as measurements they would leave no
+    Up to a few values at an end of the range that many pixels share, and that are far from all others (-9999, 65535,
+    the special pixels of ISIS), count as missing data if the file declares none: as measurements they would leave no
     range for the ground.
     """
     fills: list[float] = []
     rest = sample
     if find_fills:
-        # Fill at one end can hide that at the other, so the first end is looked at twice.
+        # Fill values at one end can hide those at the other, so the first end is checked twice.
         for sign in (1, -1, 1):
-            own = _isolated_end(sign * rest, len(sample))
-            fills += [sign * value for value in own]
+            end = _isolated_end(sign * rest, len(sample))
+            fills += [sign * value for value in end]
             rest = rest[~np.isin(rest, fills)]
     low, high = np.percentile(rest, PERCENT) if len(rest) else (0.0, 1.0)
     share = 1 - len(rest) / max(len(sample), 1)
@@ -58,14 +58,15 @@ def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
 
 
 def _isolated_end(values: NDArray, n_all: int) -> list[float]:
-    """The least values, at most _MOST_FILLS, if many share them and the others are farther away than their range."""
+    """The smallest values, at most _MOST_FILLS, if many pixels share them and the others are farther away than their
+    range."""
     distinct, counts = np.unique(values, return_counts=True)
     for n_fills in range(min(_MOST_FILLS, len(distinct) - 2), 0, -1):
         if counts[:n_fills].sum() < max(_FILL_SHARE * n_all, 2):
             break
         rest = values[values >= distinct[n_fills]]
         low, high = np.percentile(rest, PERCENT)
-        # With a range of 0, one other value would make all others missing.
+        # With a range of 0, a single other value would make all others missing.
         if high > low and float(distinct[n_fills]) - float(distinct[n_fills - 1]) > high - low:
             return [float(value) for value in distinct[:n_fills]]
     return []

@@ -39,9 +39,9 @@ class Detector:
     @torch.no_grad()
     def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
         """Boxes (N, K, 4) in pixels and scores (N, K) of all predictors, for images (N, height, width)."""
-        given = network_input(normalised(images), self.config.in_channels).to(self.device)
+        inputs = network_input(normalised(images), self.config.in_channels).to(self.device)
         with self.threads, torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
-            return self.network.detect(given)
+            return self.network.detect(inputs)
 
 
 def load_detector(path: Path) -> YOLOv3:
@@ -54,7 +54,7 @@ def load_detector(path: Path) -> YOLOv3:
 
 
 def check_detector(content: Mapping[str, Any], path: Path) -> None:
-    """Raise UserError unless the content of a checkpoint is a detector's; builds nothing that takes memory."""
+    """Raise UserError unless a checkpoint contains a detector; builds nothing that takes memory."""
     architecture = content["architecture"]
     if set(architecture) != set(DetectorArchitecture.model_fields):
         raise UserError(path, "architecture", sorted(map(str, architecture)), "a detect run's checkpoint")

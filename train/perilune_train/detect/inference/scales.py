@@ -17,32 +17,32 @@ from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
 _REACH = 4
-"""Pixels beyond a slice that its cubic interpolation needs."""
+"""Number of pixels beyond a slice that cubic interpolation needs."""
 
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Resize an image (height, width); returns the same object if the size is the same."""
+    """Resize an image (height, width); returns the input if it has this size."""
     if image.shape == (height_px, width_px):
         return image
-    # When shrinking, area averaging avoids aliased noise, which looks like craters.
+    # Area averaging, when shrinking, avoids aliased noise, which looks like craters.
     how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
 
 
 class Enlarged:
-    """An image (height, width) as if enlarged, of which only the pixels of a slice are computed.
+    """An image (height, width) as if enlarged; only the pixels of a slice are computed.
 
-    For images that do not fit into memory when they are enlarged. Values differ from those of `resized` by rounding,
-    since OpenCV interpolates here at 32 places between two pixels.
+    For images that do not fit into memory when enlarged. Values differ from those of `resized` by rounding, since
+    OpenCV interpolates here at 32 positions between two pixels.
     """
 
     def __init__(self, image: NDArray[np.uint8], width_px: int, height_px: int):
         self._image, self.shape = image, (height_px, width_px)
         self._ratio = image.shape[0] / height_px, image.shape[1] / width_px
 
-    def __getitem__(self, place: tuple[slice, slice]) -> NDArray[np.uint8]:
+    def __getitem__(self, slices: tuple[slice, slice]) -> NDArray[np.uint8]:
         starts, sizes, lows, parts = [], [], [], []
-        for part, length, ratio, side in zip(place, self.shape, self._ratio, self._image.shape, strict=True):
+        for part, length, ratio, side in zip(slices, self.shape, self._ratio, self._image.shape, strict=True):
             start, stop, _ = part.indices(length)
             low, high = (int(np.floor(edge * ratio)) + more for edge, more in ((start, -_REACH), (stop, _REACH + 1)))
             starts.append((start + 0.5) * ratio - 0.5 - max(low, 0))
@@ -50,14 +50,14 @@ class Enlarged:
             lows.append(max(low, 0))
             parts.append(slice(max(low, 0), min(high, side)))
         matrix = np.array([[self._ratio[1], 0, starts[1]], [0, self._ratio[0], starts[0]]])
-        own = np.ascontiguousarray(self._image[parts[0], parts[1]])
+        source = np.ascontiguousarray(self._image[parts[0], parts[1]])
         how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        window = cv2.warpAffine(own, matrix, (sizes[1], sizes[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)
+        window = cv2.warpAffine(source, matrix, (sizes[1], sizes[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(window, np.uint8)
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:
-    """Height and width, pixels, that the network accepts and that are nearest to `factor` times those of a frame."""
+    """Height and width, pixels, that the network accepts, nearest to `factor` times those of a frame."""
     if factor == 1:
         return height_px, width_px
     height, width = (max(1, round(side * factor / COARSEST_STRIDE)) for side in (height_px, width_px))
@@ -79,10 +79,10 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
     boxes, scores = [], []
     for factor in detector.config.evaluation.scales:
         to_height, to_width = scaled_size(height, width, factor)
-        found = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
+        predicted = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
         ratio = torch.tensor([to_width / width, to_height / height] * 2, device=detector.device)
-        boxes.append(found[0] / ratio)
-        scores.append(found[1])
+        boxes.append(predicted[0] / ratio)
+        scores.append(predicted[1])
     return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation)
 
 
@@ -91,10 +91,10 @@ def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[lis
     with progress_bar() as progress:
         bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
         started = time.perf_counter()
-        found: list[Detections] = []
+        detections: list[Detections] = []
         batch_size = detector.config.batch_size
         for start in range(0, len(split), batch_size):
             frames = split.frames.images[start : start + batch_size]
-            found += detect_at_scales(detector, frames)
+            detections += detect_at_scales(detector, frames)
             progress.advance(bar, len(frames))
-        return found, len(split) / (time.perf_counter() - started)
+        return detections, len(split) / (time.perf_counter() - started)

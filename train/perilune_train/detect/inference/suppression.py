@@ -27,17 +27,17 @@ def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -
     kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
     # One transfer for the whole batch.
     found_boxes, found_scores, kept = (part.cpu() for part in (boxes, scores, kept))
-    found = []
-    for some_boxes, some_scores, chosen in zip(found_boxes, found_scores, kept, strict=True):
+    detections = []
+    for frame_boxes, frame_scores, chosen in zip(found_boxes, found_scores, kept, strict=True):
         best = chosen[chosen >= 0][: settings.max_detections]
-        found.append(Detections(some_boxes[best].double().numpy(), some_scores[best].double().numpy()))
-    return found
+        detections.append(Detections(frame_boxes[best].double().numpy(), frame_scores[best].double().numpy()))
+    return detections
 
 
 def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: EvaluationSettings) -> Detections:
-    some_boxes, some_scores = boxes[strong].double().numpy(), scores[strong].double().numpy()
-    kept = suppress(some_boxes, some_scores, settings.nms_iou, settings.max_detections)
-    return Detections(some_boxes[kept], some_scores[kept])
+    strong_boxes, strong_scores = boxes[strong].double().numpy(), scores[strong].double().numpy()
+    kept = suppress(strong_boxes, strong_scores, settings.nms_iou, settings.max_detections)
+    return Detections(strong_boxes[kept], strong_scores[kept])
 
 
 @torch.no_grad()
@@ -61,11 +61,11 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
     corners = torch.cat([corners[..., :2], corners[..., :2] + (corners[..., 2:] - corners[..., :2])], dim=-1)
     kept = []
     while candidates.shape[1]:
-        block, own = corners[:, :_BLOCK], candidates[:, :_BLOCK]
+        block, allowed_here = corners[:, :_BLOCK], candidates[:, :_BLOCK]
         overlapped = (_overlap(block, block) > threshold_iou).triu(1)
-        chosen = own
+        chosen = allowed_here
         while True:
-            updated = own & ~(overlapped & chosen[:, :, None]).any(1)
+            updated = allowed_here & ~(overlapped & chosen[:, :, None]).any(1)
             if torch.equal(updated, chosen):
                 break
             chosen = updated

@@ -30,7 +30,7 @@ tolerance both could drop it."""
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
-    """Tile starts along a side: evenly spaced, the first at 0, the last tile ending at the side's end."""
+    """Starts of the tiles along a side: evenly spaced, the first at 0, the last tile ending at the end of the side."""
     if length_px <= tile_px:
         return np.zeros(1, np.intp)
     count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
@@ -40,7 +40,7 @@ def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.int
 def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
     """Pad an image at right and bottom with reflected pixels.
 
-    Only sides that are shorter than a tile and no multiple of 32 are padded.
+    Only sides that are shorter than a tile and not a multiple of 32 are padded.
     """
     more = [max(0, min(tile_px, -(-side // COARSEST_STRIDE) * COARSEST_STRIDE) - side) for side in image.shape]
     return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
@@ -69,13 +69,13 @@ def detect_image(
         large = scale > 1 and size[0] * size[1] > _MOST_ENLARGED_PIXELS and min(size) >= tiling.tile_px
         scaled = Enlarged(image, *size) if large else resized(image, *size)
         whole = scaled if isinstance(scaled, Enlarged) else padded(scaled, tiling.tile_px)
-        for found in _detect_tiles(detector, whole, tiling, advance):
-            own = np.ones(len(found.scores), bool)
+        for detections in _detect_tiles(detector, whole, tiling, advance):
+            inside = np.ones(len(detections.scores), bool)
             if whole.shape != scaled.shape:
                 # Drop craters in the reflected padding.
-                own = ((found.boxes[:, :2] + found.boxes[:, 2:]) / 2 < size).all(axis=1)
-            boxes.append(found.boxes[own] / np.tile([size[0] / width, size[1] / height], 2))
-            scores.append(found.scores[own])
+                inside = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2 < size).all(axis=1)
+            boxes.append(detections.boxes[inside] / np.tile([size[0] / width, size[1] / height], 2))
+            scores.append(detections.scores[inside])
     all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
     kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
     margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
@@ -107,25 +107,25 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 def _detect_tiles(
     detector: Detector, image: NDArray[np.uint8] | Enlarged, tiling: Tiling, advance: Callable[[int], object]
 ) -> Iterator[Detections]:
-    """Detections of each tile of an image, in pixels of the image, without boxes that another tile keeps."""
+    """Detections of each tile, in pixels of the whole image, without boxes that another tile keeps."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
-    places = [(int(top), int(left)) for top in tops for left in lefts]
+    corners = [(int(top), int(left)) for top in tops for left in lefts]
     tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)
-    for first in range(0, len(places), detector.config.batch_size):
-        batch = places[first : first + detector.config.batch_size]
+    for first in range(0, len(corners), detector.config.batch_size):
+        batch = corners[first : first + detector.config.batch_size]
         tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
         predictions = detections_of(*detector.predict(tiles), detector.config.evaluation)
-        for place, found in zip(batch, predictions, strict=True):
-            boxes = found.boxes + np.tile(place[::-1], 2)
+        for corner, detections in zip(batch, predictions, strict=True):
+            boxes = detections.boxes + np.tile(corner[::-1], 2)
             clear = [
                 _clearance(boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
                 for axis, starts, length in ((0, lefts, tile_w), (1, tops, tile_h))
             ]
-            column, row = int(np.searchsorted(lefts, place[1])), int(np.searchsorted(tops, place[0]))
-            own = np.minimum(clear[0][:, column], clear[1][:, row])
+            column, row = int(np.searchsorted(lefts, corner[1])), int(np.searchsorted(tops, corner[0]))
+            clearance = np.minimum(clear[0][:, column], clear[1][:, row])
             best = np.minimum(clear[0].max(axis=1), clear[1].max(axis=1))
-            kept = own >= best - _TOLERANCE_PX
-            yield Detections(boxes[kept], found.scores[kept])
+            kept = clearance >= best - _TOLERANCE_PX
+            yield Detections(boxes[kept], detections.scores[kept])
         advance(len(batch))
 
 

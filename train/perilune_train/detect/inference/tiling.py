@@ -11,18 +11,18 @@ class Tiling:
     """How to cut an image into tiles, and the margin of the boxes."""
 
     tile_px: int = 256
-    """Side of a tile, pixels: that of the training frames."""
+    """Side of a tile, pixels; by default the side of the training frames."""
     overlap_px: int = 64
     """Minimum overlap of two neighbouring tiles, pixels: craters up to this size are whole in at least one tile."""
     scales: tuple[float, ...] = (1.0,)
     """Factors by which the image is resized before it is cut; detections at all scales are merged. Above 1 for smaller
     craters than those trained on, below 1 for larger ones."""
     box_margin_px: float = 0.0
-    """Margin added to the found boxes at every side, pixels. Our boxes end at the crest of the rim, with subpixel
+    """Margin added to the detected boxes at every side, pixels. Our boxes end at the crest of the rim, with subpixel
     accuracy; the smallest box of whole pixels around a crater is on average half a pixel larger at every side."""
 
     def check(self) -> None:
-        """Raise UserError on values that cannot be used."""
+        """Raise UserError on unusable values."""
         if self.tile_px < COARSEST_STRIDE or self.tile_px % COARSEST_STRIDE:
             raise UserError("--tile", "pixels", self.tile_px, f"a multiple of {COARSEST_STRIDE}")
         if not 0 <= self.overlap_px < self.tile_px:

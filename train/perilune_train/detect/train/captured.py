@@ -1,7 +1,7 @@
-"""Training steps as a CUDA graph: one launch in place of thousands.
+"""Training steps as a CUDA graph: one launch instead of thousands.
 
-Forward and backward pass of Darknet53 with 23 attention modules are some 2,700 operations. A GPU ends each sooner than
-a process can start the next, so that it idles for most of a step. A captured step is started as a whole.
+Forward and backward pass of Darknet53 with 23 attention modules are some 2,700 operations. A GPU finishes each one
+sooner than a process can start the next, so it idles for most of a step. A captured step is started as a whole.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,11 @@ _WARM_UP = 3
 
 
 class CapturedStep:
-    """A training step over a batch of constant size; the first steps run one operation at a time.
+    """A training step over a batch of constant size.
 
     `step` maps the numbers of the frames of a batch (B,), on the device, to losses; it computes gradients and updates
-    weights. It must not depend on values, shapes included, and must use the same tensors in every call. On a CPU every
-    step runs one operation at a time.
+    weights. It must not depend on values, including shapes, and must use the same tensors in every call. The first
+    steps run one operation at a time; on a CPU, all steps do.
     """
 
     def __init__(self, step: Callable[[Tensor], Losses], batch_size: int, device: torch.device):
@@ -47,7 +47,7 @@ class CapturedStep:
         return self.losses
 
     def _aside(self, run: Callable[[], Losses]) -> Losses:
-        """Run on a stream of its own, as a capture does."""
+        """Run on a separate stream, as a capture does."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

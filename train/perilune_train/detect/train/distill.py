@@ -42,8 +42,8 @@ def distill_loss(
         target = target.detach().float()
         score = target[..., 4].sigmoid()
         weight = torch.where(score >= _MIN_TEACHER_SCORE, score, 0.0)
-        own, expected = (decode_grid(part.float(), own_anchors, stride) for part in (raw, target))
-        losses = ciou_loss(own.flatten(0, 3), expected.flatten(0, 3), "standard")
+        predicted, expected = (decode_grid(part.float(), own_anchors, stride) for part in (raw, target))
+        losses = ciou_loss(predicted.flatten(0, 3), expected.flatten(0, 3), "standard")
         box = box + (weight.flatten() * losses).sum()
         weights = weights + weight.sum()
         # Cross-entropy minus the teacher's own entropy.

@@ -9,9 +9,10 @@ from perilune_train.detect.data.assign import Targets
 GUIDED = ("B_11", "B_22", "B_38")
 """The last gates of the stages of stride 2, 4 and 8."""
 _REACHES, _LEVELS = (1.0, 1.1, 1.2, 1.3, 1.4), (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
-"""Outer radii of crater and rings, divided by the crater's, and 1 - G of the paper's mask G inside each and beyond."""
+"""Outer radii of crater and rings, divided by the crater's radius, and 1 - G of the paper's mask G inside each and
+beyond."""
 _WINDOWS = (4.0, 16.0)
-"""Largest reaches, pixels of the map, of the craters that are painted together."""
+"""Largest radii, pixels of the map, of craters that are painted together."""
 _TINY = 1e-6
 
 
@@ -20,28 +21,28 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
     """1 - G (frames, 1, height, width): 1 in craters, steps down to 0.2 in rings around them, 0 elsewhere.
 
     Craters are ellipses in the boxes, pixels, of all labels that predictors of any scale learn. A pixel of the map is
-    `stride` pixels wide; the value is that at its middle.
+    `stride` pixels wide; values are taken at pixel centres.
     """
-    boxes = torch.cat([found.boxes for found in targets]).float()
-    frame = torch.cat([found.places[0] for found in targets])
+    boxes = torch.cat([painted.boxes for painted in targets]).float()
+    frame = torch.cat([painted.predictors[0] for painted in targets])
     # Several predictors learn a label.
     rows = torch.unique(torch.cat([frame[:, None].float(), boxes], 1), dim=0)
     rows = torch.cat([rows[:, :1], rows[:, 1:] / stride], 1)
-    found = torch.zeros(frames, height, width, device=boxes.device)
+    painted = torch.zeros(frames, height, width, device=boxes.device)
     reach = (rows[:, 3:] - rows[:, 1:3]).amax(1) / 2 * _REACHES[-1]
-    # Most craters are small, so windows save nearly all of the work; a training step waits for it.
+    # Most craters are small, so small windows save nearly all of the work; a training step waits for it.
     smaller = torch.zeros_like(reach, dtype=torch.bool)
     for largest in (*_WINDOWS, float("inf")):
-        own = (reach <= largest) & ~smaller
-        if own.any():
-            _paint(found, rows[own], int(2 * float(reach[own].max())) + 2)
-        smaller |= own
-    return found[:, None]
+        fitting = (reach <= largest) & ~smaller
+        if fitting.any():
+            _paint(painted, rows[fitting], int(2 * float(reach[fitting].max())) + 2)
+        smaller |= fitting
+    return painted[:, None]
 
 
-def _paint(found: Tensor, rows: Tensor, side: int) -> None:
-    """Paint craters (N, 5), frame and box in pixels of the map, into `found`, each in a window of `side` pixels."""
-    _, height, width = found.shape
+def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
+    """Paint craters (N, 5), frame and box in pixels of the map, into `painted`, each in a window of `side` pixels."""
+    _, height, width = painted.shape
     centre, half = (rows[:, 1:3] + rows[:, 3:]) / 2, ((rows[:, 3:] - rows[:, 1:3]) / 2).clamp(min=_TINY)
     first = (centre - side / 2).ceil().long()
     steps = torch.arange(side, device=rows.device)
@@ -50,9 +51,9 @@ def _paint(found: Tensor, rows: Tensor, side: int) -> None:
     y = ((v + 0.5 - centre[:, 1:]) / half[:, 1:]).square()
     edges, levels = torch.tensor(_REACHES, device=rows.device).square(), torch.tensor(_LEVELS, device=rows.device)
     value = levels[torch.bucketize(x[:, None, :] + y[:, :, None], edges)]
-    place = (rows[:, :1].long() * height + v)[:, :, None] * width + u[:, None, :]
+    pixel = (rows[:, :1].long() * height + v)[:, :, None] * width + u[:, None, :]
     inside = ((v >= 0) & (v < height))[:, :, None] & ((u >= 0) & (u < width))[:, None, :]
-    found.view(-1).scatter_reduce_(0, place[inside], value[inside], "amax")
+    painted.view(-1).scatter_reduce_(0, pixel[inside], value[inside], "amax")
 
 
 def guide_loss(masks: dict[str, Tensor], targets: Targets, size_px: tuple[int, int]) -> Tensor:
@@ -65,8 +66,8 @@ def guide_loss(masks: dict[str, Tensor], targets: Targets, size_px: tuple[int, i
     losses = []
     for gate in GUIDED:
         mask = masks[gate].float().flatten(1)
-        own = F.adaptive_avg_pool2d(target, (masks[gate].shape[2], masks[gate].shape[3])).flatten(1)
-        mask, own = mask - mask.mean(1, keepdim=True), own - own.mean(1, keepdim=True)
-        lengths = (mask.square().sum(1) * own.square().sum(1) + _TINY).sqrt()
-        losses.append((1 - (mask * own).sum(1) / lengths).mean())
+        pooled = F.adaptive_avg_pool2d(target, (masks[gate].shape[2], masks[gate].shape[3])).flatten(1)
+        mask, pooled = mask - mask.mean(1, keepdim=True), pooled - pooled.mean(1, keepdim=True)
+        lengths = (mask.square().sum(1) * pooled.square().sum(1) + _TINY).sqrt()
+        losses.append((1 - (mask * pooled).sum(1) / lengths).mean())
     return torch.stack(losses).mean()

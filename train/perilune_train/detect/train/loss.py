@@ -1,4 +1,10 @@
-"""Complete IoU with the paper's circular prior, and the detection loss."""
+"""Complete IoU with the paper's circular prior, and the detection loss.
+
+For each scale, `detection_loss` gathers the positive predictors, decodes their boxes, and computes:
+
+L_ciou   the complete IoU loss of these boxes with their labels
+L_obj    the binary cross-entropy of the objectness of positive and negative predictors; ignored ones do not count
+"""
 
 import math
 from typing import Literal
@@ -8,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.data.assign import Targets, flat_places
+from perilune_train.detect.data.assign import Targets, flat_predictors
 from perilune_train.models.boxes import iou
 from perilune_train.models.yolo import decode
 
@@ -26,9 +32,9 @@ def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "sta
     size = (predicted[:, 2:] - predicted[:, :2]).clamp(min=0)
     size_label = (label[:, 2:] - label[:, :2]).clamp(min=0)
     overlap = iou(predicted, label)
-    around = torch.maximum(predicted[:, 2:], label[:, 2:]) - torch.minimum(predicted[:, :2], label[:, :2])
+    enclosing = torch.maximum(predicted[:, 2:], label[:, 2:]) - torch.minimum(predicted[:, :2], label[:, :2])
     shift = (predicted[:, :2] + predicted[:, 2:] - label[:, :2] - label[:, 2:]) / 2
-    distance = shift.square().sum(1) / (around.square().sum(1) + _TINY)
+    distance = shift.square().sum(1) / (enclosing.square().sum(1) + _TINY)
     angle = torch.atan2(size[:, 0] + _TINY, size[:, 1] + _TINY)
     if aspect == "circular":
         angle_label = torch.full_like(angle, math.pi / 4)
@@ -61,23 +67,23 @@ def detection_loss(
     """
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
     total = sum(1 / stride for stride in strides)
-    for raw, own_anchors, stride, found in zip(outputs, anchors, strides, targets, strict=True):
-        _, anchor, row, column = found.places
-        flat = flat_places(found.places, raw.shape[:4])
+    for raw, own_anchors, stride, assignment in zip(outputs, anchors, strides, targets, strict=True):
+        _, anchor, row, column = assignment.predictors
+        flat = flat_predictors(assignment.predictors, raw.shape[:4])
         chosen, cells = raw.flatten(0, 3)[flat].float(), torch.stack([column, row], 1)
-        boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), found.boxes
-        counted = None if found.counted is None else found.counted.float()
+        boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), assignment.boxes
+        counted = None if assignment.counted is None else assignment.counted.float()
         n_labels = max(len(labels), 1) if counted is None else counted.sum().clamp(min=1)
         sums = settings.reduction == "sums"
-        # What the sums over the predictors of this scale are divided by.
+        # Divisors of the sums over the predictors of this scale.
         of_boxes, of_scores = (
             (len(raw), len(raw)) if sums else (n_labels * total * stride, raw[..., 4].numel() * total * stride)
         )
-        # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
+        # An empty sum keeps the graph, so that a batch of empty frames stays differentiable.
         losses = ciou_loss(boxes, labels, settings.aspect)
         box = box + (losses if counted is None else losses * counted).sum() / of_boxes
-        positive = found.positive
-        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.ignored))
+        positive = assignment.positive
+        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~assignment.ignored))
         target = positive.float()
         if settings.objectness == "iou":
             # If two labels share a predictor, use the larger IoU.

@@ -20,26 +20,26 @@ def preview_images(
 ) -> dict[str, NDArray[np.uint8]]:
     """Images (height, width, 3), red, green, blue, of at most `count` frames, evenly spaced over a split, by frame_id.
 
-    Selected labels are yellow ellipses. Detections of at least `threshold` are blue boxes. Frames below 512 px are
-    enlarged by a whole factor, so that thin lines do not hide craters of a few pixels.
+    Selected labels are yellow ellipses, detections of at least `threshold` blue boxes. Frames below 512 px are enlarged
+    by a whole factor, so that lines do not hide craters of a few pixels.
     """
     chosen = np.unique(np.linspace(0, len(split) - 1, min(count, len(split))).astype(int))
     names = split.frames.table["frame_id"].tolist()
     images = {}
-    for place in chosen.tolist():
-        grey = split.frames.images[place]
+    for number in chosen.tolist():
+        grey = split.frames.images[number]
         factor = max(1, _LEAST_SIDE_PX // max(grey.shape))
         image = cv2.cvtColor(grey.repeat(factor, 0).repeat(factor, 1), cv2.COLOR_GRAY2RGB)
-        labels = split.labels[place]
+        labels = split.labels[number]
         for cx, cy, a, b, theta in labels.ellipses[labels.selected].tolist():
-            # The centre of OpenCV's first pixel is 0, ours 0.5.
+            # The centre of the first pixel is 0 for OpenCV and 0.5 for us.
             centre = _sixteenths(factor * cx - 0.5), _sixteenths(factor * cy - 0.5)
             axes = _sixteenths(factor * a), _sixteenths(factor * b)
             cv2.ellipse(image, centre, axes, np.degrees(theta), 0, 360, _LABEL, 1, cv2.LINE_AA, 4)
-        own = detections[place]
-        for x0, y0, x1, y1 in factor * own.boxes[own.scores >= threshold]:
+        frame_detections = detections[number]
+        for x0, y0, x1, y1 in factor * frame_detections.boxes[frame_detections.scores >= threshold]:
             cv2.rectangle(image, (round(x0), round(y0)), (round(x1), round(y1)), _DETECTION, 1)
-        images[names[place]] = image.astype(np.uint8)
+        images[names[number]] = image.astype(np.uint8)
     return images
 
 

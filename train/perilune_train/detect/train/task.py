@@ -28,8 +28,8 @@ from perilune_train.records.provenance import RECORD
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100
 _STEPS_BETWEEN_AVERAGES = 4
-"""Steps between updates of the average. Updating all weights takes a twentieth of a small network's step; every fourth
-step gives the same result."""
+"""Steps between updates of the average. Updating all weights takes a twentieth of a small network's step; updating at
+every fourth step gives equal results."""
 
 
 def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> float:
@@ -179,7 +179,7 @@ class DetectTask(lightning.LightningModule):
             self.captured = CapturedStep(self.whole_step, self.config.batch_size, self.device)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        # The last batch of an epoch may be smaller than those that are captured.
+        # The last batch of an epoch may be smaller than the captured ones.
         self.replayable = isinstance(batch, Tensor) and len(batch) == self.config.batch_size
 
     def training_step(self, batch: Batch | Tensor, batch_idx: int) -> Tensor:
@@ -219,7 +219,7 @@ class DetectTask(lightning.LightningModule):
         """Losses of a batch of resident frames; updates the weights. No value is read, so that it may be captured."""
         optimizer: Any = self.optimizers(use_pl_optimizer=False)
         optimizer.zero_grad(set_to_none=True)
-        # A cache would keep the casts of the weights, which the step changes.
+        # A cache would keep casts of the weights, which the step changes.
         kind = self.device.type
         enabled, dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
         with torch.autocast(kind, dtype, enabled, cache_enabled=False):

@@ -1,4 +1,5 @@
-"""Choose the score threshold of a detector on validation frames, also under varied contrast, blur and noise."""
+"""Choose the score threshold of a detector on validation frames, optionally also with varied contrast, blur and
+noise."""
 
 from dataclasses import replace
 
@@ -13,17 +14,19 @@ from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import detect_split
 
 VARIED = AugmentSettings(flips_and_turns=False, gain=0.3, gamma=0.6, stretch=0.1, blur_px=0.6, noise=5.0)
-"""How the copies of the validation frames vary: wider than in training, as published images are."""
+"""Variations of the copies of validation frames: wider than in training, to cover published images."""
 _STREAM = 7
 
 
-def threshold_on_validation(detector: Detector, split: DetectSplit, found: list[Detections]) -> tuple[float, str]:
-    """The threshold by `detect.evaluation`, and how it was chosen, from the detections of a split.
+def threshold_on_validation(
+    detector: Detector, split: DetectSplit, plain_detections: list[Detections]
+) -> tuple[float, str]:
+    """Choose the threshold as `detect.evaluation` says; returns it and a description.
 
-    With `detect.evaluation.varied_frames` the frames count twice: as they are and varied.
+    With `detect.evaluation.varied_frames` each frame counts twice: as it is and varied.
     """
     config = detector.config
-    labels, detections, frames = list(split.labels), list(found), "val"
+    labels, detections, frames = list(split.labels), list(plain_detections), "val"
     if config.evaluation.varied_frames:
         varied, _ = detect_split(detector, varied_split(split, config.seed), "varied val")
         labels, detections, frames = labels * 2, detections + varied, "val and varied val"
@@ -34,11 +37,11 @@ def threshold_on_validation(detector: Detector, split: DetectSplit, found: list[
 
 
 def varied_split(split: DetectSplit, seed: int) -> DetectSplit:
-    """The same frames with other contrast, black and white points, blur and noise (`VARIED`); same labels."""
+    """The frames with other contrast, black and white points, blur and noise (`VARIED`), and unchanged labels."""
     images = np.empty_like(split.frames.images)
     for number, image in enumerate(split.frames.images):
-        own = split.labels[number]
+        frame_labels = split.labels[number]
         rng = np.random.default_rng([seed, _STREAM, number])
-        pixels, _, _ = augment(image, own.boxes, own.selected, split.radius_px, VARIED, rng)
+        pixels, _, _ = augment(image, frame_labels.boxes, frame_labels.selected, split.radius_px, VARIED, rng)
         images[number] = np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
     return replace(split, frames=replace(split.frames, images=images))

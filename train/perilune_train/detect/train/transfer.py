@@ -116,8 +116,8 @@ def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenanc
     if last is not None:
         content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
         return [read_provenance(content, last)]
-    given = [weights_file(path) for path in (config.init_from, config.teacher) if path is not None]
-    return [read_provenance(runs.load_weights(path), path) for path in given if not is_darknet(path)]
+    paths = [weights_file(path) for path in (config.init_from, config.teacher) if path is not None]
+    return [read_provenance(runs.load_weights(path), path) for path in paths if not is_darknet(path)]
 
 
 def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:

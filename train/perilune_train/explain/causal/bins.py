@@ -25,15 +25,15 @@ BINS = {
 }
 """Label and edges of the bins of each property of a crater."""
 OUTSIDE = "outside"
-"""Name of the bin of values in no other bin; not drawn."""
+"""Name of the bin for values outside all other bins; it is not drawn."""
 MOST_ROWS = 6
-"""Gates that are drawn as bars, one row of panels each; more are drawn as a heat map."""
+"""Largest number of gates that are drawn as bars, one row of panels each; more are drawn as a heat map."""
 
 
 def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
     """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present.
 
-    The bin 3-5 has values above 3 and up to 5; "outside" has those in no bin.
+    The bin 3-5 has values above 3 and up to 5; "outside" has the values outside all bins.
     """
     parts, keys = [], [name for name in ("map", "version") if name in table]
     for name, (label, edges) in BINS.items():
@@ -52,10 +52,10 @@ def bin_metrics(table: pd.DataFrame, prefix: str) -> Metrics:
     names = {label: name for name, (label, _) in BINS.items()}
     metrics: Metrics = {}
     for row in table.to_dict("records"):
-        place = f"{names[row['property']]}/{row['bin']}"
-        own = f"{row['version']}/{row['map']}" if "map" in row else row["version"]
-        metrics[f"{prefix}/{own}/{place}"] = float(row["value"])
-        metrics[f"{prefix}/{row['version']}/{place}_n"] = int(row["n"])
+        bin_name = f"{names[row['property']]}/{row['bin']}"
+        version_and_map = f"{row['version']}/{row['map']}" if "map" in row else row["version"]
+        metrics[f"{prefix}/{version_and_map}/{bin_name}"] = float(row["value"])
+        metrics[f"{prefix}/{row['version']}/{bin_name}_n"] = int(row["n"])
     return metrics
 
 
@@ -88,8 +88,8 @@ def draw_gate_bins(path: Path, table: pd.DataFrame) -> None:
     largest = max(float(table["value"].abs().max()), 1e-9)
     for row, version in zip(axes, versions, strict=True):
         for axis, (title, edges) in zip(row, BINS.values(), strict=True):
-            own = table[(table["version"] == version) & (table["property"] == title)]
-            picture = _heat(axis, own, gates, _bin_names(edges), largest)
+            rows = table[(table["version"] == version) & (table["property"] == title)]
+            picture = _heat(axis, rows, gates, _bin_names(edges), largest)
             axis.set_xlabel(title, fontsize=8)
             axis.set_title(VERSIONS[version][0], fontsize=8)
     figure.colorbar(picture, ax=axes, label="mask with crater - without, deviations of the gate", shrink=0.5)
@@ -121,7 +121,7 @@ def _heat(axis: Axes, table: pd.DataFrame, gates: list[str], bins: list[str], la
 
 def _ticks(table: pd.DataFrame, bins: list[str]) -> list[str]:
     counts = table.groupby("bin")["n"].max().reindex(bins).fillna(0).astype(int)
-    return [f"{one}\nn = {n}" for one, n in zip(bins, counts, strict=True)]
+    return [f"{name}\nn = {n}" for name, n in zip(bins, counts, strict=True)]
 
 
 def _bin_names(edges: tuple[float, ...]) -> list[str]:

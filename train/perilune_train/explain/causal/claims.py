@@ -10,45 +10,45 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from perilune_train.explain.causal.figures import scene_interval
+from perilune_train.explain.causal.pictures import scene_interval
 from perilune_train.explain.evidence.significance import LEVEL, unit_sign_flip_p
 from perilune_train.records.spread import MIN_UNITS
 
 NO_PLACEBO = "undecided: no placebo"
 _BOTH_WAYS = MIN_UNITS + 1
-"""Scenes that a two-sided test needs: the smallest p of five scenes is 2 / 32, above `LEVEL`."""
+"""Number of scenes that a two-sided test needs: the smallest p of five scenes is 2 / 32, above `LEVEL`."""
 _FEW = 0.1
-"""Limit of the share of craters that are found after removal, divided by the share found before."""
+"""Largest share of craters that are found after removal, divided by the share found before."""
 _VIEW = ["crater", "scene_id", "frame_id"]
 _VERSIONS = ["factual", "rendered", "inpainted", "placebo"]
 
 
 @dataclass(frozen=True)
 class Tested:
-    """A claim and the p of its tests."""
+    """A claim and the p values of its tests."""
 
     claim: dict[str, str]
     """claim, figure, interval, nulls, verdict and picture, as in claims.json."""
     p: float
     """p of the change; NaN with too few scenes."""
     p_placebo: float = float("nan")
-    """p of the change beyond that of the placebo; NaN with too few scenes or without a placebo."""
+    """p of the change beyond the placebo's change; NaN with too few scenes or without a placebo."""
 
 
 def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tested:
-    """Whether a gate reacts to single craters: `effects` is the table of `mask_effects`, `gates` that of `by_gate`.
+    """Whether a gate reacts to single craters.
 
-    The change may have either sign, so p is two-sided. The change must also exceed that of the placebo in size, paired
-    over the views that have both: change - placebo and change + placebo, with the sign of the mean change, are tested,
-    and the larger p counts.
+    `effects` is the table of `mask_effects`, `gates` the table of `by_gate`. The change may have either sign, so p is
+    two-sided. The change must also exceed the placebo's change in size, paired over the views that have both: change -
+    placebo and change + placebo, with the sign of the mean change, are tested, and the larger p counts.
     """
     views = _views(effects[effects["map"] == gate], "change")
     changed = _scene_means(views["rendered"], views)
     sign = -1.0 if changed.sum() < 0 else 1.0
-    own = sign * views["rendered"]
-    beyond = [_scene_means(own + other * views["placebo"], views) for other in (-1, 1)]
+    effect = sign * views["rendered"]
+    beyond = [_scene_means(effect + other * views["placebo"], views) for other in (-1, 1)]
     p = _p(sign * changed, both_ways=True)
-    p_placebo = float(np.max([_p(one, both_ways=True) for one in beyond]))
+    p_placebo = float(np.max([_p(effect, both_ways=True) for effect in beyond]))
     rows = gates[gates["map"] == gate].set_index("version").reindex(_VERSIONS)
     mean = {str(version): float(value) for version, value in rows["change"].items()}
     low, high = ({str(version): float(value) for version, value in rows[end].items()} for end in ("low", "high"))
@@ -67,10 +67,11 @@ def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tes
 
 
 def detection_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
-    """Whether the detector finds a crater because of it: `effects` is the table of `detection_effects` with `found`.
+    """Whether the detector finds a crater because of its appearance.
 
-    Two one-sided tests must pass: found with the crater - found without it, and found with other ground inpainted -
-    found without the crater. The share that is found without must also be below a tenth of the share with.
+    `effects` is the table of `detection_effects` with `found`. Two one-sided tests must pass: found with the crater
+    minus found without it, and found with other ground inpainted minus found without the crater. The share found
+    without the crater must also be below a tenth of the share found with it.
     """
     views = _views(effects, "found")
     lost = views["factual"] - views["rendered"]
@@ -91,9 +92,9 @@ def detection_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
 
 
 def pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
-    """Whether removed craters raise the navigator's error: `effects` is the table of `pose_effects`. One-sided.
+    """Whether removed craters raise the navigator's error; one-sided.
 
-    There is no placebo: both versions are rendered.
+    `effects` is the table of `pose_effects`. There is no placebo: both versions are rendered.
     """
     before, after, moved_m = (float(np.sqrt((effects[name] ** 2).mean())) for name in ("before", "after", "moved_m"))
     harm = effects["after"] - effects["before"]
@@ -117,13 +118,13 @@ def _views(effects: pd.DataFrame, value: str) -> pd.DataFrame:
 
 
 def _scene_means(values: pd.Series, rows: pd.DataFrame) -> NDArray[np.float64]:
-    """Mean of the finite values (N,) of each scene that has any (S,); `rows` (N) have the scene_id."""
+    """Mean of the finite values (N,) of each scene that has any (S,); `rows` (N) has the column scene_id."""
     known = values[np.isfinite(values)]
     return known.groupby(rows.loc[known.index, "scene_id"]).mean().to_numpy(np.float64)
 
 
 def _p(by_scene: NDArray[np.float64], *, both_ways: bool = False) -> float:
-    """p of a mean above 0 by sign flips over scenes; doubled if the sign was chosen on the same scenes."""
+    """p that a mean is above 0, by sign flips over scenes; doubled if the sign was chosen on the same scenes."""
     if len(by_scene) < (_BOTH_WAYS if both_ways else MIN_UNITS):
         return float("nan")
     p = unit_sign_flip_p(by_scene)
@@ -132,8 +133,8 @@ def _p(by_scene: NDArray[np.float64], *, both_ways: bool = False) -> float:
 
 def _ends(values: pd.Series, rows: pd.DataFrame, rng: np.random.Generator) -> tuple[float, float]:
     known = values[np.isfinite(values)]
-    own = rows.loc[known.index]
-    return scene_interval(known.to_numpy(), own["scene_id"].tolist(), own["frame_id"].tolist(), rng)
+    known_rows = rows.loc[known.index]
+    return scene_interval(known.to_numpy(), known_rows["scene_id"].tolist(), known_rows["frame_id"].tolist(), rng)
 
 
 def _verdict(n_scenes: int, n_placebo: int | None, needed: int, holds: bool) -> str:

@@ -1,4 +1,4 @@
-"""How masks and detections change when single craters are removed.
+"""How masks, detections and poses change when single craters are removed.
 
 Three changes of the same frame are compared, in an ellipse around each crater:
 
@@ -11,23 +11,34 @@ Three changes of the same frame are compared, in an ellipse around each crater:
 A gate reacts to craters if the rendered change moves its mask and the placebo does not.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_train.data.frames import frame_table
 from perilune_train.detect.evaluate.boxes import iou_matrix
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.explain.causal.pairs import CraterPairs
 from perilune_train.explain.maps.masks import Masks
+from perilune_train.models.navigator import StackNavigator
+from perilune_train.motion.data.trajectories import load_split
+from perilune_train.motion.network import predict, target_of
+from perilune_train.motion.pose import predict_pose
 
 REACH = 1.4
-"""Semi-axes of the region around a crater, divided by the crater's: the outermost ring of the paper's mask G."""
+"""Semi-axes of the region around a crater, divided by the crater's semi-axes: the outermost ring of the paper's mask
+G."""
 _INPAINT_RADIUS_PX = 3
 _TRIES = 200
 _MIN_IOU = 0.5
+_TRAJECTORY = ["scene_id", "trajectory_id"]
 
 
 def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.bool_]:
@@ -40,7 +51,7 @@ def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, flo
 
 
 def empty_shift(crater: pd.Series, occupied: NDArray[np.bool_], rng: np.random.Generator) -> tuple[float, float] | None:
-    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if none is found.
+    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if there is none.
 
     `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free.
     """
@@ -65,10 +76,11 @@ def inpainted(image: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> NDArray[np
 def filled_frames(
     pairs: CraterPairs, occupied: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[tuple[float, float] | None]]:
-    """Frames with the removed craters inpainted, frames with placebo regions inpainted, and the shifts of these.
+    """Frames with the removed craters inpainted, frames with placebo regions inpainted, and the shifts of these
+    regions.
 
-    Shapes (N, height, width) and one shift for each row of `pairs.craters`. `occupied` (N, height, width) are pixels in
-    or near labelled craters.
+    Both are (N, height, width); there is one shift for each row of `pairs.craters`. `occupied` (N, height, width) are
+    pixels in or near labelled craters.
     """
     shape = pairs.factual.shape[1:]
     without, placebo = (np.zeros(pairs.factual.shape, bool) for _ in range(2))
@@ -84,7 +96,8 @@ def filled_frames(
             placebo[image] |= chosen
             taken[image] |= chosen
     fill = [
-        np.stack([inpainted(*one) for one in zip(pairs.factual, chosen, strict=True)]) for chosen in (without, placebo)
+        np.stack([inpainted(*pair) for pair in zip(pairs.factual, chosen, strict=True)])
+        for chosen in (without, placebo)
     ]
     return fill[0], fill[1], shifts
 
@@ -95,14 +108,14 @@ def mask_effects(
     """Change of every gate in the region of every crater, in standard deviations of the gate.
 
     `masks` has the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean over
-    the region of the factual mask minus that of the other version: above 0 the gate is stronger with the crater.
-    Columns: those of `pairs.craters`, map, version, change; NaN for a placebo without free ground.
+    the region of the factual mask minus the mean of the other version's mask: above 0 the gate is stronger with the
+    crater. Columns: those of `pairs.craters`, map, version, change; NaN for a placebo without free ground.
     """
     shape, rows = pairs.factual.shape[1:], []
     for (_, crater), shift in zip(pairs.craters.iterrows(), shifts, strict=True):
-        own, image = region(shape, crater), int(crater["image"])
+        inside, image = region(shape, crater), int(crater["image"])
         moved = None if shift is None else region(shape, crater, shift)
-        regions = {"rendered": own, "inpainted": own, "placebo": moved}
+        regions = {"rendered": inside, "inpainted": inside, "placebo": moved}
         for version, chosen in regions.items():
             for block, factual in masks["factual"].items():
                 if chosen is None or not chosen.any():
@@ -111,7 +124,7 @@ def mask_effects(
                     change = float((factual[image] - masks[version][block][image])[chosen].mean())
                 rows.append({"crater": crater.name, "map": block, "version": version, "change": change})
     table = pd.DataFrame(rows)
-    spread = {block: max(float(found.std()), 1e-9) for block, found in masks["factual"].items()}
+    spread = {block: max(float(gate_masks.std()), 1e-9) for block, gate_masks in masks["factual"].items()}
     table["change"] /= table["map"].map(spread)
     return table.merge(_facts(pairs), left_on="crater", right_index=True)
 
@@ -126,11 +139,11 @@ def detection_effects(
     boxes = pairs.craters[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     image, rows = pairs.craters["image"].to_numpy(), []
     for version, images in versions.items():
-        found = detect(images)
+        detections = detect(images)
         for k in range(len(boxes)):
-            own = found[image[k]]
-            overlap = iou_matrix(own.boxes.reshape(-1, 4), boxes[k : k + 1])[:, 0]
-            score = float(own.scores[overlap >= _MIN_IOU].max(initial=0.0))
+            frame_detections = detections[image[k]]
+            overlap = iou_matrix(frame_detections.boxes.reshape(-1, 4), boxes[k : k + 1])[:, 0]
+            score = float(frame_detections.scores[overlap >= _MIN_IOU].max(initial=0.0))
             rows.append({"crater": k, "version": version, "score": score})
     return pd.DataFrame(rows).merge(_facts(pairs), left_on="crater", right_index=True)
 
@@ -141,9 +154,46 @@ def with_found(effects: pd.DataFrame, threshold: float, shifts: Sequence[tuple[f
     NaN for the placebo of a crater without free ground (a shift of None): nothing was inpainted for it.
     """
     missing = np.array([shift is None for shift in shifts], bool)[effects["crater"].to_numpy(int)]
-    found = (effects["score"] >= threshold).astype(float)
-    return effects.assign(found=found.mask((effects["version"] == "placebo") & missing))
+    is_found = (effects["score"] >= threshold).astype(float)
+    return effects.assign(found=is_found.mask((effects["version"] == "placebo") & missing))
 
 
 def _facts(pairs: CraterPairs) -> pd.DataFrame:
     return pairs.craters[["frame_id", "scene_id", "crater_id", "radius_px", "depth_ratio", "sun_elevation_deg"]]
+
+
+def pose_effects(
+    navigator: StackNavigator, architecture: dict[str, Any], factual: Dataset, counterfactual: Dataset, split: str
+) -> pd.DataFrame:
+    """Errors of each pair of consecutive frames with all craters (before) and without the removed ones (after).
+
+    Columns: frame_id (scene/trajectory/step), scene_id, before, after (position errors, metres), moved_m (length of the
+    difference between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory: its
+    pairs would not be consecutive; render it with as many frames per trajectory as the dataset has.
+    """
+    check_descents(factual, counterfactual, split)
+    originals = {trajectory.ids: trajectory for trajectory in load_split(factual, split)}
+    of_pose, tables = target_of(architecture) == "pose", []
+    predicted = predict_pose if of_pose else predict
+    for changed in load_split(counterfactual, split):
+        original = originals[changed.ids]
+        estimates = [predicted(navigator, architecture, version)[0] for version in (original, changed)]
+        truth_m = original.pose[0] if of_pose else original.motion[0]
+        before, after = (np.linalg.norm(version - truth_m, axis=1) for version in estimates)
+        steps = ["/".join([*changed.ids, str(step)]) for step in range(changed.n_pairs)]
+        moved = np.linalg.norm(estimates[1] - estimates[0], axis=1)
+        columns = {"frame_id": steps, "scene_id": changed.ids[0], "before": before, "after": after, "moved_m": moved}
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> None:
+    """Raise UserError unless the trajectories of a split of the second dataset have all frames of the first one."""
+    whole, changed = (
+        Counter(frame_table(dataset, split)[_TRAJECTORY].agg("/".join, axis=1)) for dataset in (factual, counterfactual)
+    )
+    for trajectory, count in changed.items():
+        if whole[trajectory] != count:
+            found = f"{count} frames of {trajectory}"
+            expected = "all frames of a trajectory of the dataset; render with --frames-per-trajectory 1000"
+            raise UserError(counterfactual.store, "frames", found, expected)

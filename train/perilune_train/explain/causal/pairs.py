@@ -1,4 +1,4 @@
-"""Frames with and without single craters, and where these craters are."""
+"""Frames with and without single craters, and the positions of these craters."""
 
 import io
 from dataclasses import dataclass
@@ -38,7 +38,8 @@ class CraterPairs:
 def crater_pairs(
     factual: Dataset, counterfactual: Dataset, removed: pd.DataFrame, split: str, selection: Selection
 ) -> CraterPairs:
-    """Load the frames of a counterfactual dataset and the same frames of the dataset that it was rendered from.
+    """Load the frames of a counterfactual dataset and the corresponding frames of the dataset that it was rendered
+    from.
 
     `removed` is the table of `read_removed`. Only craters that `selection` accepts in the factual frame, whole in the
     image, are listed. Raises UserError if there are none, or if the second dataset has frames that the first does not
@@ -54,7 +55,7 @@ def crater_pairs(
 
 
 def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The frames of a split of a dataset that `other` has too, and those of `other`: `frame_table`, in one order.
+    """The frames of a split that both datasets have: both `frame_table`s, in one order.
 
     Raises UserError if the second dataset has frames that the first does not have.
     """
@@ -67,7 +68,7 @@ def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFr
 
 
 def read_removed(address: Address) -> pd.DataFrame:
-    """The table of removed craters beside a counterfactual dataset, <dataset>.removed.parquet.
+    """Read the table of removed craters of a counterfactual dataset, <dataset>.removed.parquet.
 
     Raises UserError if it is missing, is damaged or has no craters.
     """
@@ -95,9 +96,9 @@ def _shown(
     inside = (craters["bbox_x0_px"] >= 0) & (craters["bbox_x1_px"] <= camera.width_px)
     inside &= (craters["bbox_y0_px"] >= 0) & (craters["bbox_y1_px"] <= camera.height_px)
     craters = craters[inside].reset_index(drop=True)
-    place = {frame_id: index for index, frame_id in enumerate(rows["frame_id"])}
+    index_of = {frame_id: index for index, frame_id in enumerate(rows["frame_id"])}
     sun = {
         frame_id: np.degrees(np.arcsin(direction[2]))
         for frame_id, direction in zip(rows["frame_id"], rows["sun_direction"], strict=True)
     }
-    return craters.assign(image=craters["frame_id"].map(place), sun_elevation_deg=craters["frame_id"].map(sun))
+    return craters.assign(image=craters["frame_id"].map(index_of), sun_elevation_deg=craters["frame_id"].map(sun))

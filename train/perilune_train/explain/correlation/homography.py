@@ -21,7 +21,8 @@ def true_homography(
     position_2_m: Array,
     rotation_2_camera_from_site: Array,
 ) -> Array:
-    """Homography (3, 3) from image coordinates, pixels, of frame 1 to those of frame 2, of the true poses.
+    """Homography (3, 3) from image coordinates, pixels, of frame 1 to image coordinates of frame 2, from the true
+    poses.
 
     Takes positions (3,) in metres, O_L, and rotations (3, 3). The plane is the mean ground, z = 0 of O_L. The paper
     speaks of "the affine transformation matrix defined by groundtruth pose" without a definition. Deviation: a
@@ -30,19 +31,19 @@ def true_homography(
     """
     if position_1_m[2] <= 0:
         raise ValueError(f"altitude is {position_1_m[2]} m, not above 0")
-    translation_m, rotation = relative_poses(
+    translation_m, rotation_c2_from_c1 = relative_poses(
         [position_1_m, position_2_m], [rotation_1_camera_from_site, rotation_2_camera_from_site]
     )
     down_c1 = -np.asarray(rotation_1_camera_from_site)[:, 2]
-    return plane_homography(camera.matrix, translation_m[0], rotation[0], down_c1, float(position_1_m[2]))
+    return plane_homography(camera.matrix, translation_m[0], rotation_c2_from_c1[0], down_c1, float(position_1_m[2]))
 
 
 def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool_]:
     """Which pixels (height, width) of frame 1 see ground that is inside frame 2, which has the same shape."""
     height, width = shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    found = apply_homography(homography, np.stack([u, v], axis=-1))
-    return ((found >= 0) & (found < [width, height])).all(axis=-1)
+    moved = apply_homography(homography, np.stack([u, v], axis=-1))
+    return ((moved >= 0) & (moved < [width, height])).all(axis=-1)
 
 
 def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array) -> Array:
@@ -60,11 +61,3 @@ def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography
         borderMode=cv2.BORDER_REPLICATE,
     )
     return np.asarray(moved, np.float64)
-
-
-def warped_to_first(
-    image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """An image of frame 2 moved to frame 1 (height, width), and which pixels of frame 1 are inside frame 2."""
-    height, width = image_2.shape
-    return moved_to_first(image_2, homography), seen_in_second((height, width), homography)

@@ -4,6 +4,7 @@ Columns: task, kind, map, measure, frame_id, scene_id, value. Means, intervals a
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -31,31 +32,53 @@ PCC1_SIGN = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class FrameTargets:
+    """Maps that the maps of N frames are correlated with, and the names of the frames."""
+
+    truth: Maps
+    """The paper's masks G (N, height, width): 1 on background, 0 in craters."""
+    brightness: Maps
+    """Brightness of the frames (N, height, width)."""
+    gradient: Maps
+    """Length of the gradient of the brightness (N, height, width)."""
+    frame_ids: Sequence[str]
+    """Ids of the frames (N)."""
+    scene_ids: Sequence[str]
+    """Scene of each frame (N)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairTargets:
+    """True motions of N pairs of frames, and the names of the pairs."""
+
+    homographies: Sequence[Array]
+    """Homographies (3, 3) of the N pairs, from image coordinates of the upper, earlier frame to those of the lower."""
+    pair_ids: Sequence[str]
+    """Ids of the pairs (N)."""
+    scene_ids: Sequence[str]
+    """Scene of each pair (N)."""
+
+
 def detector_values(
-    masks: Masks,
-    truth: Maps,
-    brightness: Maps,
-    gradient: Maps,
-    frame_ids: Sequence[str],
-    scene_ids: Sequence[str],
-    kind: Kind = "gate",
-    other_scenes: bool = False,
+    masks: Masks, targets: FrameTargets, kind: Kind = "gate", other_scenes: bool = False
 ) -> pd.DataFrame:
-    """The long table of PCC1 and PCC2 for every map; `truth` (N, height, width) are the paper's masks G of N frames.
+    """The long table of PCC1 and PCC2 for every map (N, height, width).
 
     pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background: above 0 the map is lower on
     craters. pcc1_craterness is the correlation with 1 - G: above 0 the map is higher on craters. pcc1_partial is the
-    partial correlation with 1 - G given brightness and gradient (N, height, width). pcc2 of frame n is the mean
+    partial correlation with 1 - G given brightness and gradient. pcc2 of frame n is the mean
     correlation of the map with the same map of all other frames m, or of those of other scenes if `other_scenes`; the
     paper uses one unspecified m. Undefined values are NaN.
     """
-    scenes = np.asarray(scene_ids)
+    scenes = np.asarray(targets.scene_ids)
     paired = scenes[:, None] != scenes[None] if other_scenes else ~np.eye(len(scenes), dtype=bool)
-    craterness, basis = standardised_rows(1 - truth), given_basis([brightness, gradient])
+    craterness = standardised_rows(1 - targets.truth)
+    basis = given_basis([targets.brightness, targets.gradient])
     residuals = residual_rows(craterness, basis)
     tables = []
-    for name, found in masks.items():
-        rows = standardised_rows(found)
+    for name, maps in masks.items():
+        rows = standardised_rows(maps)
         pcc1 = dot_rows(rows, craterness)
         values = {
             "pcc1_background": -pcc1,
@@ -63,33 +86,27 @@ def detector_values(
             "pcc1_partial": partial_of_rows(rows, residuals, basis),
             "pcc2": _mean_defined(rows @ rows.T, paired),
         }
-        tables += [_table("detect", kind, name, *one, frame_ids, scene_ids) for one in values.items()]
+        for measure, measured in values.items():
+            names = {"task": "detect", "kind": kind, "map": name, "measure": measure}
+            tables.append(_table(names, measured, targets.frame_ids, targets.scene_ids))
     return pd.concat(tables, ignore_index=True)
 
 
-def pair_values(
-    masks: Masks,
-    homographies: Sequence[Array],
-    pair_ids: Sequence[str],
-    scene_ids: Sequence[str],
-    kind: Kind = "gate",
-    all_pixels: bool = True,
-) -> pd.DataFrame:
+def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pixels: bool = True) -> pd.DataFrame:
     """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the pair's.
 
-    `homographies` (3, 3) map image coordinates of the upper, earlier frame to those of the lower one. pcc3 and pcc4 are
-    over the same pixels, the part of the upper frame that is in the lower one. The paper uses all pixels, at least for
-    PCC3, and does not define the moved map outside the overlap: in pcc3_all_pixels and pcc4_all_pixels it is 0, the
-    default of OpenCV. If one half is constant, both values of that kind (overlap or all pixels) are NaN, because their
-    means must be over the same pairs. pcc4_minus_pcc3 is what the true motion adds, over the overlap. Without
-    `all_pixels` only the measures over the overlap are computed, in half the time.
+    pcc3 and pcc4 are over the same pixels, the part of the upper frame that is in the lower one. The paper uses all
+    pixels, at least for PCC3, and does not define the moved map outside the overlap: in pcc3_all_pixels and
+    pcc4_all_pixels it is 0, the default of OpenCV. If one half is constant, both values of that kind (overlap or all
+    pixels) are NaN, because their means must be over the same pairs. pcc4_minus_pcc3 is what the true motion adds, over
+    the overlap. Without `all_pixels` only the measures over the overlap are computed, in half the time.
     """
     height, width = (size // part for size, part in zip(next(iter(masks.values())).shape[1:], (2, 1), strict=True))
-    seen = np.stack([seen_in_second((height, width), one) for one in homographies])
+    seen = np.stack([seen_in_second((height, width), homography) for homography in targets.homographies])
     tables = []
-    for name, found in masks.items():
-        upper, lower = found[:, :height], found[:, height:]
-        moved = np.stack([moved_to_first(one, h) for one, h in zip(lower, homographies, strict=True)])
+    for name, maps in masks.items():
+        upper, lower = maps[:, :height], maps[:, height:]
+        moved = np.stack([moved_to_first(mask, h) for mask, h in zip(lower, targets.homographies, strict=True)])
         seen_upper = standardised_rows(upper, seen)
         values = {
             "pcc3": dot_rows(seen_upper, standardised_rows(lower, seen)),
@@ -104,7 +121,9 @@ def pair_values(
             for measure in (f"pcc3{ending}", f"pcc4{ending}"):
                 values[measure] = np.where(np.isnan(both), np.nan, values[measure])
         values["pcc4_minus_pcc3"] = values["pcc4"] - values["pcc3"]
-        tables += [_table("navigate", kind, name, *one, pair_ids, scene_ids) for one in values.items()]
+        for measure, measured in values.items():
+            names = {"task": "navigate", "kind": kind, "map": name, "measure": measure}
+            tables.append(_table(names, measured, targets.pair_ids, targets.scene_ids))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -115,10 +134,9 @@ def _mean_defined(values: Array, wanted: NDArray[np.bool_]) -> Array:
     return np.where(counts > 0, np.where(used, values, 0.0).sum(1) / np.maximum(counts, 1), np.nan)
 
 
-def _table(
-    task: str, kind: Kind, name: str, measure: str, values: Array, ids: Sequence[str], scenes: Sequence[str]
-) -> pd.DataFrame:
+def _table(names: dict[str, str], values: Array, ids: Sequence[str], scenes: Sequence[str]) -> pd.DataFrame:
+    """Rows of the long table for one measure of one map; `names` has the columns that are the same in all rows."""
     if not len(values) == len(ids) == len(scenes):
         raise ValueError(f"{len(values)} maps, {len(ids)} frame names and {len(scenes)} scene names")
-    columns = (task, kind, name, measure, list(ids), list(scenes), np.asarray(values, np.float64))
-    return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)))
+    varying = {"frame_id": list(ids), "scene_id": list(scenes), "value": np.asarray(values, np.float64)}
+    return pd.DataFrame(names | varying, columns=list(COLUMNS))

@@ -29,15 +29,6 @@ def pearson_rows(maps: Maps, targets: Maps, seen: NDArray[np.bool_] | None = Non
     return dot_rows(standardised_rows(maps, seen), standardised_rows(targets, seen))
 
 
-def pearson_between(maps: Maps, targets: Maps | None = None) -> Array:
-    """Correlations (N, M) of all maps (N, ...) with all targets (M, ...); with each other if there are none.
-
-    NaN in the rows and columns of constant ones.
-    """
-    rows = standardised_rows(maps)
-    return rows @ (rows if targets is None else standardised_rows(targets)).T
-
-
 def partial_rows(maps: Maps, targets: Maps, givens: Sequence[Maps]) -> Array:
     """Partial correlation (N,) of each map (N, ...) with its target (N, ...), given the other maps (N, ...).
 
@@ -53,7 +44,9 @@ def partial_of_rows(rows: Array, residuals: Array, basis: Sequence[Array]) -> Ar
 
     The residuals are orthogonal to the basis, so that only the length of the map's own residual is needed.
     """
-    left = np.sqrt(np.maximum(1 - sum((dot_rows(rows, one) ** 2 for one in basis), np.zeros(len(rows))), 0))
+    left = np.sqrt(
+        np.maximum(1 - sum((dot_rows(rows, basis_rows) ** 2 for basis_rows in basis), np.zeros(len(rows))), 0)
+    )
     return dot_rows(rows, residuals) / np.where(left > _ROUNDING, left, np.nan)
 
 
@@ -107,8 +100,8 @@ def is_constant(values: ArrayLike) -> bool:
 
 
 def _without(rows: Array, basis: Sequence[Array]) -> Array:
-    """Rows (N, P) without their components along the basis; twice, against rounding."""
+    """Rows (N, P) without their components along the basis; subtracted twice, because of rounding."""
     for _ in range(2):
-        for one in basis:
-            rows = rows - dot_rows(rows, one)[:, None] * one
+        for basis_rows in basis:
+            rows = rows - dot_rows(rows, basis_rows)[:, None] * basis_rows
     return rows

@@ -1,7 +1,7 @@
 """Attention gates forced to their mean: what the output loses without a gate's pattern.
 
-A gate whose pattern matters changes the output when its spatial mask is replaced by one number, its mean over pixels
-and frames. The channel gates stay. A mask that follows craters may still have no effect; a correlation cannot tell.
+If a gate's pattern matters, replacing its spatial mask by its mean over pixels and frames changes the output. The
+channel gates stay. A mask that follows craters may still have no effect; a correlation cannot tell.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ ALL = "all gates"
 
 def gate_means(masks: Masks) -> dict[str, float]:
     """Mean of each gate's mask over pixels and images."""
-    return {block: float(found.mean()) for block, found in masks.items()}
+    return {block: float(gate_masks.mean()) for block, gate_masks in masks.items()}
 
 
 def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -57,7 +57,7 @@ def forced_gates(
     measure: Callable[[NDArray[np.uint8]], NDArray[np.float64]],
     label: str,
 ) -> pd.DataFrame:
-    """Performance of each image with all gates, and with the gates of each scope forced to their means.
+    """Performance on each image with all gates, and with the gates of each scope forced to their means.
 
     `measure` gives one value per image. Columns: scope, image (index), before, after.
     """

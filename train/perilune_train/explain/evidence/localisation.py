@@ -13,7 +13,7 @@ from perilune_train.explain.correlation.pearson import is_constant
 MEASURES = ("auc", "relevance_mass", "pointing")
 """Measures in which gates are tested against nulls."""
 TOLERANCE_PX = 3
-"""Distance to a crater's pixel within which the top pixel of a map is a hit, pixels."""
+"""Distance, pixels, from a crater's pixel within which the top pixel of a map is a hit."""
 
 
 def localisation(
@@ -32,9 +32,9 @@ def localisation(
     0.5. Values are NaN where the map is constant, or no pixel or every pixel is a crater's.
     """
     rows = []
-    for name, found in maps.items():
-        for i, (one, inside) in enumerate(zip(found, craters, strict=True)):
-            values = localised(sign[name] * one.astype(np.float64), inside)
+    for name, images_map in maps.items():
+        for i, (image_map, inside) in enumerate(zip(images_map, craters, strict=True)):
+            values = localised(sign[name] * image_map.astype(np.float64), inside)
             frame = {"frame_id": frames["frame_id"].iloc[i], "scene_id": frames["scene_id"].iloc[i]}
             rows += [{"map": name, "measure": measure, **frame, "value": value} for measure, value in values.items()]
     table = pd.DataFrame(rows, columns=["map", "measure", "frame_id", "scene_id", "value"])
@@ -67,7 +67,7 @@ def localised(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> di
 
 
 def within(craters: NDArray[np.bool_], distance_px: float) -> NDArray[np.bool_]:
-    """Pixels (height, width) whose centre is at most a distance from that of a crater's pixel."""
+    """Pixels (height, width) whose centre is within a distance of the centre of a crater's pixel."""
     if not craters.any():
         return craters
     distance = cv2.distanceTransform((~craters).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

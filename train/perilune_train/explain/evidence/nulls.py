@@ -1,17 +1,17 @@
-"""Null maps: what a correlation is without a trained network that looks at craters.
+"""Null maps: how large a correlation is without a trained network that looks at craters.
 
-A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if to the gates of stage k, and
-"<null>/<gate>" if to one gate.
+A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if to the gates of stage k, and "<null>/<gate>"
+if to one gate.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+import torch
+from torch import nn
 
-from perilune_shared.geometry.frames import Array
-from perilune_train.explain.correlation.measures import detector_values, pair_values
-from perilune_train.explain.correlation.pearson import Maps
+from perilune_train.explain.correlation.measures import FrameTargets, PairTargets, detector_values, pair_values
 from perilune_train.explain.maps.baselines import Images, baseline_maps
 from perilune_train.explain.maps.masks import Masks
 
@@ -20,67 +20,56 @@ def detector_nulls(
     images: Images,
     masks: Masks,
     untrained: Masks,
-    truth: Maps,
-    brightness: Maps,
-    gradient: Maps,
-    frame_ids: Sequence[str],
-    scene_ids: Sequence[str],
+    targets: FrameTargets,
     rng: np.random.Generator,
-    px_per_input_px: float = 1.0,
-    other_scenes: bool = False,
 ) -> pd.DataFrame:
     """The long table of PCC1 and PCC2 of all null maps of N frames (N, height, width).
 
     Nulls: "edge", "contrast" and "brightness" of the images (`baseline_maps`); "untrained", the masks of an untrained
     network; "other frame", each gate's mask of a frame of another scene. The last has no PCC2, which does not depend on
-    the order of the frames. The other arguments are those of `detector_values`.
+    the order of the frames.
     """
-    maps = baseline_maps(images, px_per_input_px) | renamed("untrained", untrained)
-    exchanged = renamed("other frame", of_other_rows(masks, scene_ids, rng))
-    known, shuffled = (
-        detector_values(one, truth, brightness, gradient, frame_ids, scene_ids, "null", other_scenes)
-        for one in (maps, exchanged)
-    )
+    maps = baseline_maps(images) | renamed("untrained", untrained)
+    exchanged = renamed("other frame", of_other_rows(masks, targets.scene_ids, rng))
+    known, shuffled = (detector_values(null_maps, targets, "null") for null_maps in (maps, exchanged))
     return pd.concat([known, shuffled.loc[shuffled["measure"] != "pcc2"]], ignore_index=True)
 
 
 def pair_nulls(
-    first: Images,
-    second: Images,
+    pairs: Images,
     masks: Masks,
     untrained: Masks,
-    homographies: Sequence[Array],
-    pair_ids: Sequence[str],
-    scene_ids: Sequence[str],
+    targets: PairTargets,
     rng: np.random.Generator,
     px_per_input_px: float = 1.0,
 ) -> pd.DataFrame:
-    """The long table of PCC3 and PCC4 of all null maps of N pairs, from earlier and later images (N, height, width).
+    """The long table of PCC3 and PCC4 of all null maps of N pairs (N, 2 height, width), the earlier frame above.
 
     Only over the overlap of the two frames.
 
     Nulls: the baselines of both images; "untrained", the stacked masks (N, 2 height, width) of an untrained network;
-    "other pair", each gate's mask with the lower half of another pair. The other arguments are those of `pair_values`.
+    "other pair", each gate's mask with the lower half of another pair.
     """
+    first, second = np.split(pairs, 2, axis=1)
     upper, lower = (baseline_maps(images, px_per_input_px) for images in (first, second))
     maps = {name: np.concatenate([upper[name], lower[name]], axis=1) for name in upper}
     height = first.shape[1]
-    for gate, other in of_other_rows(masks, scene_ids, rng).items():
+    for gate, other in of_other_rows(masks, targets.scene_ids, rng).items():
         maps[f"other pair/{gate}"] = np.concatenate([masks[gate][:, :height], other[:, height:]], axis=1)
-    return pair_values(maps | renamed("untrained", untrained), homographies, pair_ids, scene_ids, "null", False)
+    return pair_values(maps | renamed("untrained", untrained), targets, "null", False)
 
 
 def renamed(null: str, masks: Masks) -> Masks:
-    """The same masks with the names "<null>/<gate>"."""
-    return {f"{null}/{gate}": found for gate, found in masks.items()}
+    """The masks with the names "<null>/<gate>"."""
+    return {f"{null}/{gate}": gate_masks for gate, gate_masks in masks.items()}
 
 
 def of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generator) -> Masks:
     """Masks (N, height, width) of other frames, in the order of `other_rows`; NaN if there is one frame."""
     if len(scene_ids) < 2:
-        return {gate: np.full_like(found, np.nan) for gate, found in masks.items()}
+        return {gate: np.full_like(gate_masks, np.nan) for gate, gate_masks in masks.items()}
     other = other_rows(scene_ids, rng)
-    return {gate: found[other] for gate, found in masks.items()}
+    return {gate: gate_masks[other] for gate, gate_masks in masks.items()}
 
 
 def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray:
@@ -91,3 +80,18 @@ def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray
     rows = np.arange(len(scenes))
     alone = len(np.unique(scenes)) == 1
     return np.array([rng.choice(rows[rows != n] if alone else rows[scenes != scenes[n]]) for n in rows])
+
+
+@torch.no_grad()
+def measure_statistics(network: nn.Module, *given: torch.Tensor) -> None:
+    """Set the batch statistics of an untrained network to those of one batch, then switch it to evaluation mode.
+
+    Without measured statistics the features of an untrained network shrink from layer to layer.
+    """
+    for norm in network.modules():
+        if isinstance(norm, nn.BatchNorm2d):
+            norm.reset_running_stats()
+            norm.momentum = None
+    network.train()
+    network(*given)
+    network.eval()

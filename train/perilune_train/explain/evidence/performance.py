@@ -1,4 +1,4 @@
-"""Performance of a network on single images: what an intervention changes."""
+"""Performance of a network on single images, which interventions change."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,17 +32,17 @@ class DetectionPerformance:
 
     def __call__(self, images: NDArray[np.uint8]) -> Values:
         """AP at IoU 0.5 (the paper's sum) of each frame, from images (N, height, width): (N,), NaN without labels."""
-        found = []
+        detections = []
         for start in range(0, len(images), _BATCH):
             boxes, scores = self.detector.predict(images[start : start + _BATCH])
-            found += detections_of(boxes, scores, self.detector.config.evaluation)
+            detections += detections_of(boxes, scores, self.detector.config.evaluation)
         size = images.shape[2], images.shape[1]
         match_iou = self.detector.config.evaluation.match_iou
         values = [
-            curve(match_split([one], [labels], size, match_iou, self.radius_px)).ap_paper()
+            curve(match_split([frame_detections], [labels], size, match_iou, self.radius_px)).ap_paper()
             if labels.selected.any()
             else np.nan
-            for one, labels in zip(found, self.labels, strict=True)
+            for frame_detections, labels in zip(detections, self.labels, strict=True)
         ]
         return np.array(values)
 
@@ -56,9 +56,9 @@ class MotionPerformance:
     truth_m: Values
     """True translations, O_C of the earlier frame, or positions, O_L, (runs, pairs, 3), metres."""
     mean_m: Values
-    """Their mean over the training set (3,), metres."""
+    """Mean of the truth over the training set (3,), metres."""
     spread_m: Values
-    """Their standard deviation over the training set (3,), metres."""
+    """Standard deviation of the truth over the training set (3,), metres."""
     size_px: int
     """Width of the network's frames."""
 
@@ -70,5 +70,5 @@ class MotionPerformance:
         halves = [torch.from_numpy(half).unflatten(0, (runs, pairs)).to(device) for half in (first, second)]
         with torch.no_grad():
             output = torch.cat([self.navigator(*(half[k : k + 1] for half in halves))[0] for k in range(runs)])
-        found = self.mean_m + self.spread_m * output[..., :3].double().cpu().numpy()
-        return np.linalg.norm(found - self.truth_m, axis=-1).ravel()
+        estimated = self.mean_m + self.spread_m * output[..., :3].double().cpu().numpy()
+        return np.linalg.norm(estimated - self.truth_m, axis=-1).ravel()

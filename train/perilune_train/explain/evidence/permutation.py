@@ -8,13 +8,8 @@ from numpy.typing import ArrayLike
 
 from perilune_shared.geometry.frames import Array
 from perilune_train.explain.correlation.homography import moved_to_first, seen_in_second
-from perilune_train.explain.correlation.pearson import (
-    Maps,
-    given_basis,
-    pearson_rows,
-    residual_rows,
-    standardised_rows,
-)
+from perilune_train.explain.correlation.measures import FrameTargets, PairTargets
+from perilune_train.explain.correlation.pearson import given_basis, pearson_rows, residual_rows, standardised_rows
 from perilune_train.explain.evidence.significance import Signs
 from perilune_train.explain.maps.masks import Masks
 from perilune_train.records.spread import MIN_UNITS
@@ -47,8 +42,8 @@ def permuted(
     observed, means = np.nanmean(np.diagonal(values)), []
     for _ in range(n_draws):
         partner = everyone.copy()
-        for own, to in zip(members, rng.permutation(len(members)), strict=True):
-            partner[own] = members[to][np.arange(len(own)) * len(members[to]) // len(own)]
+        for rows, source in zip(members, rng.permutation(len(members)), strict=True):
+            partner[rows] = members[source][np.arange(len(rows)) * len(members[source]) // len(rows)]
         drawn = values[everyone, partner]
         if np.isfinite(drawn).any():
             means.append(np.nanmean(drawn))
@@ -56,36 +51,29 @@ def permuted(
     return float(np.mean(means)) if means else float("nan"), (1 + reached) / (1 + n_draws)
 
 
-def detector_permutations(
-    masks: Masks,
-    truth: Maps,
-    brightness: Maps,
-    gradient: Maps,
-    scene_ids: Sequence[str],
-    signs: Signs,
-    rng: np.random.Generator,
-) -> pd.DataFrame:
+def detector_permutations(masks: Masks, targets: FrameTargets, signs: Signs, rng: np.random.Generator) -> pd.DataFrame:
     """Rows of the permutation null for pcc1_craterness and pcc1_partial, with the columns of `null_differences`.
 
-    The maps are (N, height, width), as in `detector_values`; `signs` are those of `validation_signs`. PCC2 has no such
+    Masks are (N, height, width); `signs` are those of `validation_signs`. PCC2 has no such
     null: it does not depend on the order of the frames.
     """
-    basis = given_basis([brightness, gradient])
-    craterness = standardised_rows(1 - truth)
+    basis = given_basis([targets.brightness, targets.gradient])
+    craterness = standardised_rows(1 - targets.truth)
     residuals = residual_rows(craterness, basis)
     rows = []
-    for gate, found in masks.items():
-        own = standardised_rows(found)
-        matrices = {"pcc1_craterness": own @ craterness.T, "pcc1_partial": residual_rows(own, basis) @ residuals.T}
+    for gate, gate_masks in masks.items():
+        mask_rows = standardised_rows(gate_masks)
+        matrices = {
+            "pcc1_craterness": mask_rows @ craterness.T,
+            "pcc1_partial": residual_rows(mask_rows, basis) @ residuals.T,
+        }
         for measure, matrix in matrices.items():
             signed = signs["detect", measure, gate] * matrix
-            rows.append(_row("detect", measure, gate, signed, scene_ids, rng))
+            rows.append(_row("detect", measure, gate, signed, targets.scene_ids, rng))
     return pd.DataFrame(rows)
 
 
-def pair_permutations(
-    masks: Masks, homographies: Sequence[Array], scene_ids: Sequence[str], rng: np.random.Generator
-) -> pd.DataFrame:
+def pair_permutations(masks: Masks, targets: PairTargets, rng: np.random.Generator) -> pd.DataFrame:
     """Rows of the permutation null for pcc3, pcc4 and pcc4_minus_pcc3, with the columns of `null_differences`.
 
     Upper halves are compared with the lower halves of the pairs of other scenes, moved by the homography of their own
@@ -93,31 +81,33 @@ def pair_permutations(
     values therefore differ slightly from those of `pair_values`.
     """
     scale = np.diag([1 / _PAIR_STEP, 1 / _PAIR_STEP, 1.0])
-    small = [scale @ one @ np.linalg.inv(scale) for one in homographies]
+    small = [scale @ homography @ np.linalg.inv(scale) for homography in targets.homographies]
     rows = []
-    for gate, found in masks.items():
-        upper, lower = np.split(found, 2, axis=1)
-        upper, lower = (one[:, _PAIR_STEP // 2 :: _PAIR_STEP, _PAIR_STEP // 2 :: _PAIR_STEP] for one in (upper, lower))
+    for gate, gate_masks in masks.items():
+        upper, lower = np.split(gate_masks, 2, axis=1)
+        upper, lower = (
+            half_masks[:, _PAIR_STEP // 2 :: _PAIR_STEP, _PAIR_STEP // 2 :: _PAIR_STEP] for half_masks in (upper, lower)
+        )
         matrices: dict[str, list[Array]] = {"pcc3": [], "pcc4": []}
         for mask, homography in zip(upper, small, strict=True):
             seen = np.broadcast_to(seen_in_second(mask.shape, homography), lower.shape)
             same = np.broadcast_to(mask, lower.shape)
             matrices["pcc3"].append(pearson_rows(same, lower, seen))
-            moved = np.stack([moved_to_first(one, homography) for one in lower])
+            moved = np.stack([moved_to_first(half_masks, homography) for half_masks in lower])
             matrices["pcc4"].append(pearson_rows(same, moved, seen))
-        both = {measure: np.stack(own) for measure, own in matrices.items()}
+        both = {measure: np.stack(rows_of_measure) for measure, rows_of_measure in matrices.items()}
         both["pcc4_minus_pcc3"] = both["pcc4"] - both["pcc3"]
-        rows += [_row("navigate", measure, gate, matrix, scene_ids, rng) for measure, matrix in both.items()]
+        rows += [_row("navigate", measure, gate, matrix, targets.scene_ids, rng) for measure, matrix in both.items()]
     return pd.DataFrame(rows)
 
 
 def _row(
     task: str, measure: str, gate: str, matrix: Array, scene_ids: Sequence[str], rng: np.random.Generator
 ) -> dict[str, object]:
-    own = np.diagonal(matrix)
-    value = float(np.nanmean(own)) if np.isfinite(own).any() else float("nan")
+    diagonal = np.diagonal(matrix)
+    value = float(np.nanmean(diagonal)) if np.isfinite(diagonal).any() else float("nan")
     null_value, p = permuted(matrix, scene_ids, rng)
-    scenes = len(set(np.asarray(scene_ids)[np.isfinite(own)].tolist()))
+    scenes = len(set(np.asarray(scene_ids)[np.isfinite(diagonal)].tolist()))
     names = {"task": task, "measure": measure, "map": gate, "null": NULL, "value": value, "null_value": null_value}
     interval = {"difference": value - null_value, "low": float("nan"), "high": float("nan")}
     tested = {"p_bootstrap": float("nan"), "p": p if scenes >= MIN_UNITS else float("nan")}

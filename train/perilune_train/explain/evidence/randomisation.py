@@ -60,7 +60,7 @@ def cascade(
     order = range(count, 0, -1) if direction == "top_down" else range(1, count + 1)
     for step, stage in enumerate(order, start=1):
         with torch.random.fork_rng(devices=[]):
-            # Each stage has its own seed, so that both directions draw the same weights for it.
+            # Each stage has its own seed, so that both directions draw equal weights for it.
             torch.manual_seed(int(np.random.SeedSequence([rng_seed, stage]).generate_state(1)[0]))
             for part in _parts(changed, stage):
                 _reset(part)
@@ -101,11 +101,11 @@ def similarity(trained: Masks, other: Masks, step: str = "") -> pd.DataFrame:
     averaged to that width first, which is nearly the resolution of stage 2 for frames of 256 px.
     """
     rows = []
-    for name, found in trained.items():
-        a, b = _small(found), _small(other[name])
-        ranks = [np.stack([rankdata(one) for one in maps.reshape(len(maps), -1)]) for maps in (a, b)]
+    for name, trained_maps in trained.items():
+        a, b = _small(trained_maps), _small(other[name])
+        ranks = [np.stack([rankdata(values) for values in maps.reshape(len(maps), -1)]) for maps in (a, b)]
         spearman = pearson_rows(*ranks)
-        # Ranks of rounding errors are not constant.
+        # Ranks of rounding errors would not be constant.
         spearman[[is_constant(x) or is_constant(y) for x, y in zip(a, b, strict=True)]] = np.nan
         ssim = np.array([_ssim(x, y) for x, y in zip(a, b, strict=True)])
         rows.append({"map": name, "step": step, "spearman": _mean(spearman), "ssim": _mean(ssim)})
@@ -139,8 +139,10 @@ def randomised(
 
 def _parts(backbone: AttentionDarknet53, stage: int) -> list[nn.Module]:
     """The modules of a stage, 1 to 5; stage 1 includes the stem."""
-    own = [modules[name] for modules in (backbone.units, backbone.attentions) for name in _names(modules, stage)]
-    return [*([backbone.stem] if stage == 1 else []), backbone.downs[stage - 1], *own]
+    stage_modules = [
+        modules[name] for modules in (backbone.units, backbone.attentions) for name in _names(modules, stage)
+    ]
+    return [*([backbone.stem] if stage == 1 else []), backbone.downs[stage - 1], *stage_modules]
 
 
 def _names(modules: nn.ModuleDict, stage: int) -> list[str]:
@@ -159,7 +161,7 @@ def _small(maps: NDArray[np.floating]) -> Array:
     if width <= GRID_PX:
         return maps.astype(np.float64)
     size = GRID_PX, max(1, round(height * GRID_PX / width))
-    return np.stack([cv2.resize(one.astype(np.float64), size, interpolation=cv2.INTER_AREA) for one in maps])
+    return np.stack([cv2.resize(map_.astype(np.float64), size, interpolation=cv2.INTER_AREA) for map_ in maps])
 
 
 def _ssim(a: Array, b: Array) -> float:

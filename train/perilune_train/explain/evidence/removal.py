@@ -9,12 +9,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 Which = Literal["most", "least"]
-How = Literal["inpaint", "mean"]
+Filling = Literal["inpaint", "mean"]
 Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
-"""One value (N,) for each image (N, height, width), NaN if undefined."""
+"""One value (N,) for each image (N, height, width); NaN if undefined."""
 CONTROLS = ("random", "shifted")
+_FILLINGS: tuple[Filling, ...] = ("inpaint", "mean")
 BLOCK_PX = 8
-"""Side of the blocks that are removed, so that inpainting cannot restore single pixels."""
+"""Side of the removed blocks, pixels: inpainting cannot restore them as it restores single pixels."""
 _BINS = 10
 _INPAINT_RADIUS_PX = 3
 _WINDOW_PX = 31
@@ -50,16 +51,16 @@ def random_like(
     decile[np.lexsort((rng.random(means.size), means))] = np.arange(means.size) * _BINS // means.size
     taken = block_means(chosen, block_px).ravel() > 0.5
     drawn = [
-        rng.choice(np.flatnonzero(decile == one), int((taken & (decile == one)).sum()), replace=False)
-        for one in range(_BINS)
+        rng.choice(np.flatnonzero(decile == number), int((taken & (decile == number)).sum()), replace=False)
+        for number in range(_BINS)
     ]
     return _pixels(np.concatenate(drawn), image.shape, block_px)
 
 
 def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX) -> NDArray[np.bool_]:
-    """The chosen blocks flipped, turned and shifted circularly at random, so that their shape is the same elsewhere.
+    """The chosen blocks flipped, rotated and shifted circularly at random: an equal shape at another position.
 
-    Images that are not square are turned by 0 or 180 degrees.
+    Images that are not square are rotated by 0 or 180 degrees.
     """
     blocks = block_means(chosen, block_px) > 0.5
     height, width = blocks.shape
@@ -69,7 +70,7 @@ def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: 
     return _pixels(np.flatnonzero(moved), chosen.shape, block_px)
 
 
-def removed(image: NDArray[np.uint8], chosen: NDArray[np.bool_], how: How) -> NDArray[np.uint8]:
+def removed(image: NDArray[np.uint8], chosen: NDArray[np.bool_], how: Filling) -> NDArray[np.uint8]:
     """The image (height, width) with the chosen pixels replaced.
 
     "inpaint": by Telea's method (2004, doi 10.1080/10867651.2004.10487596), radius 3 px. "mean": by the mean of the
@@ -95,8 +96,6 @@ def removal_effect(
     measure: Measure,
     rng: np.random.Generator,
     share: float = 0.2,
-    hows: tuple[How, ...] = ("inpaint", "mean"),
-    block_px: int = BLOCK_PX,
 ) -> pd.DataFrame:
     """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
 
@@ -108,20 +107,22 @@ def removal_effect(
     """
     before = np.asarray(measure(images))
     tables = []
-    for name, found in maps.items():
+    for name, image_maps in maps.items():
         most, least = (
-            [chosen_pixels(one, share, which, sign[name], rng, block_px) for one in found]
+            [chosen_pixels(image_map, share, which, sign[name], rng) for image_map in image_maps]
             for which in ("most", "least")
         )
         choices = {
             "most": most,
             "least": least,
-            "random": [random_like(*pair, rng, block_px) for pair in zip(images, most, strict=True)],
-            "shifted": [shifted_like(one, rng, block_px) for one in most],
+            "random": [random_like(*pair, rng) for pair in zip(images, most, strict=True)],
+            "shifted": [shifted_like(image_map, rng) for image_map in most],
         }
         for which, chosen in choices.items():
-            overlap = [(one & first).sum() / one.sum() for one, first in zip(chosen, most, strict=True)]
-            for how in hows:
+            overlap = [
+                (image_map & first).sum() / image_map.sum() for image_map, first in zip(chosen, most, strict=True)
+            ]
+            for how in _FILLINGS:
                 changed = np.stack([removed(*pair, how) for pair in zip(images, chosen, strict=True)])
                 values = {"overlap": overlap, "before": before, "after": measure(changed)}
                 index = np.arange(len(images))
@@ -140,7 +141,7 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     """
     change = effects["before"] - effects["after"]
     harm = effects.assign(harm=change if higher_is_better else -change)
-    # A pivot table would leave out maps, and removals, without any value.
+    # A pivot table would leave out maps and removals without any value.
     means = harm.groupby(["map", "how", "which"])["harm"].mean()
     table = effects[["map", "how"]].drop_duplicates(ignore_index=True)
     pairs = list(zip(table["map"], table["how"], strict=True))
@@ -159,7 +160,7 @@ def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:
 
     Blocks at the right and at the lower edge are smaller if a side is not a multiple of block_px.
     """
-    sums, sizes = (_block_sums(one, block_px) for one in (values, np.ones(values.shape)))
+    sums, sizes = (_block_sums(array, block_px) for array in (values, np.ones(values.shape)))
     return sums / sizes
 
 

@@ -19,7 +19,7 @@ BEATS = "beats every null"
 PAIRWISE = ("pcc2",)
 """Measures whose value for a frame is a mean over its pairs with the other frames."""
 _FLIPS = 4096
-"""Sign flips; all of them with up to 12 units."""
+"""Number of sign flips; with up to 12 units, all flips."""
 _GROUP = ["task", "kind", "map", "measure"]
 
 
@@ -34,18 +34,18 @@ def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     rows = []
     for _, task in table.groupby("task", sort=False):
         frames = _Frames.of(task, rng)
-        for key, own in task.groupby(_GROUP, sort=False):
-            values = pairwise(str(key[-1]), frames.aligned(own))
+        for key, group_rows in task.groupby(_GROUP, sort=False):
+            values = pairwise(str(key[-1]), frames.aligned(group_rows))
             mean = frames.mean(values)
-            missing = {"undefined": int(own["value"].isna().sum()), "count": len(own)}
+            missing = {"undefined": int(group_rows["value"].isna().sum()), "count": len(group_rows)}
             rows.append(dict(zip(_GROUP, key, strict=True)) | mean.columns("value") | missing)
     return pd.DataFrame(rows)
 
 
 def validation_signs(table: pd.DataFrame) -> dict[tuple[str, str, str], float]:
     """Sign, 1 or -1, of the mean of every PCC1 on validation frames, by task, measure and map; 1 if undefined."""
-    own = table[table["measure"].str.startswith("pcc1")]
-    means = own.groupby(["task", "measure", "map"], as_index=False)["value"].mean()
+    rows = table[table["measure"].str.startswith("pcc1")]
+    means = rows.groupby(["task", "measure", "map"], as_index=False)["value"].mean()
     keys = zip(means["task"], means["measure"], means["map"], strict=True)
     return {key: -1.0 if mean < 0 else 1.0 for key, mean in zip(keys, means["value"], strict=True)}
 
@@ -70,12 +70,19 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
     rows = []
     for name, task in table.groupby("task", sort=False):
         frames = _Frames.of(task, rng)
-        for measure, own in task.groupby("measure", sort=False):
-            values = {str(one): frames.aligned(part) for one, part in own.groupby("map", sort=False)}
-            signed = {one: _sign(signs, str(name), str(measure), one) * found for one, found in values.items()}
-            nulls = [one for one in own.loc[own["kind"] == "null", "map"].unique() if np.isfinite(values[one]).any()]
-            for gate in own.loc[own["kind"] == kind, "map"].unique():
-                for null in (one for one in nulls if _applies(one, gate)):
+        for measure, measure_rows in task.groupby("measure", sort=False):
+            values = {str(map_name): frames.aligned(part) for map_name, part in measure_rows.groupby("map", sort=False)}
+            signed = {
+                map_name: _sign(signs, str(name), str(measure), map_name) * map_values
+                for map_name, map_values in values.items()
+            }
+            nulls = [
+                map_name
+                for map_name in measure_rows.loc[measure_rows["kind"] == "null", "map"].unique()
+                if np.isfinite(values[map_name]).any()
+            ]
+            for gate in measure_rows.loc[measure_rows["kind"] == kind, "map"].unique():
+                for null in (map_name for map_name in nulls if _applies(map_name, gate)):
                     difference = pairwise(str(measure), signed[gate] - signed[null])
                     means = {"value": _mean(signed[gate]), "null_value": _mean(signed[null])}
                     p_values = {"p_bootstrap": frames.bootstrap_p(difference), "p": frames.sign_flip_p(difference)}
@@ -129,18 +136,18 @@ def against_nulls(differences: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (task, measure), family in differences.groupby(["task", "measure"], sort=False):
-        gates = [(str(gate), own) for gate, own in family.groupby("map", sort=False)]
-        largest = [float(own["p"].fillna(1.0).max()) for _, own in gates]
-        for (gate, own), p, adjusted in zip(gates, largest, false_discovery_control(largest), strict=True):
-            beats, verdict = _verdict(own, float(adjusted))
+        gates = [(str(gate), gate_rows) for gate, gate_rows in family.groupby("map", sort=False)]
+        largest = [float(gate_rows["p"].fillna(1.0).max()) for _, gate_rows in gates]
+        for (gate, gate_rows), p, adjusted in zip(gates, largest, false_discovery_control(largest), strict=True):
+            beats, verdict = _verdict(gate_rows, float(adjusted))
             rows.append(
                 {
                     "task": task,
                     "measure": measure,
                     "map": gate,
-                    "value": float(own["value"].iloc[0]),
-                    "n_units": int(own["n_units"].min()),
-                    "unit": own["unit"].iloc[0],
+                    "value": float(gate_rows["value"].iloc[0]),
+                    "n_units": int(gate_rows["n_units"].min()),
+                    "unit": gate_rows["unit"].iloc[0],
                     "p": p,
                     "p_adjusted": float(adjusted),
                     "beats_all": beats,
@@ -182,28 +189,28 @@ class _Frames:
     @classmethod
     def of(cls, task: pd.DataFrame, rng: np.random.Generator) -> "_Frames":
         frames = task[["frame_id", "scene_id"]].drop_duplicates()
-        ids, scenes = [str(one) for one in frames["frame_id"]], [str(one) for one in frames["scene_id"]]
+        ids, scenes = [str(text) for text in frames["frame_id"]], [str(text) for text in frames["scene_id"]]
         if len(set(ids)) < len(ids):
             raise ValueError("a frame is in two scenes")
-        resamples = draw_resamples(scenes, [one.rpartition("/")[0] for one in ids], ids, rng)
+        resamples = draw_resamples(scenes, [text.rpartition("/")[0] for text in ids], ids, rng)
         return cls(pd.Index(ids), resamples, _flips(resamples.count, rng))
 
-    def aligned(self, own: pd.DataFrame) -> Array:
+    def aligned(self, rows: pd.DataFrame) -> Array:
         """Values (N,) of one map and measure; NaN where a frame has none."""
-        values = own["value"].to_numpy(np.float64)
-        found = np.full(len(self.ids), np.nan)
-        places = self.ids.get_indexer(pd.Index(own["frame_id"].astype(str)))
-        if len(np.unique(places)) < len(places):
-            raise ValueError(f"two values of one frame for {own['map'].iloc[0]}, {own['measure'].iloc[0]}")
-        found[places] = values
-        return found
+        values = rows["value"].to_numpy(np.float64)
+        aligned = np.full(len(self.ids), np.nan)
+        row_of_frame = self.ids.get_indexer(pd.Index(rows["frame_id"].astype(str)))
+        if len(np.unique(row_of_frame)) < len(row_of_frame):
+            raise ValueError(f"two values of one frame for {rows['map'].iloc[0]}, {rows['measure'].iloc[0]}")
+        aligned[row_of_frame] = values
+        return aligned
 
     def mean(self, values: Array) -> _Mean:
         """Mean of the defined values (N,) and its interval; none for images, which are not independent."""
         rows = np.flatnonzero(np.isfinite(values))
-        found = spreads(lambda drawn: {"mean": _ratio(drawn, rows, values)}, rows, self.resamples)["mean"]
+        spread = spreads(lambda drawn: {"mean": _ratio(drawn, rows, values)}, rows, self.resamples)["mean"]
         unit, n_units = self.resamples.unit, len(np.unique(self.resamples.of_row[rows]))
-        low, high = found.interval if found.interval and unit != "image" else (np.nan, np.nan)
+        low, high = spread.interval if spread.interval and unit != "image" else (np.nan, np.nan)
         return _Mean(_mean(values), low, high, n_units, unit)
 
     def bootstrap_p(self, values: Array) -> float:
@@ -251,15 +258,15 @@ def _applies(null: str, gate: str) -> bool:
     return target in ("", gate) or (target.startswith("stage_") and gate.startswith(f"B_{target[6:]}"))
 
 
-def _verdict(own: pd.DataFrame, p_adjusted: float) -> tuple[bool, str]:
-    """Whether a gate beats all its nulls, and the verdict; `own` are its differences."""
-    if own["value"].isna().all():
+def _verdict(rows: pd.DataFrame, p_adjusted: float) -> tuple[bool, str]:
+    """Whether a gate beats all its nulls, and the verdict; `rows` are its differences."""
+    if rows["value"].isna().all():
         return False, UNDEFINED
-    if own["unit"].iloc[0] != "scene" or own["n_units"].min() < MIN_UNITS:
+    if rows["unit"].iloc[0] != "scene" or rows["n_units"].min() < MIN_UNITS:
         return False, UNDECIDED
-    weaker = (own["p"] >= LEVEL) | (own["difference"] <= 0)
+    weaker = (rows["p"] >= LEVEL) | (rows["difference"] <= 0)
     if p_adjusted < LEVEL and not weaker.any():
         return True, BEATS
     # If only the correction for the number of gates fails, name the null with the largest p.
-    names = own.loc[weaker if weaker.any() else own["p"] == own["p"].max(), "null"]
+    names = rows.loc[weaker if weaker.any() else rows["p"] == rows["p"].max(), "null"]
     return False, "does not beat: " + ", ".join(sorted(set(names)))

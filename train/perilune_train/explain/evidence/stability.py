@@ -1,6 +1,7 @@
 """Similarity of masks under noise, shifts, another lens, and between two renderings of the same poses."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,12 +11,21 @@ from numpy.typing import NDArray
 from perilune_train.explain.correlation.pearson import pearson_rows
 from perilune_train.explain.maps.masks import Masks
 
-SIGMAS_DN = (2.0, 5.0)
-"""Standard deviations of the added noise, grey values of 255."""
-SHIFTS_PX = ((1, 0), (0, 1), (3, -2))
-"""Shifts to the right and down, pixels."""
-LENSES = (-0.05, 0.05)
-"""Radial distortions: relative change of the distance from the middle at half the image's width. Below 0: barrel."""
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """Changes of images under which masks are compared."""
+
+    noise_dn: tuple[float, ...] = (2.0, 5.0)
+    """Standard deviations of added noise, grey values of 255."""
+    shifts_px: tuple[tuple[int, int], ...] = ((1, 0), (0, 1), (3, -2))
+    """Shifts to the right and down, pixels."""
+    lenses: tuple[float, ...] = (-0.05, 0.05)
+    """Radial distortions: relative change of the distance from the centre at half the image width. Below 0: barrel."""
+
+
+DEFAULT_CHANGES = Changes()
+"""Noise, shifts and lenses of an explain run."""
 
 
 def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -24,7 +34,7 @@ def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) 
 
 
 def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
-    """Images (..., height, width) moved dx pixels to the right and dy down; edge pixels fill what becomes free."""
+    """Images (..., height, width) moved dx pixels to the right and dy down; edge pixels fill the gap."""
     height, width = images.shape[-2:]
     rows = np.clip(np.arange(height) - dy, 0, height - 1)
     columns = np.clip(np.arange(width) - dx, 0, width - 1)
@@ -47,9 +57,7 @@ def stability(
     masks_of: Callable[[NDArray[np.uint8]], Masks],
     images: NDArray[np.uint8],
     rng: np.random.Generator,
-    sigmas_dn: tuple[float, ...] = SIGMAS_DN,
-    shifts_px: tuple[tuple[int, int], ...] = SHIFTS_PX,
-    lenses: tuple[float, ...] = LENSES,
+    changes: Changes = DEFAULT_CHANGES,
     stacked: int = 1,
 ) -> pd.DataFrame:
     """Pearson correlation of the masks of images (N, height, width) with those of the changed images.
@@ -61,33 +69,33 @@ def stability(
     """
     before = masks_of(images)
     tables = []
-    for sigma_dn in sigmas_dn:
+    for sigma_dn in changes.noise_dn:
         tables.append(between(before, masks_of(noisy(images, sigma_dn, rng)), f"noise {sigma_dn:g} DN"))
-    for dx, dy in shifts_px:
+    for dx, dy in changes.shifts_px:
 
         def moved(values: NDArray, dx: int = dx, dy: int = dy) -> NDArray:
             frames = values.reshape(-1, values.shape[1] // stacked, values.shape[2])
             return shifted(frames, dx, dy).reshape(values.shape)
 
-        after = {name: moved(found, -dx, -dy) for name, found in masks_of(moved(images)).items()}
-        # A pixel is in both images if its place was not filled in, there and back.
+        after = {name: moved(gate_masks, -dx, -dy) for name, gate_masks in masks_of(moved(images)).items()}
+        # A pixel is in both images if no shift filled it in.
         inside = np.zeros((images.shape[1] // stacked, images.shape[2]), bool)
         height, width = inside.shape
         inside[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)] = True
         seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
         tables.append(_compared(before, after, f"shift {dx} {dy} px", seen))
-    for distortion in lenses:
+    for distortion in changes.lenses:
         maps = lens_map(images.shape[1] // stacked, images.shape[2], distortion)
 
         def bent(values: NDArray, maps: tuple = maps) -> NDArray:
             frames = values.reshape(-1, *maps[0].shape)
             x, y = maps
-            changed = [cv2.remap(one, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in frames]
+            changed = [cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for frame in frames]
             return np.stack(changed).reshape(values.shape)
 
         inside = (maps[0] >= 0) & (maps[0] <= images.shape[2] - 1) & (maps[1] >= 0) & (maps[1] <= len(maps[0]) - 1)
         seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
-        expected = {name: bent(found) for name, found in before.items()}
+        expected = {name: bent(gate_masks) for name, gate_masks in before.items()}
         tables.append(_compared(expected, masks_of(bent(images)), f"lens {100 * distortion:+g} %", seen))
     return pd.concat(tables, ignore_index=True)
 
@@ -109,8 +117,8 @@ def _compared(
     seen: NDArray[np.bool_] | None,
 ) -> pd.DataFrame:
     tables = []
-    for name, found in masks_a.items():
-        values = pearson_rows(found, masks_b[name], seen)
-        columns = {"frame_index": np.arange(len(found)), "pearson": values}
+    for name, before in masks_a.items():
+        values = pearson_rows(before, masks_b[name], seen)
+        columns = {"frame_index": np.arange(len(before)), "pearson": values}
         tables.append(pd.DataFrame({"map": name, "change": change, **columns}))
     return pd.concat(tables, ignore_index=True)

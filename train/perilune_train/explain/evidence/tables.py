@@ -1,4 +1,4 @@
-"""Results of one network as tables: what an explain run computes and what its page reads."""
+"""Results of one network as tables, which an explain run computes and its page reads."""
 
 from dataclasses import dataclass, field
 

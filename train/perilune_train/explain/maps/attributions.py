@@ -1,4 +1,4 @@
-"""Attribution maps of both networks by Grad-CAM, integrated gradients and occlusion (Captum).
+"""Attribution maps of the detector by Grad-CAM, integrated gradients and occlusion (Captum).
 
 All maps are float32 (N, height, width) at the size of the given frames. Frames are normalised, so that 0 is each
 frame's mean grey; the baseline of integrated gradients and of occlusion is 0.
@@ -15,26 +15,7 @@ from torch import Tensor, nn
 
 from perilune_train.detect.data.batches import network_input
 from perilune_train.models.darknet import UNITS, AttentionDarknet53
-from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
-
-
-class Target(Protocol):
-    """A scalar output for each image, of which attributions are computed."""
-
-    def __call__(self, grey: Tensor, *fixed: Tensor) -> Tensor:
-        """Scalars (N,) of normalised grey images (N, 1, height, width)."""
-
-    def fixed(self, grey: Tensor) -> tuple[Tensor, ...]:
-        """Further inputs, each (N, ...), which stay the same while the images are changed."""
-
-    @property
-    def backbone(self) -> AttentionDarknet53:
-        """The network's backbone."""
-
-    @property
-    def last_layer(self) -> nn.Module:
-        """The last layer with features of two dimensions, on which Grad-CAM is computed by default."""
 
 
 class DetectorTarget(nn.Module):
@@ -51,10 +32,12 @@ class DetectorTarget(nn.Module):
 
     @property
     def backbone(self) -> AttentionDarknet53:
+        """The network's backbone."""
         return self.network.backbone
 
     @property
     def last_layer(self) -> nn.Module:
+        """The features before the head of the finest stride, on which Grad-CAM is computed by default."""
         return self.network.branches[str(self.network.strides[0])]
 
     def scores(self, grey: Tensor) -> Tensor:
@@ -64,44 +47,13 @@ class DetectorTarget(nn.Module):
 
     @torch.no_grad()
     def fixed(self, grey: Tensor) -> tuple[Tensor, ...]:
+        """Which predictors belong to the sum (N, K); it stays the same while the images are changed."""
         scores = self.scores(grey)
         return ((scores >= self.min_score) | (scores == scores.amax(1, keepdim=True)),)
 
     def forward(self, grey: Tensor, *fixed: Tensor) -> Tensor:
+        """Sums (N,) for normalised grey images (N, 1, height, width)."""
         return (self.scores(grey) * fixed[0]).sum(1)
-
-
-class NavigatorTarget(nn.Module):
-    """Norm of the stack navigator's translation output for pairs stacked in height, the earlier frame above.
-
-    A network for poses outputs positions instead. The output is in spreads about its mean
-    (navigate/network.py:Scales). Each pair is treated as the first of a trajectory: the LSTM's state is zero. The
-    network must be in evaluation mode.
-    """
-
-    def __init__(self, network: StackNavigator):
-        super().__init__()
-        _check_evaluation(network)
-        self.network = network
-
-    @property
-    def backbone(self) -> AttentionDarknet53:
-        return self.network.backbone
-
-    @property
-    def last_layer(self) -> nn.Module:
-        return last_of_stage(self.backbone, len(self.backbone.channels))
-
-    def fixed(self, grey: Tensor) -> tuple[Tensor, ...]:
-        return ()
-
-    def forward(self, grey: Tensor, *fixed: Tensor) -> Tensor:
-        first, second = grey.chunk(2, dim=2)
-        features = self.network.features(first, second)
-        # cuDNN's LSTM has no backward pass in evaluation mode.
-        with torch.backends.cudnn.flags(enabled=False):
-            motion, _ = self.network.recurrent(features)
-        return torch.linalg.vector_norm(motion[:, 0, :3], dim=1)
 
 
 def last_of_stage(backbone: AttentionDarknet53, stage: int) -> nn.Module:
@@ -110,12 +62,11 @@ def last_of_stage(backbone: AttentionDarknet53, stage: int) -> nn.Module:
     return backbone.attentions[name] if name in backbone.attentions else backbone.units[name]
 
 
-def grad_cam(target: Target, frames: NDArray[np.float32], stage: int | None = None) -> NDArray[np.float32]:
+def grad_cam(target: DetectorTarget, frames: NDArray[np.float32], stage: int | None = None) -> NDArray[np.float32]:
     """Grad-CAM (N, height, width) of normalised frames, on the last layer of a stage 1..5, resized to the frames.
 
-    Selvaraju et al. 2017, doi 10.1109/ICCV.2017.74, with their ReLU. The default layer is the target's last one: the
-    detector's features before the head of its finest stride, the last stage of the navigator's backbone. A map can be
-    zero everywhere, as on stage 2 of the installed detector, where every weighted sum is negative.
+    Selvaraju et al. 2017, doi 10.1109/ICCV.2017.74, with their ReLU. The default layer is `target.last_layer`. A
+    map can be zero everywhere, as on stage 2 of the installed detector, where every weighted sum is negative.
     """
     method = LayerGradCam(target, target.last_layer if stage is None else last_of_stage(target.backbone, stage))
 
@@ -126,7 +77,7 @@ def grad_cam(target: Target, frames: NDArray[np.float32], stage: int | None = No
 
 
 def integrated_gradients(
-    target: Target, frames: NDArray[np.float32], n_steps: int = 16, signed: bool = False
+    target: DetectorTarget, frames: NDArray[np.float32], n_steps: int = 16, signed: bool = False
 ) -> NDArray[np.float32]:
     """Absolute integrated gradients (N, height, width) of normalised frames, from mean grey to the frame.
 
@@ -136,14 +87,14 @@ def integrated_gradients(
     method = IntegratedGradients(target)
 
     def one(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
-        found = method.attribute(grey, additional_forward_args=fixed, n_steps=n_steps, internal_batch_size=_BATCH)
-        return found if signed else found.abs()
+        gradients = method.attribute(grey, additional_forward_args=fixed, n_steps=n_steps, internal_batch_size=_BATCH)
+        return gradients if signed else gradients.abs()
 
     return _each(target, frames, one)
 
 
 def occlusion(
-    target: Target, frames: NDArray[np.float32], window_px: int = 16, stride_px: int = 16
+    target: DetectorTarget, frames: NDArray[np.float32], window_px: int = 16, stride_px: int = 16
 ) -> NDArray[np.float32]:
     """Decrease of the target (N, height, width) where a square window of normalised frames is set to mean grey.
 
@@ -171,15 +122,15 @@ class _Method(Protocol):
     def __call__(self, grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor: ...
 
 
-def _each(target: Target, frames: NDArray[np.float32], method: _Method) -> NDArray[np.float32]:
+def _each(target: DetectorTarget, frames: NDArray[np.float32], method: _Method) -> NDArray[np.float32]:
     """Maps of all frames, one frame at a time, resized to the frames."""
     device = next(target.backbone.parameters()).device
     height, width = frames.shape[1:]
     maps = np.empty(frames.shape, np.float32)
     for i, frame in enumerate(frames):
         grey = torch.from_numpy(frame)[None, None].to(device)
-        found = method(grey, target.fixed(grey))[0, 0].detach().float().cpu().numpy()
-        maps[i] = cv2.resize(found, (width, height), interpolation=cv2.INTER_LINEAR)
+        attribution = method(grey, target.fixed(grey))[0, 0].detach().float().cpu().numpy()
+        maps[i] = cv2.resize(attribution, (width, height), interpolation=cv2.INTER_LINEAR)
     return maps
 
 

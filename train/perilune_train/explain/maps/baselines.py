@@ -30,11 +30,11 @@ def edge_map(images: Images) -> Map:
 def contrast_map(images: Images) -> Map:
     """Standard deviation of brightness (N, height, width) in a square window of 9 px of images (N, height, width)."""
     window = (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX)
-    found = []
+    contrasts = []
     for image in images.astype(np.float64) / 255:
         mean, square = cv2.blur(image, window), cv2.blur(image * image, window)
-        found.append(np.sqrt(np.maximum(square - mean * mean, 0)))
-    return np.stack(found).astype(np.float32)
+        contrasts.append(np.sqrt(np.maximum(square - mean * mean, 0)))
+    return np.stack(contrasts).astype(np.float32)
 
 
 def gradient_map(images: Images) -> Map:
@@ -42,7 +42,9 @@ def gradient_map(images: Images) -> Map:
 
     Less sensitive to sensor noise than `edge_map`.
     """
-    return np.stack([_magnitude(cv2.GaussianBlur(one, (0, 0), GRADIENT_SIGMA_PX)) for one in brightness_map(images)])
+    return np.stack(
+        [_magnitude(cv2.GaussianBlur(image, (0, 0), GRADIENT_SIGMA_PX)) for image in brightness_map(images)]
+    )
 
 
 BASELINES: dict[str, Callable[[Images], Map]] = {
@@ -64,14 +66,16 @@ def baseline_maps(images: Images, px_per_input_px: float = 1.0) -> Masks:
     for name, function in BASELINES.items():
         full = function(images)
         for stage in range(1, _STAGES + 1):
-            maps[f"{name}/stage_{stage}"] = np.stack([_at_stride(one, 2**stage * px_per_input_px) for one in full])
+            maps[f"{name}/stage_{stage}"] = np.stack(
+                [_at_stride(full_map, 2**stage * px_per_input_px) for full_map in full]
+            )
     return maps
 
 
-def _at_stride(one: Map, stride_px: float) -> Map:
-    height, width = one.shape
+def _at_stride(map_: Map, stride_px: float) -> Map:
+    height, width = map_.shape
     size = max(1, round(width / stride_px)), max(1, round(height / stride_px))
-    small = cv2.resize(one, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(map_, size, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(small, (width, height)), np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Sheets of attention masks beside their images."""
+"""Sheets of attention masks with their images."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,8 +23,8 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
     All masks of the sheet share one scale, from the smallest to the largest value. Below each mask is its own range, or
     "constant" if it does not vary.
     """
-    low = min(float(found.min()) for found in masks.values())
-    high = max(float(found.max()) for found in masks.values())
+    low = min(float(gate_masks.min()) for gate_masks in masks.values())
+    high = max(float(gate_masks.max()) for gate_masks in masks.values())
     columns = min(_MOST_COLUMNS, 1 + len(masks))
     sheet = []
     for n, image in enumerate(images):
@@ -32,9 +32,9 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
         grey = np.clip(image / max(1.0, float(np.percentile(image, 99.5))) * 255, 0, 255).astype(np.uint8)
         frame = cv2.cvtColor(cv2.resize(grey, (_CELL_PX, height), interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
         cells = [_labelled(frame, f"{height_m[n]:.0f} m high")]
-        for name, found in masks.items():
-            mask = cv2.resize(found[n], (_CELL_PX, height))
-            cells.append(_labelled(_coloured(mask, low, high), caption(name, found[n])))
+        for name, gate_masks in masks.items():
+            mask = cv2.resize(gate_masks[n], (_CELL_PX, height))
+            cells.append(_labelled(_coloured(mask, low, high), caption(name, gate_masks[n])))
         cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
         sheet += [np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)]
     sheet.append(_colour_bar(sheet[0].shape[1], low, high))
@@ -43,8 +43,8 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
 
 def caption(block: str, mask: NDArray[np.floating]) -> str:
     """A block's name with the range of its mask, or with "constant" and the value."""
-    own = f"constant {mask.mean():.3f}" if is_constant(mask) else f"{mask.min():.3f}-{mask.max():.3f}"
-    return f"{block} {own}"
+    span = f"constant {mask.mean():.3f}" if is_constant(mask) else f"{mask.min():.3f}-{mask.max():.3f}"
+    return f"{block} {span}"
 
 
 def _coloured(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
-"""Spatial attention masks of the trained networks."""
+"""Spatial attention masks of the trained networks, and a file of them for a viewer of frames."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
+from perilune_shared.storage.files import written_aside
 from perilune_train.data.frames import normalised
 from perilune_train.models.darknet import AttentionDarknet53
 from perilune_train.models.navigator import StackNavigator
@@ -17,6 +19,8 @@ Masks = dict[str, NDArray[np.float32]]
 """Block "B_ij" to masks (N, height, width) of N images, resized to the size of the frames."""
 
 _BATCH = 8
+LARGEST_PX = 64
+"""Largest width of a stored mask; masks of deep gates have fewer pixels of their own."""
 
 
 def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
@@ -68,8 +72,35 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
     with torch.no_grad():
         for batch in inputs:
             for name, mask in backbone.attention_masks(batch).items():
-                own = mask[:, 0].float().cpu().numpy()
-                masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in own)
+                image_masks = mask[:, 0].float().cpu().numpy()
+                masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in image_masks)
     if not masks:
         raise UserError(where, "attention", "none", "a checkpoint of a network with attention gates")
-    return {name: np.stack(found) for name, found in masks.items()}
+    return {name: np.stack(gate_masks) for name, gate_masks in masks.items()}
+
+
+def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
+    """Write an .npz file with frame_ids (N,), blocks (B,), low (B,), high (B,), and uint8 masks (N, h, w) by block.
+
+    0 to 255 stand for `low` to `high`, the range of the block's masks (N, height, width).
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for block, block_masks in masks.items():
+        low, high = float(block_masks.min()), float(block_masks.max())
+        width = min(LARGEST_PX, max(8, block_masks.shape[2] // 2 ** int(block[2])))
+        size = width, max(1, round(block_masks.shape[1] * width / block_masks.shape[2]))
+        small = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in block_masks])
+        arrays[block] = np.rint(255 * (small - low) / max(high - low, 1e-9)).clip(0, 255).astype(np.uint8)
+    ends = {
+        name: np.array([float(getattr(block_masks, name)()) for block_masks in masks.values()], np.float32)
+        for name in ("min", "max")
+    }
+    with written_aside(path) as aside, aside.open("wb") as file:
+        np.savez_compressed(
+            file,
+            frame_ids=np.array(list(frame_ids), dtype=str),
+            blocks=np.array(list(masks), dtype=str),
+            low=ends["min"],
+            high=ends["max"],
+            **arrays,
+        )

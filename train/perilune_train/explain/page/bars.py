@@ -35,19 +35,19 @@ def draw_correlations(
     figure = Figure(figsize=(12, 3.3 * len(measures)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(measures), 1))
     for axis, (measure, label) in zip(axes, measures.items(), strict=True):
-        own = summary[(summary["kind"] == "gate") & (summary["measure"] == measure)].reset_index(drop=True)
+        rows = summary[(summary["kind"] == "gate") & (summary["measure"] == measure)].reset_index(drop=True)
         verdicts = tested[tested["measure"] == measure].set_index("map")["beats_all"]
-        beats = [bool(verdicts.get(block, False)) for block in own["map"]]
-        place = np.arange(len(own))
-        colours = [BLUE if one else "white" for one in beats]
-        axis.bar(place, own["value"], 0.7, color=colours, edgecolor=BLUE, linewidth=1.2)
-        errors = np.abs(np.vstack([own["value"] - own["low"], own["high"] - own["value"]]))
+        beats = [bool(verdicts.get(block, False)) for block in rows["map"]]
+        position = np.arange(len(rows))
+        colours = [BLUE if is_beating else "white" for is_beating in beats]
+        axis.bar(position, rows["value"], 0.7, color=colours, edgecolor=BLUE, linewidth=1.2)
+        errors = np.abs(np.vstack([rows["value"] - rows["low"], rows["high"] - rows["value"]]))
         if np.isfinite(errors).any():
-            axis.errorbar(place, own["value"], errors, fmt="none", ecolor="black", capsize=2, linewidth=1)
-        _draw_nulls(axis, own, differences[differences["measure"] == measure])
-        axis.set_xticks(place, own["map"], rotation=60)
+            axis.errorbar(position, rows["value"], errors, fmt="none", ecolor="black", capsize=2, linewidth=1)
+        _draw_nulls(axis, rows, differences[differences["measure"] == measure])
+        axis.set_xticks(position, rows["map"], rotation=60)
         axis.axhline(0, color="black", linewidth=0.8)
-        axis.set(ylabel=label, xlim=(-0.6, len(own) - 0.4))
+        axis.set(ylabel=label, xlim=(-0.6, len(rows) - 0.4))
         axis.grid(axis="y", alpha=0.3)
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(
@@ -61,13 +61,15 @@ def draw_correlations(
     save_figure(path, figure, dpi=110)
 
 
-def _draw_nulls(axis: Axes, own: pd.DataFrame, differences: pd.DataFrame) -> None:
+def _draw_nulls(axis: Axes, gates: pd.DataFrame, differences: pd.DataFrame) -> None:
     # A gate whose expected sign is -1 is drawn below 0; so are its nulls.
-    side = np.where(own["value"] < 0, -1.0, 1.0) if own["measure"].iloc[0].startswith("pcc1") else np.ones(len(own))
+    side = (
+        np.where(gates["value"] < 0, -1.0, 1.0) if gates["measure"].iloc[0].startswith("pcc1") else np.ones(len(gates))
+    )
     for null, rows in differences.groupby("null", sort=False):
-        values = rows.set_index("map")["null_value"].reindex(own["map"]).to_numpy()
+        values = rows.set_index("map")["null_value"].reindex(gates["map"]).to_numpy()
         marker, colour = _MARKERS.get(str(null), ("d", GREY))
-        axis.plot(np.arange(len(own)), side * values, marker, color=colour, markersize=4, label=str(null))
+        axis.plot(np.arange(len(gates)), side * values, marker, color=colour, markersize=4, label=str(null))
 
 
 def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
@@ -149,22 +151,22 @@ def draw_stability(path: Path, stability: pd.DataFrame) -> None:
 
 def draw_localisation(path: Path, summary: pd.DataFrame) -> None:
     """Draw the ROC-AUC of every map on crater pixels: gates, nulls and attribution methods; chance is 0.5."""
-    own = summary[summary["measure"] == "auc"]
+    rows = summary[summary["measure"] == "auc"]
     for null in ("untrained", "other frame"):
         # There is one of these nulls for each gate: draw the strongest.
-        ones = own["map"].str.startswith(f"{null}/")
-        best = own.loc[ones, "value"].max()
-        own = own[~ones | (own["value"] == best)]
-    own = own.reset_index(drop=True)
-    colours = own["kind"].map({"gate": BLUE, "null": GREY, "attribution": ORANGE})
+        ones = rows["map"].str.startswith(f"{null}/")
+        best = rows.loc[ones, "value"].max()
+        rows = rows[~ones | (rows["value"] == best)]
+    rows = rows.reset_index(drop=True)
+    colours = rows["kind"].map({"gate": BLUE, "null": GREY, "attribution": ORANGE})
     figure = Figure(figsize=(12, 3.6), layout="constrained")
     axis = figure.subplots()
-    axis.bar(np.arange(len(own)), own["value"] - 0.5, 0.7, bottom=0.5, color=colours)
-    errors = np.abs(np.vstack([own["value"] - own["low"], own["high"] - own["value"]]))
+    axis.bar(np.arange(len(rows)), rows["value"] - 0.5, 0.7, bottom=0.5, color=colours)
+    errors = np.abs(np.vstack([rows["value"] - rows["low"], rows["high"] - rows["value"]]))
     if np.isfinite(errors).any():
-        axis.errorbar(np.arange(len(own)), own["value"], errors, fmt="none", ecolor="black", capsize=2, linewidth=1)
+        axis.errorbar(np.arange(len(rows)), rows["value"], errors, fmt="none", ecolor="black", capsize=2, linewidth=1)
     axis.axhline(0.5, color="black", linewidth=0.8)
-    axis.set_xticks(np.arange(len(own)), own["map"], rotation=75, fontsize=8)
+    axis.set_xticks(np.arange(len(rows)), rows["map"], rotation=75, fontsize=8)
     axis.set_ylabel("ROC-AUC on crater pixels")
     axis.grid(axis="y", alpha=0.3)
     save_figure(path, figure, dpi=110)

@@ -1,56 +1,108 @@
 """All statements on the gates of a run, each with its figure, interval, nulls, verdict and picture."""
 
+import math
 from collections.abc import Collection
+from dataclasses import asdict, dataclass
 
+import numpy as np
+import pandas as pd
+
+from perilune_train.explain.evidence.gates import ALL
+from perilune_train.explain.evidence.removal import removal_summary
+from perilune_train.explain.evidence.significance import BEATS, LEVEL, UNDECIDED, unit_sign_flip_p
 from perilune_train.explain.evidence.tables import Evidence
-from perilune_train.explain.page.claim import Claim
-from perilune_train.explain.page.correlation_claims import (
-    LOCALISATION,
-    against_nulls,
-    deep_alike,
-    located,
-    motion,
-    shallow,
-)
-from perilune_train.explain.page.intervention_claims import HARM_RATIO, forced_claim, removal_claim
+from perilune_train.records.spread import MIN_UNITS
 
 LEAST_DEVIATION = 0.02
-"""A gate whose mask has a smaller standard deviation over pixels and images is called constant."""
+"""Smallest standard deviation over pixels and images of a mask that does not count as constant."""
 _REMOVES = "removing the 20 %"
+STILL_FROM = 37
+"""The paper: PCC4 is above PCC3 up to B_36, below from B_37."""
+DEEP_GATES = tuple(f"B_4{k}" for k in (8,)) + tuple(f"B_5{k}" for k in (1, 2, 3, 4))
+DEEP_ALIKE = 0.75
+LOCALISATION = {"auc": "ROC-AUC", "relevance_mass": "relevance mass", "pointing": "pointing game"}
+"""Measures of localisation and their names."""
+HARM_RATIO = 3.0
+"""Removing attended pixels should do at least this many times as much harm as the stronger control."""
 
 
-def detector_claims(found: Evidence, deviations: dict[str, float], guided: Collection[str] = ()) -> list[Claim]:
+@dataclass(frozen=True)
+class Claim:
+    """One statement; all fields are texts for a table."""
+
+    claim: str
+    """The statement, and who makes it."""
+    figure: str
+    """The measured figure."""
+    interval: str
+    """Its 95 % interval over scenes, or why there is none."""
+    nulls: str
+    """The figure of the nulls or controls."""
+    verdict: str
+    """holds, does not hold, or undecided, with the reason."""
+    picture: str
+    """File name of the picture that shows it."""
+
+    def plain(self) -> dict[str, str]:
+        """The fields as plain data."""
+        return asdict(self)
+
+
+def decided(holds: bool, scenes: int) -> str:
+    """The verdict on a statement that was measured over a number of scenes."""
+    return UNDECIDED if scenes < MIN_UNITS else "holds" if holds else "does not hold"
+
+
+def row_of(evidence: Evidence, measure: str, name: str) -> pd.Series:
+    """The row of the summary of a map and measure."""
+    rows = evidence.summary[(evidence.summary["measure"] == measure) & (evidence.summary["map"] == name)]
+    return rows.iloc[0]
+
+
+def interval_text(row: pd.Series) -> str:
+    """The interval and the units of a row of the summary, or that there is no interval."""
+    if math.isfinite(row["low"]) and math.isfinite(row["high"]):
+        return f"{row['low']:.2f} to {row['high']:.2f} ({row['n_units']} units: {row['unit']})"
+    return f"none: {row['n_units']} units ({row['unit']})"
+
+
+def scenes_of(rows: pd.DataFrame) -> int:
+    """The number of scenes behind rows of a summary: 1 if their units are trajectories of one scene."""
+    return int(rows["n_units"].min()) if len(rows) and (rows["unit"] == "scene").all() else 1
+
+
+def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Collection[str] = ()) -> list[Claim]:
     """Claims on the detector; `deviations` are the standard deviations of the masks over pixels and images.
 
     `guided` are gates whose masks were trained to follow labels; the claims say so.
     """
-    strongest = found.strongest
+    strongest = evidence.strongest
     follows = f"Detector: the mask of {strongest} follows craters"
     trained = ", as it was trained to" if strongest in guided else ""
     beyond = f"{follows} beyond brightness and gradient{trained}"
     unit = "AP of a frame"
     return [
-        against_nulls(found, "pcc1_craterness", strongest, follows + trained, "pcc_detect.png"),
-        against_nulls(found, "pcc1_partial", strongest, beyond, "pcc_detect.png"),
-        shallow(found),
-        deep_alike(found),
-        *(located(found, measure) for measure in LOCALISATION),
-        removal_claim(found, "Detector", unit, "removal_detect.png", higher_is_better=True),
-        forced_claim(found, "Detector", unit, "gates_detect.png", higher_is_better=True),
+        against_nulls(evidence, "pcc1_craterness", strongest, follows + trained, "pcc_detect.png"),
+        against_nulls(evidence, "pcc1_partial", strongest, beyond, "pcc_detect.png"),
+        shallow(evidence),
+        deep_alike(evidence),
+        *(located(evidence, measure) for measure in LOCALISATION),
+        removal_claim(evidence, "Detector", unit, "removal_detect.png", higher_is_better=True),
+        forced_claim(evidence, "Detector", unit, "gates_detect.png", higher_is_better=True),
         _constant("Detector", deviations, "masks_detect.png"),
     ]
 
 
-def navigator_claims(found: Evidence, deviations: dict[str, float]) -> list[Claim]:
+def navigator_claims(evidence: Evidence, deviations: dict[str, float]) -> list[Claim]:
     """Claims on the stack navigator."""
-    strongest, unit = found.strongest, "position error of a pair, m"
+    strongest, unit = evidence.strongest, "position error of a pair, m"
     alike = f"Navigator: both halves of the mask of {strongest} mark the same ground (PCC4)"
     return [
-        against_nulls(found, "pcc4", strongest, alike, "pcc_navigate.png"),
-        motion(found, moving=True),
-        motion(found, moving=False),
-        removal_claim(found, "Navigator", unit, "removal_navigate.png", higher_is_better=False),
-        forced_claim(found, "Navigator", unit, "gates_navigate.png", higher_is_better=False),
+        against_nulls(evidence, "pcc4", strongest, alike, "pcc_navigate.png"),
+        motion(evidence, moving=True),
+        motion(evidence, moving=False),
+        removal_claim(evidence, "Navigator", unit, "removal_navigate.png", higher_is_better=False),
+        forced_claim(evidence, "Navigator", unit, "gates_navigate.png", higher_is_better=False),
         _constant("Navigator", deviations, "masks_navigate.png"),
     ]
 
@@ -59,11 +111,11 @@ def headline(claims: list[Claim]) -> str:
     """One sentence for each task: whether its strongest gate beats every null, and whether removal hurts enough."""
     sentences = []
     for task in ("Detector", "Navigator"):
-        own = [one for one in claims if one.claim.startswith(task)]
-        if not own:
+        task_claims = [claim for claim in claims if claim.claim.startswith(task)]
+        if not task_claims:
             continue
-        parts = [f"{own[0].claim[len(task) + 2 :]}: {own[0].verdict}"]
-        removal = next((one for one in own if _REMOVES in one.claim), None)
+        parts = [f"{task_claims[0].claim[len(task) + 2 :]}: {task_claims[0].verdict}"]
+        removal = next((claim for claim in task_claims if _REMOVES in claim.claim), None)
         if removal is not None:
             parts.append(
                 f"removing what it attends to hurts {HARM_RATIO:g} times as much as controls: {removal.verdict}"
@@ -83,3 +135,213 @@ def _constant(task: str, deviations: dict[str, float], picture: str) -> Claim:
         "does not hold" if constant else "holds",
         picture,
     )
+
+
+def against_nulls(evidence: Evidence, measure: str, gate: str, claim: str, picture: str) -> Claim:
+    """Whether a gate beats every null in a measure."""
+    row = row_of(evidence, measure, gate)
+    tested = evidence.tested[(evidence.tested["measure"] == measure) & (evidence.tested["map"] == gate)]
+    verdict = "undefined: no null has a value" if tested.empty else str(tested.iloc[0]["verdict"])
+    verdict = f"holds: {BEATS}" if verdict == BEATS else verdict
+    figure = f"{row['value']:.2f}" if math.isfinite(row["value"]) else "-"
+    return Claim(claim, figure, interval_text(row), null_means(evidence, measure, gate), verdict, picture)
+
+
+def null_means(evidence: Evidence, measure: str, gate: str) -> str:
+    """The mean of each null of a gate; a null whose map is constant in every image is undefined and not tested."""
+    rows = evidence.differences[(evidence.differences["measure"] == measure) & (evidence.differences["map"] == gate)]
+    texts = [f"{row.null} {row.null_value:.2f}" for row in rows.itertuples()]
+    values = evidence.values[(evidence.values["measure"] == measure) & (evidence.values["map"] == f"untrained/{gate}")]
+    if len(values) and values["value"].isna().all():
+        texts.append("untrained undefined (constant, not tested)")
+    return ", ".join(texts)
+
+
+def shallow(evidence: Evidence) -> Claim:
+    """Whether each stage up to stride 8 has a gate that follows craters and beats every null."""
+    tested = evidence.tested[(evidence.tested["measure"] == "pcc1_craterness")]
+    shallow_gates = tested[tested["map"].str[2].isin(["1", "2", "3"])]
+    beating = beating_gates(evidence, "pcc1_craterness")
+    stages = [str(k) for k in (1, 2, 3) if any(block[2] == str(k) for block in beating)]
+    undecided = bool(shallow_gates["verdict"].str.startswith("undecided").any())
+    return Claim(
+        "Detector: every stage up to stride 8 has a gate that beats every null (paper: shallow gates follow craters)",
+        f"{len(beating)} of {len(shallow_gates)} gates, stages {', '.join(stages) or 'none'}",
+        "by gate in pcc_detect.png",
+        f"untrained, edge, contrast, brightness, other frame, permutation; Benjamini-Hochberg over {len(tested)} gates",
+        UNDECIDED if undecided else "holds" if len(stages) == 3 else "does not hold",
+        "pcc_detect.png",
+    )
+
+
+def beating_gates(evidence: Evidence, measure: str, stages: str = "123") -> list[str]:
+    """Gates of some stages that beat every null in a measure, corrected for the number of gates."""
+    rows = evidence.tested[(evidence.tested["measure"] == measure) & evidence.tested["beats_all"]]
+    return rows.loc[rows["map"].str[2].isin(list(stages)), "map"].tolist()
+
+
+def deep_alike(evidence: Evidence) -> Claim:
+    """Whether deep masks of two frames are alike, as the paper claims."""
+    gates = [gate for gate in DEEP_GATES if gate in set(evidence.summary["map"])]
+    rows = [row_of(evidence, "pcc2", gate) for gate in gates]
+    values = [float(row["value"]) for row in rows]
+    untrained = [_null_value(evidence, "pcc2", gate, "untrained") for gate in gates]
+    holds = all(value > DEEP_ALIKE for value in values)
+    trivial = holds and all(value > DEEP_ALIKE for value in untrained)
+    verdict = decided(holds, scenes_of(pd.DataFrame(rows)))
+    verdict = "holds, as in the untrained network" if verdict == "holds" and trivial else verdict
+    return Claim(
+        f"Paper: PCC2 of {', '.join(gates)} is above {DEEP_ALIKE}",
+        ", ".join(f"{value:.2f}" for value in values),
+        "; ".join(interval_text(row) for row in rows),
+        "untrained " + ", ".join(f"{value:.2f}" for value in untrained),
+        verdict,
+        "pcc_detect.png",
+    )
+
+
+def _null_value(evidence: Evidence, measure: str, gate: str, null: str) -> float:
+    rows = evidence.differences
+    rows = rows[(rows["measure"] == measure) & (rows["map"] == gate) & (rows["null"] == null)]
+    return float(rows["null_value"].iloc[0]) if len(rows) else float("nan")
+
+
+def located(evidence: Evidence, measure: str) -> Claim:
+    """Whether the strongest gate locates craters better than its nulls and than attribution methods.
+
+    A method is compared over the frames that have its map, paired, by sign flips of whole scenes. With fewer than five
+    such scenes the comparison is undecided.
+    """
+    gate = evidence.strongest
+    row = row_of(evidence, measure, gate)
+    nulls = against_nulls(evidence, measure, gate, "", "")
+    methods = evidence.summary.loc[
+        (evidence.summary["measure"] == measure) & (evidence.summary["kind"] == "attribution"), "map"
+    ].unique()
+    compared = {str(name): _paired(evidence, measure, gate, str(name)) for name in methods}
+    lost = [name for name, (_, p, _) in compared.items() if not p < LEVEL]
+    least = min((scenes for _, _, scenes in compared.values()), default=scenes_of(row.to_frame().T))
+    verdict = nulls.verdict
+    if verdict.startswith("holds"):
+        verdict = decided(not lost, least)
+        if verdict == "does not hold":
+            verdict += ": not better than " + ", ".join(lost)
+    texts = [f"{name} {value:.2f} (p {p:.3f}, {scenes} scenes)" for name, (value, p, scenes) in compared.items()]
+    chance = "0.50" if measure == "auc" else f"{row_of(evidence, f'{measure}_chance', gate)['value']:.2f}"
+    return Claim(
+        f"Detector: {gate} locates crater pixels better than nulls and attribution methods ({LOCALISATION[measure]})",
+        f"{row['value']:.2f}",
+        interval_text(row),
+        ", ".join([f"chance {chance}", nulls.nulls, *texts]),
+        verdict,
+        "localisation_detect.png",
+    )
+
+
+def _paired(evidence: Evidence, measure: str, gate: str, name: str) -> tuple[float, float, int]:
+    """Of an attribution method: its mean, p of "the gate is better" over the same frames, and the number of scenes."""
+    rows = evidence.values[evidence.values["measure"] == measure]
+    table = rows[rows["map"].isin([gate, name])].pivot_table(
+        index=["scene_id", "frame_id"], columns="map", values="value", aggfunc="first"
+    )
+    if name not in table or gate not in table:
+        return math.nan, math.nan, 0
+    table = table.dropna()
+    by_scene = (table[gate] - table[name]).groupby(level="scene_id").mean().to_numpy(np.float64)
+    return float(table[name].mean()), unit_sign_flip_p(by_scene), len(by_scene)
+
+
+def motion(evidence: Evidence, *, moving: bool) -> Claim:
+    """Sign of PCC4 - PCC3 of the gates up to B_36, or from B_37 on, with the nulls of these gates."""
+    rows = evidence.summary[(evidence.summary["measure"] == "pcc4_minus_pcc3") & (evidence.summary["kind"] == "gate")]
+    number = rows["map"].str[2:].astype(int)
+    rows = rows[number < STILL_FROM] if moving else rows[number >= STILL_FROM]
+    fit = rows["value"] > 0 if moving else rows["value"] < 0
+    nulls = evidence.differences[
+        (evidence.differences["measure"] == "pcc4_minus_pcc3") & evidence.differences["map"].isin(rows["map"])
+    ]
+    medians = nulls.groupby("null", sort=False)["null_value"].median()
+    verdict = decided(bool(fit.all()), scenes_of(rows))
+    figure = f"{int(fit.sum())} of {len(rows)} gates; median difference {rows['value'].median():.2f}"
+    if moving:
+        tested = evidence.tested[
+            (evidence.tested["measure"] == "pcc4_minus_pcc3") & evidence.tested["map"].isin(rows["map"])
+        ]
+        beating = int(tested["beats_all"].sum())
+        figure += f"; {beating} beat every null"
+        if verdict == "holds" and beating < len(rows):
+            verdict = f"holds, but {len(rows) - beating} of {len(rows)} gates do not beat every null"
+    return Claim(
+        f"Paper: PCC4 is {'above' if moving else 'below'} PCC3 {'up to B_36' if moving else 'from B_37 on'}",
+        figure,
+        "by gate in pcc_navigate.png",
+        "medians over these gates: " + ", ".join(f"{null} {value:.2f}" for null, value in medians.items())
+        if len(medians)
+        else "-",
+        verdict,
+        "pcc_navigate.png",
+    )
+
+
+def removal_row(evidence: Evidence, *, higher_is_better: bool) -> pd.Series:
+    """Harm of removing the strongest gate's pixels (a row of `removal_summary`), by the less favourable filling."""
+    table = removal_summary(evidence.removal, higher_is_better)
+    rows = table[table["map"] == evidence.strongest]
+    return rows.iloc[int(np.argmin(rows["ratio"].fillna(-np.inf).to_numpy()))]
+
+
+def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
+    """Whether removing attended pixels hurts HARM_RATIO times as much as the stronger control."""
+    row = removal_row(evidence, higher_is_better=higher_is_better)
+    controls = (
+        f"random {row['random']:.3f}, same shape elsewhere {row['shifted']:.3f}, least attended {row['least']:.3f}"
+    )
+    scenes = evidence.removal.loc[evidence.removal["before"].notna(), "scene_id"].nunique()
+    if math.isnan(row["most"]):
+        times = "no image with a value"
+    elif math.isfinite(row["ratio"]):
+        times = f"{row['ratio']:.1f} times the stronger control"
+    else:
+        times = "the stronger control does no harm, so there is no ratio"
+    return Claim(
+        f"{task}: removing the 20 % that {evidence.strongest} attends to hurts at least {HARM_RATIO:g} times as much as"
+        f" a control ({unit})",
+        f"{row['most']:.3f}; {times} (filled by {row['how']}, the less favourable)",
+        f"none: ratio over {scenes} scenes",
+        controls,
+        decided(math.isfinite(row["ratio"]) and row["ratio"] >= HARM_RATIO and row["most"] > 0, scenes),
+        picture,
+    )
+
+
+def forced_harm(evidence: Evidence, *, higher_is_better: bool) -> dict[str, float]:
+    """Mean harm over frames of forcing each gate, each stage and all gates to their means, by name."""
+    harm = _harms(evidence, higher_is_better).groupby("scope", sort=False)["harm"].mean()
+    return {str(scope): float(value) for scope, value in harm.items()}
+
+
+def forced_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
+    """Whether the output gets worse if all gates are forced to their means."""
+    harm = forced_harm(evidence, higher_is_better=higher_is_better)
+    single = pd.Series({scope: value for scope, value in harm.items() if scope.startswith("B_")}).dropna()
+    table = _harms(evidence, higher_is_better)
+    by_scene = table[table["scope"] == ALL].groupby("scene_id")["harm"].mean()
+    scenes = by_scene.dropna().to_numpy(np.float64)
+    p = unit_sign_flip_p(scenes)
+    interval = "none: no scene with a value"
+    if len(scenes):
+        interval = f"smallest and largest of {len(scenes)} scenes: {scenes.min():.3f} to {scenes.max():.3f}, p {p:.4f}"
+    controls = f"largest single gate {single.idxmax()} {single.max():.3f}; median gate {single.median():.3f}"
+    return Claim(
+        f"{task}: the pattern of the masks matters (all gates forced to their means: {unit})",
+        f"harm {harm[ALL]:.3f}",
+        interval,
+        controls if len(single) else "-",
+        decided(p < LEVEL, len(scenes)),
+        picture,
+    )
+
+
+def _harms(evidence: Evidence, higher_is_better: bool) -> pd.DataFrame:
+    change = (evidence.gates["before"] - evidence.gates["after"]) * (1 if higher_is_better else -1)
+    return evidence.gates.assign(harm=change)

@@ -1,8 +1,15 @@
 """All pictures of an explain run, and their captions."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from perilune_train.explain.config import ExplainConfig
+from perilune_train.explain.evidence.removal import CONTROLS, chosen_pixels, random_like, removed, shifted_like
 from perilune_train.explain.evidence.tables import Evidence
 from perilune_train.explain.inputs import LabelledFrames, Pairs, evenly_spaced
 from perilune_train.explain.maps.drawing import draw_masks
@@ -15,7 +22,7 @@ from perilune_train.explain.page.bars import (
     draw_removal,
     draw_stability,
 )
-from perilune_train.explain.page.pairs import draw_removed
+from perilune_train.records.pictures import save_image
 
 _DETECT = {
     "pcc1_craterness": "PCC1: mask and craters\n(above 0: stronger on craters)",
@@ -54,56 +61,93 @@ PICTURES = {
 """Picture files of each network."""
 
 
+Images = TypeVar("Images", LabelledFrames, Pairs)
+_CELL_PX = 256
+_CAPTION_PX = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Masked(Generic[Images]):
+    """Frames or pairs with the masks of all gates."""
+
+    images: Images
+    """N frames or pairs."""
+    masks: Masks
+    """Mask of each image by gate (N, height, width)."""
+
+
 def draw_detector(
     folder: Path,
     settings: ExplainConfig,
-    frames: LabelledFrames,
-    masks: Masks,
-    found: Evidence,
-    descent: LabelledFrames,
-    along: Masks,
+    evidence: Evidence,
+    frames: Masked[LabelledFrames],
+    descent: Masked[LabelledFrames],
 ) -> None:
     """Draw all pictures of the detector into a folder.
 
-    `along` are the masks of the frames of one descent, of which `n_drawn` are drawn, from the highest to the lowest.
+    `n_drawn` frames of the descent are drawn, from the highest to the lowest, and the middle one of `frames`.
     """
-    drawn = evenly_spaced(len(descent.images), settings.n_drawn)
-    shown = {name: one[drawn] for name, one in along.items()}
-    draw_masks(folder / "masks_detect.png", descent.images[drawn], shown, [descent.height_m[k] for k in drawn])
-    draw_correlations(folder / "pcc_detect.png", found.summary, found.differences, found.tested, _DETECT)
-    draw_localisation(folder / "localisation_detect.png", found.summary)
-    _draw_interventions(folder, "detect", found, "decrease of the AP of a frame", higher_is_better=True)
-    middle = len(frames.images) // 2
-    draw_removed(
-        folder / "before_after_detect.png",
-        frames.images[middle],
-        masks[found.strongest][middle],
-        found.signs[found.strongest],
-        settings.removed_share,
-        settings.seed,
-    )
+    images = descent.images
+    drawn = evenly_spaced(len(images.images), settings.n_drawn)
+    masks = {gate: values[drawn] for gate, values in descent.masks.items()}
+    draw_masks(folder / "masks_detect.png", images.images[drawn], masks, [images.height_m[k] for k in drawn])
+    draw_correlations(folder / "pcc_detect.png", evidence.summary, evidence.differences, evidence.tested, _DETECT)
+    draw_localisation(folder / "localisation_detect.png", evidence.summary)
+    _draw_interventions(folder, "detect", evidence, "decrease of the AP of a frame", higher_is_better=True)
+    _draw_removed(folder / "before_after_detect.png", settings, evidence, frames)
 
 
 def draw_navigator(
-    folder: Path, settings: ExplainConfig, pairs: Pairs, masks: Masks, found: Evidence, descent: Pairs, along: Masks
+    folder: Path, settings: ExplainConfig, evidence: Evidence, pairs: Masked[Pairs], descent: Masked[Pairs]
 ) -> None:
-    """Draw all pictures of the navigator into a folder; `along` are the masks of the drawn pairs of one descent."""
-    draw_masks(folder / "masks_navigate.png", descent.images, along, descent.height_m)
-    draw_correlations(folder / "pcc_navigate.png", found.summary, found.differences, found.tested, _NAVIGATE)
-    _draw_interventions(folder, "navigate", found, "increase of the position error, m", higher_is_better=False)
-    middle = len(pairs.images) // 2
-    draw_removed(
-        folder / "before_after_navigate.png",
-        pairs.images[middle],
-        masks[found.strongest][middle],
-        found.signs[found.strongest],
-        settings.removed_share,
-        settings.seed,
+    """Draw all pictures of the navigator into a folder: all pairs of `descent`, and the middle one of `pairs`."""
+    draw_masks(folder / "masks_navigate.png", descent.images.images, descent.masks, descent.images.height_m)
+    draw_correlations(folder / "pcc_navigate.png", evidence.summary, evidence.differences, evidence.tested, _NAVIGATE)
+    _draw_interventions(folder, "navigate", evidence, "increase of the position error, m", higher_is_better=False)
+    _draw_removed(folder / "before_after_navigate.png", settings, evidence, pairs)
+
+
+def _draw_removed(path: Path, settings: ExplainConfig, evidence: Evidence, masked: Masked) -> None:
+    """Draw the middle image before and after removal of the pixels that the strongest gate attends to."""
+    gate, middle = evidence.strongest, len(masked.images.images) // 2
+    image, mask = masked.images.images[middle], masked.masks[gate][middle]
+    draw_removed(path, image, mask, evidence.signs[gate], settings.removed_share, settings.seed)
+
+
+def _draw_interventions(folder: Path, task: str, evidence: Evidence, unit: str, *, higher_is_better: bool) -> None:
+    draw_gates(folder / f"gates_{task}.png", evidence.gates, unit, higher_is_better)
+    draw_removal(folder / f"removal_{task}.png", evidence.removal, unit, higher_is_better)
+    draw_randomisation(folder / f"randomisation_{task}.png", evidence.randomisation)
+    draw_stability(folder / f"stability_{task}.png", evidence.stability)
+
+
+def draw_removed(
+    path: Path, image: NDArray[np.uint8], map_: NDArray[np.floating], sign: int, share: float, seed: int
+) -> None:
+    """Draw a PNG row: the image (height, width), its map, and the image with the most attended, random, shifted and
+    least attended pixels inpainted.
+    """
+    rng = np.random.default_rng(seed)
+    most, least = (chosen_pixels(map_, share, which, sign, rng) for which in ("most", "least"))
+    choices = {
+        "most attended": most,
+        CONTROLS[0]: random_like(image, most, rng),
+        CONTROLS[1]: shifted_like(most, rng),
+        "least attended": least,
+    }
+    low, high = float(map_.min()), float(map_.max())
+    level = (255 * (map_ - low) / max(high - low, 1e-9)).astype(np.uint8)
+    cells = {"before": cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), "mask": cv2.applyColorMap(level, cv2.COLORMAP_CIVIDIS)}
+    for name, chosen in choices.items():
+        cells[name] = cv2.cvtColor(removed(image, chosen, "inpaint"), cv2.COLOR_GRAY2BGR)
+    save_image(path, np.hstack([_captioned(np.asarray(cell, np.uint8), name) for name, cell in cells.items()]))
+
+
+def _captioned(cell: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    size = _CELL_PX, round(_CELL_PX * cell.shape[0] / cell.shape[1])
+    framed = cv2.copyMakeBorder(
+        cv2.resize(cell, size), 2, _CAPTION_PX, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255)
     )
-
-
-def _draw_interventions(folder: Path, task: str, found: Evidence, unit: str, *, higher_is_better: bool) -> None:
-    draw_gates(folder / f"gates_{task}.png", found.gates, unit, higher_is_better)
-    draw_removal(folder / f"removal_{task}.png", found.removal, unit, higher_is_better)
-    draw_randomisation(folder / f"randomisation_{task}.png", found.randomisation)
-    draw_stability(folder / f"stability_{task}.png", found.stability)
+    where = 4, framed.shape[0] - 5
+    cv2.putText(framed, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.asarray(framed, np.uint8)

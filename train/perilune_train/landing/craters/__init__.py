@@ -1,1 +1,1 @@
-"""Absolute navigation by craters: a catalogue, matching detections to it, and the pose that follows."""
+"""Absolute navigation by craters: a catalogue, its match with detections, and the camera pose from that match."""

@@ -12,7 +12,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.neighbours import Grid, grid_of, nearest
 
 LEAST_DIAMETER_M = 5.0
-"""Smallest crater of a catalogue that is made from a dataset, where nothing else is asked for."""
+"""Smallest diameter, metres, in a catalogue that is made from a dataset, by default."""
 Chosen = NDArray[np.integer] | NDArray[np.bool_]
 """An index or a mask."""
 
@@ -38,8 +38,10 @@ class Catalogue:
     def part(self, chosen: Chosen) -> "Catalogue":
         """Some of the craters."""
         places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
-        # Many times as fast as an index.
-        centre_m, normal, radius_m = (own.take(places, axis=0) for own in (self.centre_m, self.normal, self.radius_m))
+        # `take` is many times as fast as indexing.
+        centre_m, normal, radius_m = (
+            column.take(places, axis=0) for column in (self.centre_m, self.normal, self.radius_m)
+        )
         return replace(self, centre_m=centre_m, normal=normal, radius_m=radius_m)
 
     def ground_m(self, position_m: Array, count: int) -> float:
@@ -61,13 +63,13 @@ class CatalogueErrors:
     diameter_sigma_share: float = 0.03
     """Standard deviation of the diameter, divided by it."""
     missing_share: float = 0.1
-    """Share of the craters that it lacks."""
+    """Share of the real craters that the catalogue lacks."""
     false_share: float = 0.05
-    """Share of its craters that do not exist."""
+    """Share of the catalogue's craters that do not exist."""
 
 
 def exact_catalogue(dataset: Dataset, scene_id: str, least_diameter_m: float) -> Catalogue:
-    """All craters of a scene from a diameter on, without errors."""
+    """All craters of a scene of at least a diameter, largest first, without errors."""
     columns = ["x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
     rows = dataset.table("craters", columns, scene_id=scene_id).to_pandas()
     rows = rows[rows["diameter_m"] >= least_diameter_m].sort_values("diameter_m", ascending=False)
@@ -81,8 +83,8 @@ def with_errors(exact: Catalogue, errors: CatalogueErrors, rng: np.random.Genera
     n_false = round(len(kept) * errors.false_share / (1 - errors.false_share))
     model = kept.part(rng.integers(len(kept), size=n_false))
     low, high = exact.centre_m.min(axis=0), exact.centre_m.max(axis=0)
-    place = np.column_stack([rng.uniform(low[:2], high[:2], (n_false, 2)), model.centre_m[:, 2]])
-    centre = np.concatenate([kept.centre_m, place])
+    false_centre = np.column_stack([rng.uniform(low[:2], high[:2], (n_false, 2)), model.centre_m[:, 2]])
+    centre = np.concatenate([kept.centre_m, false_centre])
     radius = np.concatenate([kept.radius_m, model.radius_m])
     return Catalogue(
         centre + errors.position_sigma_m * rng.normal(size=centre.shape),

@@ -1,8 +1,9 @@
 """A camera's pose from craters that are matched to a catalogue, starting near the true pose.
 
-One-to-one assignment within a gate that narrows, then Gauss-Newton on the centres of the ellipses with Tukey's weights
-(Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171), repeated. The centres of the ellipses are projected exactly,
-so the offset between them and the images of the circles' centres is no error.
+Each round projects the catalogue into the image, matches sightings and craters one to one within a gate, and takes a
+Gauss-Newton step on the centres and sizes of the ellipses with Tukey's weights (Beaton & Tukey 1974, doi
+10.1080/00401706.1974.10489171). The gate narrows from round to round. The centres of the ellipses are projected
+exactly: they differ from the images of the circles' centres.
 """
 
 from dataclasses import dataclass
@@ -19,29 +20,29 @@ from perilune_train.landing.craters.projection import Pose, in_view, projected
 from perilune_train.landing.craters.sightings import Sightings
 
 _GATES_PX = (6.0, 3.0, 1.5, 0.0, 0.0, 0.0)
-"""Uncertainty of the pose in each round, pixels, beside that of the sightings."""
+"""Uncertainty of the pose in each round, pixels, in addition to the noise of the sightings."""
 _GATE_SIGMAS = 3.5
 _FARTHEST_PX, _SMALLER = 64.0, 0.8
-"""Craters beside the image at the start by more pixels, or below a share of the least size, are left out of all rounds.
-The start is right to a few pixels; the rounds look 18 px beside the image."""
+"""Craters farther outside the image than this, or smaller than this share of the smallest radius, are left out of all
+rounds. The start is right to a few pixels, and the rounds consider craters up to 18 px outside the image."""
 _TUKEY = 4.685
 COMMON_PX = 0.08
 """Standard deviation of an error that all centres of a frame share, pixels."""
 _LEAST_SIZE = 0.7
-"""Radius of the smallest crater that is matched, by that of the smallest sighting."""
+"""Radius of the smallest crater to match, as a share of the radius of the smallest sighting."""
 _LEAST_MATCHES = 6
 _LEAST_SHARE = 0.3
-"""Share of the sightings that must be matched; a fix with fewer is none."""
+"""Smallest share of the sightings that must be matched; a fix with fewer is rejected."""
 
 
 @dataclass(frozen=True, slots=True)
 class PosePrior:
-    """What is known of a pose before."""
+    """Prior knowledge of a pose."""
 
     pose: Pose
     """Expected pose."""
     covariance: Array
-    """Of a step of the pose (6, 6): shift in O_L, metres, turn from the left, radians, O_C."""
+    """Covariance (6, 6) of a step of the pose: shift in O_L, metres, then turn from the left in O_C, radians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Fix:
     pose: Pose
     """Estimated pose."""
     covariance: Array
-    """Of a step of the pose (6, 6), as in `PosePrior`."""
+    """Covariance (6, 6) of a step of the pose, as in `PosePrior`."""
     sighting: NDArray[np.integer]
     """Matched sightings (K,)."""
     crater: NDArray[np.integer]
@@ -63,54 +64,61 @@ class Fix:
 
 
 def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, start: Pose) -> Fix | None:
-    """The pose that fits best, from a start within a few pixels; None if too few sightings can be matched."""
+    """Estimate the pose that fits best, from a start that is right to a few pixels; None if too few sightings match."""
     if not len(sightings):
         return None
     precision = np.linalg.inv(prior.covariance)
     pose, noise_px = start, np.hypot(sightings.noise_px, sightings.static_px)
     size, size_sigma = np.log(sightings.radius_px), float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
     least_px = _LEAST_SIZE * float(sightings.radius_px.min())
-    places = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
-    catalogue = catalogue.part(places)
+    in_field = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
+    catalogue = catalogue.part(in_field)
     for gate_px in _GATES_PX:
-        seen = projected(catalogue, camera, pose, 3 * gate_px, least_px)
-        placed_px = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
-        found = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
-        expected = Circles(seen.centre_px, np.log(seen.radius_px), placed_px)
-        own, other, error = matched(found, expected, size_sigma**2 + (gate_px / 60) ** 2, _GATE_SIGMAS)
-        if len(own) < _LEAST_MATCHES:
+        expected = projected(catalogue, camera, pose, 3 * gate_px, least_px)
+        placed_px = camera.fx_px / expected.depth_m * catalogue.position_sigma_m
+        seen_circles = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
+        expected_circles = Circles(expected.centre_px, np.log(expected.radius_px), placed_px)
+        sighting, crater, error = matched(
+            seen_circles, expected_circles, size_sigma**2 + (gate_px / 60) ** 2, _GATE_SIGMAS
+        )
+        if len(sighting) < _LEAST_MATCHES:
             return None
-        centre_sigma = np.hypot(noise_px[own], placed_px[other])
-        weight, normal, gradient = _normal_equations(error, centre_sigma, size_sigma, gate_px, seen.jacobian(other))
+        centre_sigma = np.hypot(noise_px[sighting], placed_px[crater])
+        weight, normal, gradient = _normal_equations(
+            error, centre_sigma, size_sigma, gate_px, expected.jacobian(crater)
+        )
         normal += precision
         gradient -= precision @ _offset(pose, prior.pose)
         pose = pose.changed(np.linalg.solve(normal, gradient))
-    if len(own) < _LEAST_SHARE * len(sightings):
+    if len(sighting) < _LEAST_SHARE * len(sightings):
         return None
-    # Stated errors that are too small must not make the fix look better than it is.
+    # Do not let stated errors that are too small make the fix look more certain than its residuals.
     squares = np.sum(weight[:, None] * (error[:, :2] / centre_sigma[:, None]) ** 2)
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
-    return Fix(pose, covariance, own, places[seen.index[other]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2))))
+    return Fix(
+        pose, covariance, sighting, in_field[expected.index[crater]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2)))
+    )
 
 
 @compiled
 def _normal_equations(
     error: Array, centre_sigma: Array, size_sigma: float, gate_px: float, jacobian: Array
 ) -> tuple[Array, Array, Array]:
-    """Weights (K,) of K matches, and normal matrix (6, 6) and right side (6,) of their step of the pose.
+    """Weights (K,) of K matches, normal matrix (6, 6) and right side (6,) of a Gauss-Newton step of the pose.
 
-    From their differences (K, 3), the deviations of these, the uncertainty of the pose and the derivatives (K, 3, 6).
+    `error` (K, 3) are the differences of centre and size, `centre_sigma` (K,) and `size_sigma` their standard
+    deviations, `gate_px` the uncertainty of the pose, and `jacobian` (K, 3, 6) the derivatives by the step.
     """
     weight, normal, right = np.empty(len(error)), np.zeros((6, 6)), np.zeros(6)
     for k in range(len(error)):
         squared = (error[k, 0] ** 2 + error[k, 1] ** 2) / (centre_sigma[k] ** 2 + gate_px**2) / 2
         weight[k] = max(1 - squared / _TUKEY**2, 0.0) ** 2
         for part in range(3):
-            own = weight[k] / (size_sigma if part == 2 else centre_sigma[k]) ** 2
+            precision = weight[k] / (size_sigma if part == 2 else centre_sigma[k]) ** 2
             for i in range(6):
-                along = own * jacobian[k, part, i]
+                along = precision * jacobian[k, part, i]
                 right[i] += along * error[k, part]
                 for j in range(i + 1):
                     normal[i, j] += along * jacobian[k, part, j]

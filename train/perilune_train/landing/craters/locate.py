@@ -12,19 +12,19 @@ from perilune_train.landing.craters.search import N_TESTED, Area, search
 from perilune_train.landing.craters.sightings import Sightings
 
 _NEAR_PX = 6.0
-"""Standard deviation of the expected pose, pixels on the ground, up to which no search is needed."""
+"""Standard deviation of the expected pose, in pixels on the ground, up to which no search is needed."""
 _LEAST_AGREED = 8
 _LEAST_SHARE = 0.25
-"""Least number of sightings that agree with a hypothesis, and their least share of those tested."""
+"""Smallest number, and smallest share of the tested sightings, that must agree with a hypothesis."""
 _AHEAD = 1.5
-"""By how much the best hypothesis must be ahead of the next different one."""
+"""Factor by which the best hypothesis must have more agreeing sightings than the second best."""
 _SIGMAS = 3.5
 _REACHES = (1.0, 3.0)
-"""How far a search goes, by what the prior says: it may be wrong."""
+"""Radii of the searches, as multiples of the radius that the prior suggests: the prior may be wrong."""
 _NEAREST = 30
-"""Craters whose median height is that of the ground."""
+"""Number of nearest craters whose median height is taken as the height of the ground."""
 _LEAST_MARGIN = 0.06
-"""Least margin of the altitude in a search, as a share: the ground is not level."""
+"""Smallest margin of the altitude in a search, as a share of it: the ground is not level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +34,12 @@ class Located:
     fix: Fix
     """The fix."""
     searched: bool
-    """Whether it was found by search, not near the expected pose."""
+    """Whether the fix was found by a search, not near the expected pose."""
 
 
 def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior) -> Located | None:
-    """The pose of a frame by its craters, near the expected pose if that is certain enough, else by search.
+    """Estimate the pose of a frame from its craters: near the expected pose if that is certain enough, else by a
+    search.
 
     None if too few sightings can be matched, or if two places explain them about equally well.
     """
@@ -47,9 +48,9 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     sigma = np.sqrt(np.diag(prior.covariance))
     on_ground_m = float(np.hypot(sigma[:2].max(), altitude_m * sigma[3:5].max()))
     if on_ground_m * camera.fx_px < _NEAR_PX * max(altitude_m, 1.0):
-        found = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose)
-        if found is not None:
-            return Located(found, searched=False)
+        fix = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose)
+        if fix is not None:
+            return Located(fix, searched=False)
     margin = max(_SIGMAS * float(sigma[2]) / max(altitude_m, 1.0), _LEAST_MARGIN)
     reach_m = max(_SIGMAS * on_ground_m, 20 * altitude_m / camera.fx_px)
     altitudes = altitude_m * max(1 - margin, 0.2), altitude_m * (1 + margin)
@@ -65,22 +66,27 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
 def lost_in_space(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
 ) -> Located | None:
-    """The pose of a frame somewhere in an area, from a tilt known to about a degree; None if it is not certain."""
-    found = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
+    """Search an area for the pose of a frame, with a tilt known to about a degree; None if the result is not
+    certain."""
+    hypotheses = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
     least = max(_LEAST_AGREED, _LEAST_SHARE * min(len(sightings), N_TESTED))
-    if not found or found[0].n_agreed < least:
+    if not hypotheses or hypotheses[0].n_agreed < least:
         return None
-    if len(found) > 1 and found[0].n_agreed < _AHEAD * found[1].n_agreed and not _same(found[0].pose, found[1].pose):
+    if (
+        len(hypotheses) > 1
+        and hypotheses[0].n_agreed < _AHEAD * hypotheses[1].n_agreed
+        and not _same(hypotheses[0].pose, hypotheses[1].pose)
+    ):
         return None
-    fix = refine(sightings, catalogue, camera, _around(found[0].pose), found[0].pose)
+    fix = refine(sightings, catalogue, camera, _around(hypotheses[0].pose), hypotheses[0].pose)
     return Located(fix, searched=True) if fix is not None else None
 
 
-def _same(one: Pose, other: Pose) -> bool:
-    """Whether two hypotheses differ by the error of a hypothesis only."""
-    return float(np.linalg.norm(one.position_m - other.position_m)) < 0.1 * float(one.position_m[2])
+def _same(first: Pose, second: Pose) -> bool:
+    """Whether two hypotheses differ no more than by the error of a hypothesis."""
+    return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 
 def _around(pose: Pose) -> PosePrior:
-    """Weak knowledge around a pose, so that a fix tells what the sightings tell and nothing twice."""
+    """A weak prior around a pose: the fix then rests on the sightings, and no sighting is counted twice."""
     return PosePrior(pose, np.diag(np.square([300.0] * 3 + [np.radians(3.0)] * 3)))

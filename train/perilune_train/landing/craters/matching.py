@@ -1,4 +1,11 @@
-"""Match sightings with projected craters, one to one (compiled by numba)."""
+"""Match sightings with projected craters, one to one (compiled by numba).
+
+Steps:
+
+1. `within_reach` (neighbours.py) lists the pairs whose centres are close enough.
+2. `_best` computes the cost of each pair and drops pairs beyond the gate.
+3. `assigned` chooses the pairs: as many as possible and, of these, those of least total cost.
+"""
 
 from typing import NamedTuple
 
@@ -10,7 +17,8 @@ from perilune_train.compiled import compiled
 from perilune_train.landing.craters.neighbours import within_reach
 
 _ALONE = 1e6
-"""Cost of a sighting without crater: more than any exchange of pairs saves, so that as many as possible are matched."""
+"""Cost of leaving a sighting without a crater. It exceeds what any exchange of pairs saves, so that as many sightings
+as possible are matched."""
 
 
 class Circles(NamedTuple):
@@ -27,11 +35,12 @@ class Circles(NamedTuple):
 def matched(
     seen: Circles, craters: Circles, size_variance: float, gate: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """The one-to-one assignment of most pairs within a gate and, of these, of least cost.
+    """The one-to-one assignment with the most pairs within a gate and, of these, the least total cost.
 
-    The cost of a pair is half of the squared distance, by the variance of each axis, plus the square of the difference
-    of the sizes by `size_variance`. It is below the square of `gate`. Returns the matched sightings (K,), in increasing
-    order, their craters (K,), and the differences of centre and size (K, 3), sighting less crater.
+    The cost of a pair is half of its squared distance, divided by the variance on each axis, plus the squared
+    difference of the sizes, divided by `size_variance`. It must be below the square of `gate`. Returns the matched
+    sightings (K,), in increasing order, their craters (K,), and the differences of centre and size (K, 3), sighting
+    minus crater.
     """
     farthest_px = np.max(craters.sigma_px, initial=0.0)
     reach_px = gate * np.sqrt(2 * (seen.sigma_px**2 + farthest_px**2))
@@ -47,7 +56,7 @@ def _best(
     crater: NDArray[np.int64],
     limits: tuple[float, float],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """`matched` among pairs as of `within_reach`; `limits` are variance of sizes and gate."""
+    """`matched` over the pairs that `within_reach` lists; `limits` are the variance of the sizes and the gate."""
     size_variance, gate = limits
     kept, kept_crater, cost, count = np.zeros_like(first), np.empty_like(crater), np.empty(len(crater)), 0
     for i in range(len(seen.size)):
@@ -62,24 +71,27 @@ def _best(
         kept[i + 1] = count
     first, crater = kept, kept_crater
     partner = assigned(first, crater, cost, len(craters.size))
-    own = np.flatnonzero(partner >= 0)
-    other = partner[own]
-    error = np.empty((len(own), 3))
-    error[:, :2] = seen.centre_px[own] - craters.centre_px[other]
-    error[:, 2] = seen.size[own] - craters.size[other]
-    return own, other, error
+    sighting = np.flatnonzero(partner >= 0)
+    partner_of = partner[sighting]
+    error = np.empty((len(sighting), 3))
+    error[:, :2] = seen.centre_px[sighting] - craters.centre_px[partner_of]
+    error[:, 2] = seen.size[sighting] - craters.size[partner_of]
+    return sighting, partner_of, error
 
 
 @compiled
 def assigned(first: NDArray[np.int64], crater: NDArray[np.int64], cost: Array, n_craters: int) -> NDArray[np.int64]:
-    """The crater of each sighting (M,), -1 for none, in the assignment of most pairs and of these of least cost.
+    """The crater of each sighting (M,), or -1, in the assignment with the most pairs and, of these, the least total
+    cost.
 
-    Pairs as of `within_reach`. Sighting by sighting, along the shortest path of exchanges (Crouse 2016, doi
-    10.1109/TAES.2016.140952), over these pairs only. A sighting may stay alone at the cost `_ALONE`.
+    `first` and `crater` list the pairs as `within_reach` does. Adds one sighting after the other, each along the
+    shortest path of exchanges (Crouse 2016, doi 10.1109/TAES.2016.140952), over the listed pairs only. A sighting may
+    stay alone at the cost `_ALONE`.
     """
     n = len(first) - 1
     partner, taken = np.full(n, -1), np.full(n_craters, -1)
-    # Dual prices of sightings and craters.
+    # Dual prices of sightings and craters: reduced costs stay at least 0, so that Dijkstra's search finds the shortest
+    # path.
     price, discount = np.zeros(n), np.zeros(n_craters)
     shortest, before = np.full(n_craters, np.inf), np.empty(n_craters, np.int64)
     done = np.zeros(n_craters, np.bool_)
@@ -126,7 +138,7 @@ def assigned(first: NDArray[np.int64], crater: NDArray[np.int64], cost: Array, n
                 discount[j] -= length - shortest[j]
             done[j] = False
             shortest[j] = np.inf
-        # Exchange partners along the path, from its end.
+        # Exchange partners along the path, starting at its end.
         if end < 0:
             end, partner[alone] = partner[alone], -1
         while end >= 0:

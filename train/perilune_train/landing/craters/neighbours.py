@@ -1,4 +1,4 @@
-"""Neighbours among points of a plane, by a grid (compiled by numba)."""
+"""Neighbours among points of a plane, found with a grid (compiled by numba)."""
 
 from typing import NamedTuple
 
@@ -10,67 +10,68 @@ from perilune_train.compiled import compiled
 
 
 class Grid(NamedTuple):
-    """N points in a grid of n x n cells, about as many as points."""
+    """N points in a grid of n x n cells, with about as many cells as points."""
 
-    place: Array
+    points: Array
     """The points (N, 2)."""
     n: int
     """Number of rows, and of columns."""
     corner: Array
-    """Least coordinates (2,)."""
+    """Smallest coordinates (2,)."""
     side: Array
     """Sides of a cell (2,)."""
     begin: NDArray[np.int64]
-    """Place in `order` of the first point of each cell, row by row, and the number of points (n^2 + 1,)."""
+    """Index in `order` of the first point of each cell, row by row, and the number of points at the end (n^2 + 1,)."""
     order: NDArray[np.int64]
-    """The points in the order of cells (N,)."""
+    """Indices of the points, sorted by cell (N,)."""
 
 
 @compiled
-def grid_of(place: Array) -> Grid:
+def grid_of(points: Array) -> Grid:
     """Points (N, 2) in a grid."""
-    n = int(np.ceil(np.sqrt(max(len(place), 1))))
+    n = int(np.ceil(np.sqrt(max(len(points), 1))))
     corner, side = np.zeros(2), np.ones(2)
-    if len(place):
+    if len(points):
         for axis in range(2):
-            corner[axis] = place[:, axis].min()
-            side[axis] = max((place[:, axis].max() - corner[axis]) / n, 1e-9)
-    cell, begin = np.empty(len(place), np.int64), np.zeros(n * n + 1, np.int64)
-    for k in range(len(place)):
-        row, column = _cell(place[k, 1], corner[1], side[1], n), _cell(place[k, 0], corner[0], side[0], n)
+            corner[axis] = points[:, axis].min()
+            side[axis] = max((points[:, axis].max() - corner[axis]) / n, 1e-9)
+    cell, begin = np.empty(len(points), np.int64), np.zeros(n * n + 1, np.int64)
+    for k in range(len(points)):
+        row, column = _cell(points[k, 1], corner[1], side[1], n), _cell(points[k, 0], corner[0], side[0], n)
         cell[k] = row * n + column
         begin[cell[k] + 1] += 1
     begin = np.cumsum(begin)
-    following, order = begin.copy(), np.empty(len(place), np.int64)
-    for k in range(len(place)):
+    following, order = begin.copy(), np.empty(len(points), np.int64)
+    for k in range(len(points)):
         order[following[cell[k]]] = k
         following[cell[k]] += 1
-    return Grid(place, n, corner, side, begin, order)
+    return Grid(points, n, corner, side, begin, order)
 
 
 @compiled
-def _cell(place: float, corner: float, side: float, n: int) -> int:
-    """The cell along an axis, the nearest one for a place beside the grid."""
-    return int(min(max((place - corner) / side, 0.0), n - 1.0))
+def _cell(coordinate: float, corner: float, side: float, n: int) -> int:
+    """Index of the cell along an axis; the nearest cell for a coordinate outside the grid."""
+    return int(min(max((coordinate - corner) / side, 0.0), n - 1.0))
 
 
 @compiled
-def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each of M places (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
+def within_reach(positions: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each of M positions (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
 
-    Returns the place of the first pair of each place, and the number of pairs (M + 1,), then the point of each pair.
+    Returns the index of the first pair of each position, with the number of pairs at the end (M + 1,), then the point
+    of each pair.
     """
     grid = grid_of(others)
-    first, other, count = np.zeros(len(place) + 1, np.int64), np.empty(8 * len(place) + 1, np.int64), 0
-    for i in range(len(place)):
-        left = _cell(place[i, 0] - reach[i], grid.corner[0], grid.side[0], grid.n)
-        right = _cell(place[i, 0] + reach[i], grid.corner[0], grid.side[0], grid.n)
-        top = _cell(place[i, 1] - reach[i], grid.corner[1], grid.side[1], grid.n)
-        bottom = _cell(place[i, 1] + reach[i], grid.corner[1], grid.side[1], grid.n)
+    first, other, count = np.zeros(len(positions) + 1, np.int64), np.empty(8 * len(positions) + 1, np.int64), 0
+    for i in range(len(positions)):
+        left = _cell(positions[i, 0] - reach[i], grid.corner[0], grid.side[0], grid.n)
+        right = _cell(positions[i, 0] + reach[i], grid.corner[0], grid.side[0], grid.n)
+        top = _cell(positions[i, 1] - reach[i], grid.corner[1], grid.side[1], grid.n)
+        bottom = _cell(positions[i, 1] + reach[i], grid.corner[1], grid.side[1], grid.n)
         for row in range(top, bottom + 1):
             for k in range(grid.begin[row * grid.n + left], grid.begin[row * grid.n + right + 1]):
                 j = grid.order[k]
-                if abs(place[i, 0] - others[j, 0]) <= reach[i] and abs(place[i, 1] - others[j, 1]) <= reach[i]:
+                if abs(positions[i, 0] - others[j, 0]) <= reach[i] and abs(positions[i, 1] - others[j, 1]) <= reach[i]:
                     if count == len(other):
                         other = np.append(other, other)
                     other[count] = j
@@ -81,12 +82,12 @@ def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.
 
 @compiled
 def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
-    """The `count` points nearest to a place, or all if there are fewer, the nearest first."""
-    count = min(count, len(grid.place))
-    found, squared = np.empty(count, np.int64), np.full(count, np.inf)
+    """The `count` points nearest to a position, nearest first, or all points if there are fewer."""
+    count = min(count, len(grid.points))
+    nearest_points, squared = np.empty(count, np.int64), np.full(count, np.inf)
     column, row = _cell(x, grid.corner[0], grid.side[0], grid.n), _cell(y, grid.corner[1], grid.side[1], grid.n)
     for ring in range(grid.n):
-        # Points farther out than the ring before are at least this far away.
+        # Points beyond the previous ring are at least this far away.
         if count and squared[count - 1] <= ((ring - 1) * min(grid.side[0], grid.side[1])) ** 2 and ring > 0:
             break
         for down in range(max(row - ring, 0), min(row + ring, grid.n - 1) + 1):
@@ -96,13 +97,13 @@ def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
                     continue
                 for k in range(grid.begin[down * grid.n + right], grid.begin[down * grid.n + right + 1]):
                     j = grid.order[k]
-                    apart = (grid.place[j, 0] - x) ** 2 + (grid.place[j, 1] - y) ** 2
+                    apart = (grid.points[j, 0] - x) ** 2 + (grid.points[j, 1] - y) ** 2
                     if not count or apart >= squared[count - 1]:
                         continue
-                    # Insert in the order of distances.
+                    # Insert in order of distance.
                     at = count - 1
                     while at > 0 and squared[at - 1] > apart:
-                        squared[at], found[at] = squared[at - 1], found[at - 1]
+                        squared[at], nearest_points[at] = squared[at - 1], nearest_points[at - 1]
                         at -= 1
-                    squared[at], found[at] = apart, j
-    return found
+                    squared[at], nearest_points[at] = apart, j
+    return nearest_points

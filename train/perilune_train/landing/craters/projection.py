@@ -1,4 +1,4 @@
-"""A catalogue as a camera at a pose would see it."""
+"""Craters of a catalogue as a camera at a pose sees them."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ class Projected:
     """The craters of a catalogue in view."""
 
     index: NDArray[np.integer]
-    """Places (N,) in the catalogue."""
+    """Rows (N,) of the catalogue."""
     centre_px: Array
     """Centres of the ellipses (N, 2), which are not the images of the circles' centres."""
     radius_px: Array
@@ -50,16 +50,18 @@ class Projected:
         return self.point_m[:, 2]
 
     def jacobian(self, chosen: NDArray[np.integer] | None = None) -> Array:
-        """Derivatives of centre and logarithm of radius by a step of the pose (K, 3, 6), of all craters or of some.
+        """Derivatives (K, 3, 6) of centre and logarithm of the radius by a step of the pose, of all craters or of
+        `chosen`.
 
-        The ellipse's own offset from the image of the circle's centre changes far more slowly.
+        They neglect the change of the offset between the ellipse's centre and the image of the circle's centre, which
+        changes far more slowly.
         """
         points = self.point_m if chosen is None else self.point_m[chosen]
         return _derivatives(points, self.pose.rotation_camera_from_site, self.camera.fx_px, self.camera.fy_px)
 
 
 @compiled
-def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) -> Array:
+def _derivatives(point_m: Array, rotation_camera_from_site: Array, fx_px: float, fy_px: float) -> Array:
     """`Projected.jacobian` at points (K, 3), O_C.
 
     A point X = R (c - p) moves by -R times a shift of the camera, and by w x X when it turns by w from the left.
@@ -68,29 +70,31 @@ def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) ->
     for k in range(len(point_m)):
         x, y, z = point_m[k]
         right, down = fx_px / z, fy_px / z
-        own = derivatives[k]
+        by_step = derivatives[k]
         for axis in range(3):
-            own[0, axis] = right * (rotation[2, axis] * x / z - rotation[0, axis])
-            own[1, axis] = down * (rotation[2, axis] * y / z - rotation[1, axis])
-            own[2, axis] = rotation[2, axis] / z
-        own[0, 3], own[0, 4], own[0, 5] = -right * x * y / z, right * (z + x * x / z), -right * y
-        own[1, 3], own[1, 4], own[1, 5] = -down * (z + y * y / z), down * x * y / z, down * x
-        own[2, 3], own[2, 4], own[2, 5] = -y / z, x / z, 0.0
+            by_step[0, axis] = right * (rotation_camera_from_site[2, axis] * x / z - rotation_camera_from_site[0, axis])
+            by_step[1, axis] = down * (rotation_camera_from_site[2, axis] * y / z - rotation_camera_from_site[1, axis])
+            by_step[2, axis] = rotation_camera_from_site[2, axis] / z
+        by_step[0, 3], by_step[0, 4], by_step[0, 5] = -right * x * y / z, right * (z + x * x / z), -right * y
+        by_step[1, 3], by_step[1, 4], by_step[1, 5] = -down * (z + y * y / z), down * x * y / z, down * x
+        by_step[2, 3], by_step[2, 4], by_step[2, 5] = -y / z, x / z, 0.0
     return derivatives
 
 
 def projected(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float = 0.0, least_radius_px: float = 1.0
 ) -> Projected:
-    """Craters of a least radius whose centre is in the image or at most `margin_px` beside it."""
+    """Project craters of at least a radius whose centre is in the image or at most `margin_px` outside it."""
     index, points = _in_view(catalogue, camera, pose, margin_px, least_radius_px)
-    rotation = pose.rotation_camera_from_site
+    rotation_camera_from_site = pose.rotation_camera_from_site
     if any(camera.distortion):
-        normals = catalogue.normal[index] @ rotation.T
+        normals = catalogue.normal[index] @ rotation_camera_from_site.T
         boxes = project_circles(camera, points, normals, catalogue.radius_m[index]).bounding_boxes()
         centre, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
     else:
-        centre, half = _boxes(points, index, catalogue.normal, catalogue.radius_m, rotation, _lens(camera))
+        centre, half = _boxes(
+            points, index, catalogue.normal, catalogue.radius_m, rotation_camera_from_site, _lens(camera)
+        )
     seen = np.isfinite(half).all(axis=1)
     if not seen.all():
         index, points, centre, half = index[seen], points[seen], centre[seen], half[seen]
@@ -100,17 +104,20 @@ def projected(
 def in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> NDArray[np.integer]:
-    """Places of the craters whose centre is in the image or at most `margin_px` beside it, by radius over depth."""
+    """Rows of the craters whose centre is in the image or at most `margin_px` outside it, and whose radius divided by
+    depth is at least `least_radius_px`."""
     return _in_view(catalogue, camera, pose, margin_px, least_radius_px)[0]
 
 
 def _in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> tuple[NDArray[np.integer], Array]:
-    """As `in_view`, and the centres of the craters (N, 3), O_C."""
+    """The rows as `in_view` returns them, and the centres of these craters (N, 3), O_C."""
     limits = margin_px, least_radius_px
-    rotation = pose.rotation_camera_from_site
-    return _visible(catalogue.centre_m, catalogue.radius_m, pose.position_m, rotation, _lens(camera), limits)
+    rotation_camera_from_site = pose.rotation_camera_from_site
+    return _visible(
+        catalogue.centre_m, catalogue.radius_m, pose.position_m, rotation_camera_from_site, _lens(camera), limits
+    )
 
 
 _Lens = tuple[float, float, float, float, float, float]
@@ -124,55 +131,71 @@ def _lens(camera: Camera) -> _Lens:
 
 @compiled
 def _visible(
-    centre_m: Array, radius_m: Array, position_m: Array, rotation: Array, lens: _Lens, limits: tuple[float, float]
+    centre_m: Array,
+    radius_m: Array,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    lens: _Lens,
+    limits: tuple[float, float],
 ) -> tuple[NDArray[np.int64], Array]:
     """`_in_view` for circles with centres (N, 3), O_L, and radii (N,); `limits` are the margin and the least radius."""
     fx_px, fy_px, cx_px, cy_px, width_px, height_px = lens
     margin_px, least_px = limits
-    # No branches: which craters pass cannot be predicted. Size first: it alone excludes most craters of a catalogue.
+    # No branches: the processor cannot predict which craters pass. Size comes first, because it alone excludes most
+    # craters of a catalogue.
     index = np.empty(len(radius_m) + 1, np.int64)
     large = 0
     for k in range(len(radius_m)):
         x, y, z = centre_m[k, 0] - position_m[0], centre_m[k, 1] - position_m[1], centre_m[k, 2] - position_m[2]
-        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        depth = (
+            rotation_camera_from_site[2, 0] * x
+            + rotation_camera_from_site[2, 1] * y
+            + rotation_camera_from_site[2, 2] * z
+        )
         index[large] = k
         large += (depth > radius_m[k]) & (fx_px * radius_m[k] >= least_px * depth)
     count = 0
-    for place in range(large):
-        k = index[place]
-        across, down, depth = _turned(centre_m[k], position_m, rotation)
+    for number in range(large):
+        k = index[number]
+        across, down, depth = _turned(centre_m[k], position_m, rotation_camera_from_site)
         column, row = fx_px * across / depth + cx_px, fy_px * down / depth + cy_px
         index[count] = k
         near = (column > -margin_px) & (column < width_px + margin_px)
         count += near & (row > -margin_px) & (row < height_px + margin_px)
     index, points = index[:count].copy(), np.empty((count, 3))
-    for place in range(count):
-        points[place] = _turned(centre_m[index[place]], position_m, rotation)
+    for number in range(count):
+        points[number] = _turned(centre_m[index[number]], position_m, rotation_camera_from_site)
     return index, points
 
 
 @compiled
-def _turned(point_m: Array, position_m: Array, rotation: Array) -> tuple[float, float, float]:
+def _turned(point_m: Array, position_m: Array, rotation_camera_from_site: Array) -> tuple[float, float, float]:
     """A point (3,), O_L, in O_C."""
     x, y, z = point_m[0] - position_m[0], point_m[1] - position_m[1], point_m[2] - position_m[2]
     return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+        rotation_camera_from_site[0, 0] * x + rotation_camera_from_site[0, 1] * y + rotation_camera_from_site[0, 2] * z,
+        rotation_camera_from_site[1, 0] * x + rotation_camera_from_site[1, 1] * y + rotation_camera_from_site[1, 2] * z,
+        rotation_camera_from_site[2, 0] * x + rotation_camera_from_site[2, 1] * y + rotation_camera_from_site[2, 2] * z,
     )
 
 
 @compiled
 def _boxes(
-    points: Array, index: NDArray[np.integer], normals: Array, radius_m: Array, rotation: Array, lens: _Lens
+    points: Array,
+    index: NDArray[np.integer],
+    normals: Array,
+    radius_m: Array,
+    rotation_camera_from_site: Array,
+    lens: _Lens,
 ) -> tuple[Array, Array]:
     """Centres and half sizes (K, 2), pixels, of the boxes of circles, for a pinhole.
 
-    From the centres (K, 3), O_C, and places in the catalogue (K,) of the circles, and the normals (N, 3), O_L, and
-    radii (N,) of the catalogue. NaN if the image of a circle is not an ellipse. From the dual conic
-    r^2 (I - n n^T) - c c^T of the circle (Hartley & Zisserman, Multiple View Geometry, 2nd ed., section 8.1): its
-    tangents along the axes of the image are the sides of the box. This is many times as fast as `project_circles`,
-    which also has axes and directions.
+    `points` (K, 3), O_C, are the centres of the circles and `index` (K,) their rows in the catalogue, which has
+    `normals` (N, 3), O_L, and `radius_m` (N,). NaN if the image of a circle is not an ellipse.
+
+    The dual conic of the circle is r^2 (I - n n^T) - c c^T (Hartley & Zisserman, Multiple View Geometry, 2nd ed.,
+    section 8.1); its tangents along the axes of the image are the sides of the box. This is many times as fast as
+    `project_circles`, which also computes axes and directions.
     """
     focal_px, middle_px = lens[:2], lens[2:4]
     centre, half = np.full((len(points), 2), np.nan), np.full((len(points), 2), np.nan)
@@ -182,7 +205,7 @@ def _boxes(
         for axis in range(3):
             normal[axis] = 0.0
             for i in range(3):
-                normal[axis] += rotation[axis, i] * normals[index[k], i]
+                normal[axis] += rotation_camera_from_site[axis, i] * normals[index[k], i]
         squared = radius_m[index[k]] ** 2
         last = squared * (1 - normal[2] ** 2) - depth**2
         distance = np.sqrt(x * x + y * y + depth * depth)
@@ -193,8 +216,8 @@ def _boxes(
             # Relative to the image of the circle's centre: otherwise small, distant circles lose precision.
             middle = points[k, axis] / depth
             along = focal_px[axis] * (normal[axis] - middle * normal[2])
-            own = focal_px[axis] ** 2 * (1 + middle**2) - along**2
+            quadratic = focal_px[axis] ** 2 * (1 + middle**2) - along**2
             mixed = -focal_px[axis] * middle - along * normal[2]
             centre[k, axis] = focal_px[axis] * middle + middle_px[axis] + squared * mixed / last
-            half[k, axis] = np.sqrt(squared * (squared * mixed**2 - own * last)) / -last
+            half[k, axis] = np.sqrt(squared * (squared * mixed**2 - quadratic * last)) / -last
     return centre, half

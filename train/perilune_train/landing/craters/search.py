@@ -1,8 +1,15 @@
-"""Find where a camera is: pairs of craters, without or with a rough knowledge of the position.
+"""Find where a camera is from pairs of craters, with no or only rough knowledge of its position.
 
-Two craters determine shift, heading and altitude of a level camera. Pairs of sightings are looked up among the
-catalogue's pairs by their ratios of size to separation (a 3-dimensional tree), each hit is a hypothesis, and the
-hypothesis is tested on all sightings. An accepted one must explain far more sightings than the best different one.
+Two craters determine position, heading and altitude of a level camera. Steps:
+
+1. `_in_reach` selects the craters that the camera may see from the area.
+2. `_Pairs.of` forms ordered pairs of sightings and of craters.
+3. `_placements` looks up each pair of sightings among the pairs of craters in a tree over their ratios of size to
+   separation, their separation and their direction. Each hit gives a placement of the camera.
+4. `_agreed` counts the sightings that agree with a crater under each placement.
+5. `search` returns the best placements that differ, as hypotheses.
+
+The caller accepts a hypothesis only if it explains far more sightings than the second best.
 """
 
 from dataclasses import dataclass, replace
@@ -17,38 +24,38 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _N_PAIRED = 18
-"""Largest sightings that form pairs: larger craters are rarer."""
+"""Number of the largest sightings that form pairs: larger craters are rarer."""
 _N_FIRST, N_TESTED = 24, 60
-"""Largest sightings that test every hypothesis, and those that test the best."""
+"""Number of the largest sightings that test every placement, and of those that test the best placements."""
 _LEAST_SEPARATION = 0.1
 """Smallest separation of a pair, divided by the width of the image."""
 _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
-"""Standard deviation of the logarithm of a size; that of altitude and heading, in the limits of an area; the largest
-distance of two pairs that may be the same, in standard deviations."""
+"""Standard deviation of the logarithm of a size; number of standard deviations that the limits of an area cover in
+altitude and heading; largest distance, in standard deviations, between a pair of sightings and a pair of craters."""
 _TEST_PX, _TEST_SIZE = 4.0, 0.35
-"""A sighting agrees with a crater within this distance and difference of the logarithms of the sizes."""
-_MOST_PAIRED, _MOST_HITS, _MOST_TESTED = 800, 150, 1000
-"""Limits on the time: craters that form pairs, the largest first; hypotheses for a pair of sightings; hypotheses that
-are tested on more sightings."""
+"""Largest distance, and largest difference of the logarithms of the sizes, at which a sighting agrees with a crater."""
+_MOST_PAIRED, _MOST_HITS, _MOST_TESTED, _MOST_RETURNED = 800, 150, 1000, 5
+"""Limits on the time: craters that form pairs, the largest first; placements for a pair of sightings; placements that
+are tested on more sightings; hypotheses that are returned."""
 
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Where the camera may be."""
+    """The area in which the camera may be."""
 
     centre_m: Array
-    """Middle of the search (2,), metres, O_L."""
+    """Centre of the search (2,), metres, O_L."""
     reach_m: float
-    """Largest distance of the camera from it, over ground."""
+    """Largest distance of the camera from the centre, over ground, metres."""
     altitude_m: tuple[float, float]
-    """Least and largest altitude above the ground."""
+    """Smallest and largest altitude above the ground, metres."""
     heading_rad: float
-    """Largest difference of the heading from that of the assumed attitude; pi if it is unknown."""
+    """Largest difference between the heading and the heading of the assumed attitude, radians; pi if it is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose, and how many sightings agree."""
+    """A pose, and how many sightings agree with it."""
 
     pose: Pose
     """The pose."""
@@ -59,9 +66,10 @@ class Hypothesis:
 def search(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, rotation_camera_from_site: Array, area: Area
 ) -> list[Hypothesis]:
-    """The best hypotheses, the best first, each at least 10 px of ground away from those before; may be empty.
+    """The best hypotheses, best first; may be empty.
 
-    `rotation_camera_from_site` is the assumed attitude: its tilt must be right to about a degree.
+    Each is at least 10 px on the ground away from all better ones. `rotation_camera_from_site` is the assumed attitude:
+    its tilt must be right to about a degree.
     """
     rays = camera.rays(sightings.centre_px) @ rotation_camera_from_site
     offset, size = rays[:, :2] / -rays[:, 2:], sightings.radius_px / camera.fx_px
@@ -72,31 +80,31 @@ def search(
     paired = paired.part(np.argsort(-paired.radius_m, kind="stable")[:_MOST_PAIRED])
     if len(paired) < 3:
         return []
-    scale, turn, shift = _hypotheses(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
-    if not len(scale):
+    placements = _placements(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
+    if not len(placements.altitude_m):
         return []
-    # All hypotheses are tested on some sightings, the best on more.
-    agreed = _agreed(scale, turn, shift, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
-    best = np.argsort(-agreed, kind="stable")[:_MOST_TESTED]
-    scale, turn, shift = scale[best], turn[best], shift[best]
-    agreed = _agreed(scale, turn, shift, offset[:N_TESTED], size[:N_TESTED], local, camera)
+    # All placements are tested on some sightings, the best on more.
+    agreed = _agreed(placements, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
+    placements = placements.part(np.argsort(-agreed, kind="stable")[:_MOST_TESTED])
+    agreed = _agreed(placements, offset[:N_TESTED], size[:N_TESTED], local, camera)
     ground_m = float(np.median(local.centre_m[:, 2]))
-    found: list[Hypothesis] = []
+    best: list[Hypothesis] = []
     for k in np.argsort(-agreed, kind="stable"):
-        position = np.array([*shift[k], ground_m + scale[k]])
-        apart = 10 * scale[k] / camera.fx_px
-        if any(np.linalg.norm(one.pose.position_m - position) < apart for one in found):
+        altitude_m, turn = placements.altitude_m[k], placements.heading_rad[k]
+        position = np.array([*placements.position_m[k], ground_m + altitude_m])
+        apart_m = 10 * altitude_m / camera.fx_px
+        if any(np.linalg.norm(better.pose.position_m - position) < apart_m for better in best):
             continue
         heading = np.eye(3)
-        heading[:2, :2] = [[np.cos(turn[k]), np.sin(turn[k])], [-np.sin(turn[k]), np.cos(turn[k])]]
-        found.append(Hypothesis(Pose(position, rotation_camera_from_site @ heading), int(agreed[k])))
-        if len(found) == 5:
+        heading[:2, :2] = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        best.append(Hypothesis(Pose(position, rotation_camera_from_site @ heading), int(agreed[k])))
+        if len(best) == _MOST_RETURNED:
             break
-    return found
+    return best
 
 
 def _in_reach(catalogue: Catalogue, camera: Camera, radius_px: Array, area: Area) -> Catalogue:
-    """Craters that the camera may see, of the sizes of these sightings."""
+    """The craters that the camera may see, of the sizes that these sightings may have."""
     low, high = area.altitude_m
     view = np.hypot(camera.width_px, camera.height_px) / 2 / camera.fx_px * high
     near = np.linalg.norm(catalogue.centre_m[:, :2] - area.centre_m, axis=1) < area.reach_m + view
@@ -121,7 +129,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, place: Array, size: Array, least: float, most: float) -> "_Pairs":
-        """Pairs with a separation in limits."""
+        """All ordered pairs whose separation is between two limits."""
         index = KDTree(place).query_pairs(most, output_type="ndarray")
         index = np.concatenate([index, index[:, ::-1]])
         across = place[index[:, 1]] - place[index[:, 0]]
@@ -136,30 +144,52 @@ class _Pairs:
         return _Pairs(self.index[chosen], self.separation[chosen], self.sizes[chosen], self.direction[chosen])
 
     def places(self, log_range: float, heading_rad: float) -> Array:
-        """Places (n, 5) whose distance is that of two pairs in standard deviations; a range has `_SIGMAS` of them."""
+        """Points (n, 5) whose distance is the distance of two pairs in standard deviations; a range has `_SIGMAS` of
+        them."""
         on_circle = np.column_stack([np.cos(self.direction), np.sin(self.direction)])
         across = 2 * np.sin(min(heading_rad, np.pi) / 2)
         ranged = self.separation[:, None] * _SIGMAS / (log_range + 0.01)
         return np.concatenate([self.sizes / _SIZE_SIGMA, ranged, on_circle * _SIGMAS / across], axis=1)
 
 
-def _hypotheses(offset: Array, size: Array, local: Catalogue, camera: Camera, area: Area) -> tuple[Array, Array, Array]:
-    """Altitudes (n,), turns of the heading (n,) and positions (n, 2) of all pairs that fit a pair of the catalogue."""
-    none = np.zeros(0), np.zeros(0), np.zeros((0, 2))
+@dataclass(frozen=True, slots=True)
+class _Placements:
+    """Possible places of a level camera."""
+
+    altitude_m: Array
+    """Altitudes above the ground (n,), metres."""
+    heading_rad: Array
+    """Turns of the heading from that of the assumed attitude (n,), radians."""
+    position_m: Array
+    """Positions over ground (n, 2), metres, O_L."""
+
+    def part(self, chosen: Chosen | slice) -> "_Placements":
+        """Some of the placements."""
+        return _Placements(self.altitude_m[chosen], self.heading_rad[chosen], self.position_m[chosen])
+
+    def on_ground(self, offset: Array) -> Array:
+        """Points (n, M, 2), O_L, at which sightings with offsets (M, 2) on the plane at depth 1 lie."""
+        turned = _turned(offset[None], self.heading_rad[:, None])
+        return self.position_m[:, None] + self.altitude_m[:, None, None] * turned
+
+
+def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, area: Area) -> _Placements:
+    """The placements by which a pair of sightings fits a pair of the catalogue."""
+    none = _Placements(np.zeros(0), np.zeros(0), np.zeros((0, 2)))
     low, high = area.altitude_m
     width = camera.width_px / camera.fx_px
-    seen = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
-    seen = seen.part(seen.index[:, 0] < seen.index[:, 1])
-    if not len(seen.index):
+    sighting_pairs = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
+    sighting_pairs = sighting_pairs.part(sighting_pairs.index[:, 0] < sighting_pairs.index[:, 1])
+    if not len(sighting_pairs.index):
         return none
-    most = np.exp(seen.separation.max()) * high
-    known = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
-    if not len(known.index):
+    most = np.exp(sighting_pairs.separation.max()) * high
+    catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
+    if not len(catalogue_pairs.index):
         return none
-    # In the middle of the range of altitudes, the separations differ by half of it at most.
-    middle = replace(seen, separation=seen.separation + np.log(low * high) / 2)
+    # At the middle of the range of altitudes, separations differ by at most half of the range.
+    middle = replace(sighting_pairs, separation=sighting_pairs.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
-    tree = KDTree(known.places(log_range, area.heading_rad))
+    tree = KDTree(catalogue_pairs.places(log_range, area.heading_rad))
     distance, second = tree.query(
         middle.places(log_range, area.heading_rad), _MOST_HITS, distance_upper_bound=_FARTHEST
     )
@@ -167,32 +197,30 @@ def _hypotheses(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     second = second[first, hit]
     if not len(first):
         return none
-    turn = (known.direction[second] - seen.direction[first] + np.pi) % (2 * np.pi) - np.pi
-    scale = np.exp(known.separation[second] - seen.separation[first])
-    middle_seen = offset[seen.index[first]].mean(axis=1)
-    middle_known = local.centre_m[known.index[second], :2].mean(axis=1)
-    shift = middle_known - scale[:, None] * _turned(middle_seen, turn)
-    near = np.linalg.norm(shift - area.centre_m, axis=1) <= area.reach_m
-    return scale[near], turn[near], shift[near]
+    heading = (catalogue_pairs.direction[second] - sighting_pairs.direction[first] + np.pi) % (2 * np.pi) - np.pi
+    altitude = np.exp(catalogue_pairs.separation[second] - sighting_pairs.separation[first])
+    middle_seen = offset[sighting_pairs.index[first]].mean(axis=1)
+    middle_known = local.centre_m[catalogue_pairs.index[second], :2].mean(axis=1)
+    position = middle_known - altitude[:, None] * _turned(middle_seen, heading)
+    near = np.linalg.norm(position - area.centre_m, axis=1) <= area.reach_m
+    return _Placements(altitude, heading, position).part(near)
 
 
-def _agreed(
-    scale: Array, turn: Array, shift: Array, offset: Array, size: Array, local: Catalogue, camera: Camera
-) -> Array:
-    """Number of sightings (n,) that agree with a crater, by hypothesis."""
+def _agreed(placements: _Placements, offset: Array, size: Array, local: Catalogue, camera: Camera) -> Array:
+    """Number of sightings (n,) that agree with a crater under each placement."""
+    scale = placements.altitude_m
     altitude = float(np.exp(np.log(scale).mean()))
     per_log = _TEST_PX / _TEST_SIZE * altitude / camera.fx_px
     tree = KDTree(np.column_stack([local.centre_m[:, :2], per_log * np.log(local.radius_m)]))
     count = np.zeros(len(scale), int)
     for start in range(0, len(scale), 2000):
-        own = slice(start, start + 2000)
-        turned = _turned(offset[None], turn[own, None])
-        ground = shift[own, None] + scale[own, None, None] * turned
-        sizes = per_log * np.log(scale[own, None] * size[None])
+        batch = slice(start, start + 2000)
+        ground = placements.part(batch).on_ground(offset)
+        sizes = per_log * np.log(scale[batch, None] * size[None])
         points = np.concatenate([ground, sizes[..., None]], axis=2).reshape(-1, 3)
         limit = _TEST_PX * altitude / camera.fx_px
         distance, _ = tree.query(points, distance_upper_bound=limit)
-        count[own] = np.isfinite(distance).reshape(len(turned), -1).sum(axis=1)
+        count[batch] = np.isfinite(distance).reshape(len(ground), -1).sum(axis=1)
     return count
 
 

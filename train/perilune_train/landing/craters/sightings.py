@@ -7,10 +7,12 @@ import numpy as np
 from perilune_shared.geometry.frames import Array
 
 _FLOOR_PX, _NOISE_SHARE, STATIC_SHARE = 0.15, 0.045, 0.075
-"""Errors of a detected centre on each axis, from the validation scenes of `shipped-nav`: a floor and a share of the
-radius for those that differ from frame to frame, and a share of the radius for those that repeat with a crater."""
+"""Standard deviations of a detected centre on each axis, measured on the validation scenes of `shipped-nav`: a floor
+and a share of the radius for errors that differ from frame to frame, and a share of the radius for errors that repeat
+with a crater."""
 _PER_SCORE, _USUAL_SCORE = 1.5, 0.8
-"""How the logarithm of the former grows with a lower score, and the score at which it is as stated."""
+"""Growth of the logarithm of the first kind of error with a falling score, and the score at which that error is as
+stated."""
 _SIZE_SHARE = 0.1
 """Standard deviation of a detected radius, divided by it."""
 
@@ -28,7 +30,7 @@ class Sightings:
 
     @classmethod
     def of_boxes(cls, boxes: Array, scores: Array) -> "Sightings":
-        """From boxes (M, 4) as x0, y0, x1, y1, pixels, by decreasing radius."""
+        """From boxes (M, 4) as x0, y0, x1, y1, pixels; sorted by decreasing radius."""
         size = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None)
         radius = np.sqrt(size.prod(axis=1)) / 2
         order = np.argsort(-radius)
@@ -39,13 +41,13 @@ class Sightings:
 
     @property
     def noise_px(self) -> Array:
-        """Standard deviations of what differs from frame to frame, on each axis (M,)."""
+        """Standard deviations of the errors that differ from frame to frame, on each axis (M,), pixels."""
         doubt = np.exp(_PER_SCORE * np.clip(_USUAL_SCORE - self.score, -0.2, 0.4))
         return np.hypot(_FLOOR_PX, _NOISE_SHARE * self.radius_px) * doubt
 
     @property
     def static_px(self) -> Array:
-        """Standard deviations of what repeats with a crater, on each axis (M,)."""
+        """Standard deviations of the errors that repeat with a crater, on each axis (M,), pixels."""
         return STATIC_SHARE * self.radius_px
 
     @property

@@ -1,1 +1,1 @@
-"""An error-state Kalman filter over inertial measurements, ranges, craters and relative motion."""
+"""An error-state Kalman filter over inertial measurements, ranges and craters."""

@@ -1,4 +1,4 @@
-"""One descent through the filter: measurements in the order of time, an estimate at every frame."""
+"""One descent through the filter: measurements in order of time, an estimate at every frame."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,18 +20,18 @@ _SAME_S = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Instruments:
-    """Measurements of one descent besides its frames."""
+    """Measurements of one descent in addition to its frames."""
 
     inertial: Increments
-    """Of the inertial unit."""
+    """Measurements of the inertial unit."""
     range_time_s: Array
     """Times of the ranges (n,), seconds since the first frame."""
     range_m: Array
-    """Distances to the ground along -Z_B (n,), NaN where there is none."""
+    """Distances to the ground along -Z_B (n,), metres; NaN where the altimeter measured none."""
 
     @classmethod
     def of_trajectory(cls, dataset: Dataset, ids: tuple[str, str], grade: InertialGrade) -> "Instruments":
-        """From the tables `inertial` and `ranges`, by scene_id and trajectory_id."""
+        """Read the tables `inertial` and `ranges` of a trajectory, given by scene_id and trajectory_id."""
         columns = ["grade", "time_s", "interval_s", "angular_rate_radps", "specific_force_mps2"]
         rows = dataset.table("inertial", columns, *ids).to_pandas()
         rows = rows[rows["grade"] == grade].sort_values("time_s")
@@ -46,34 +46,36 @@ class Instruments:
 
 
 def together(flights: Sequence[Instruments]) -> Instruments:
-    """Instruments of F flights, whose measurements have the times and the ranges of the first."""
-    inertial = [one.inertial for one in flights]
-    rate = np.stack([one.angular_rate_radps for one in inertial])
-    force = np.stack([one.specific_force_mps2 for one in inertial])
+    """The instruments of F flights as one, with the times and the ranges of the first flight."""
+    inertial = [flight.inertial for flight in flights]
+    rate = np.stack([measured.angular_rate_radps for measured in inertial])
+    force = np.stack([measured.specific_force_mps2 for measured in inertial])
     return replace(flights[0], inertial=replace(inertial[0], angular_rate_radps=rate, specific_force_mps2=force))
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What the filter knows after a frame."""
+    """What the filter estimates at a frame."""
 
     frame: int
-    """Place of the frame in the descent."""
+    """Number of the frame in the descent."""
     state: State
     """State after the frame."""
     status: Status
-    """Whether to believe it."""
+    """Whether the state can be trusted."""
     located: Located | None
-    """The fix that was accepted."""
+    """The accepted fix, if there is one."""
 
 
 def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
     """Run a filter over a descent.
 
-    `seen` has the sightings of the frames at increasing times (n,); an iterator is advanced by one at each frame.
-    Inertial measurements that are not finite are missing ones; what was measured before the lander's state is ignored.
+    `seen` yields the sightings of each frame, at increasing times (n,); it is advanced by one at each frame. Inertial
+    measurements that are not finite count as missing; measurements from before the lander's state are ignored.
     """
-    for (estimate,) in fly_together([lander], instruments, frame_time_s, ((own,) for own in seen)):
+    for (estimate,) in fly_together(
+        [lander], instruments, frame_time_s, ((frame_sightings,) for frame_sightings in seen)
+    ):
         yield estimate
 
 
@@ -82,37 +84,37 @@ def fly_together(
 ) -> Iterator[list[Estimate]]:
     """Run the filters of F flights over descents with measurements at the same times, faster than one by one.
 
-    `seen` has the sightings of all flights, frame by frame. All flights take inertial noise, range and relief from the
-    first lander.
+    `seen` yields the sightings of all flights, frame by frame. Inertial noise, the noise of a range and relief are
+    those of the first lander.
     """
     times = np.concatenate([instruments.range_time_s, frame_time_s])
     is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])
-    place = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
-    # At the same time, the range is first.
+    number = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
+    # At equal times, the range comes first.
     order = np.lexsort([is_frame, times])
-    sightings, surroundings = iter(seen), [one.surroundings for one in landers]
-    measured, done = instruments.inertial.measured(), 0
+    sightings, surroundings = iter(seen), [lander.surroundings for lander in landers]
+    measured, n_done = instruments.inertial.measured(), 0
     stretch = _stretch(landers)
     for k in order[times[order] >= stretch.time_s - _SAME_S]:
         end = int(np.searchsorted(measured.time_s, times[k] + _SAME_S, side="right"))
-        stretch.inertial(measured.part(slice(done, end)))
-        done = end
+        stretch.inertial(measured.part(slice(n_done, end)))
+        n_done = end
         if times[k] > stretch.time_s + _SAME_S:
-            following = measured.part(slice(done, done + 1))
+            following = measured.part(slice(n_done, n_done + 1))
             stretch.inertial(following.until(times[k])) if len(following) else stretch.coast(times[k])
         if is_frame[k]:
-            estimates, own = [], next(sightings)
-            for lander, state, frame in zip(landers, stretch.states(), own, strict=True):
+            estimates, frame_sightings = [], next(sightings)
+            for lander, state, frame in zip(landers, stretch.states(), frame_sightings, strict=True):
                 lander.state = state
                 located = lander.sightings(frame)
-                estimates.append(Estimate(int(place[k]), lander.state, lander.status, located))
+                estimates.append(Estimate(int(number[k]), lander.state, lander.status, located))
             yield estimates
             stretch = _stretch(landers)
         else:
-            range_update(stretch, float(instruments.range_m[place[k]]), surroundings)
+            range_update(stretch, float(instruments.range_m[number[k]]), surroundings)
     for lander, state in zip(landers, stretch.states(), strict=True):
         lander.state = state
 
 
 def _stretch(landers: Sequence[Lander]) -> Stretch:
-    return Stretch([one.state for one in landers], landers[0].noise, landers[0].surroundings.relief_m)
+    return Stretch([lander.state for lander in landers], landers[0].noise, landers[0].surroundings.relief_m)

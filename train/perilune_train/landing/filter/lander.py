@@ -1,4 +1,15 @@
-"""The filter in flight: one call for each measurement, in the order of time."""
+"""The filter in flight: one call for each measurement, in order of time.
+
+inertial, coast   propagate the state
+range             update it by a distance to the ground below
+sightings         match craters (locate.py), then one of three:
+                  - the fix fits the state: update by its craters (`craters_update`)
+                  - the fix contradicts the state, and the previous fix did so too, with an equal offset: replace
+                    position and attitude (`_restart`)
+                  - otherwise ignore the frame
+
+Between frames the state is propagated for many measurements at once (stretch.py).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,20 +32,22 @@ from perilune_train.landing.filter.stretch import Stretch
 from perilune_train.landing.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
-"""tracking: the last frame was matched to craters; coasting: it was not; lost: none was for 15 s, or a fix contradicts
-the state."""
+"""tracking: the last frame was matched to craters. coasting: it was not. lost: no frame was matched for 15 s, or a fix
+contradicts the state."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
-"""Standard deviations of a range and of the ground's height about the nearest craters, where none are given."""
+"""Default standard deviations, metres, of a range, and of the ground's height about the height of the nearest
+craters."""
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
-"""Standard deviation of the velocity, on each axis, where a fix contradicts the state."""
+"""Standard deviation of the velocity on each axis, metres per second, that is added when a fix contradicts the
+state."""
 _NEAREST = 10
-"""Craters whose median height is that of the ground below, but for an error of the state."""
+"""Number of nearest craters whose median height is taken as the height of the ground below."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What the lander knows of its camera and of the ground."""
+    """What the lander knows about its camera and the ground."""
 
     camera: Camera
     """Intrinsics."""
@@ -43,17 +56,22 @@ class Surroundings:
     catalogue: Catalogue
     """Craters of the landing site."""
     range_sigma_m: float
-    """Standard deviation of a range."""
+    """Standard deviation of a range, metres."""
     relief_m: float
-    """Standard deviation of the ground's height about that of the nearest craters."""
+    """Standard deviation of the ground's height about the height of the nearest craters, metres."""
 
 
 def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
-    """Update flights by the same range at the present time; whether it was accepted (F,). None if it is no length."""
+    """Update flights by one range at the present time; returns whether it was accepted (F,).
+
+    A range that is not a positive, finite length is refused.
+    """
     if not (np.isfinite(range_m) and range_m > 0):
         return np.zeros(len(surroundings), bool)
-    places = zip(stretch.position_m, surroundings, strict=True)
-    ground_m = np.array([around.catalogue.ground_m(position, _NEAREST) for position, around in places])
+    positions_and_surroundings = zip(stretch.position_m, surroundings, strict=True)
+    ground_m = np.array(
+        [local.catalogue.ground_m(position, _NEAREST) for position, local in positions_and_surroundings]
+    )
     return stretch.range(range_m, ground_m, surroundings[0].range_sigma_m)
 
 
@@ -64,12 +82,12 @@ class _Contradiction:
     time_s: float
     """Time of its frame."""
     offset_m: Array
-    """Position by the fix less that of the state (3,), O_L."""
+    """Position of the fix minus position of the state (3,), metres, O_L."""
     covariance: Array
-    """Of the position by the fix (3, 3)."""
+    """Covariance (3, 3) of the position of the fix."""
 
     def agrees(self, later: "_Contradiction") -> bool:
-        """Whether a later fix has the same offset, but for errors of fixes and velocity."""
+        """Whether a later fix has the same offset, within the errors of both fixes and of the velocity."""
         step_s = later.time_s - self.time_s
         spread = self.covariance + later.covariance + np.eye(3) * (_UNKNOWN_VELOCITY_MPS * step_s) ** 2
         return passes_gate(later.offset_m - self.offset_m, spread)
@@ -78,7 +96,7 @@ class _Contradiction:
 class Lander:
     """State and status of a lander; every method takes one measurement.
 
-    With `keep_poses` the state keeps the pose of every frame, and later frames correct it: a smoother.
+    With `keep_poses` the state keeps the pose of every frame, and later measurements correct it: a smoother.
     """
 
     def __init__(self, state: State, noise: InertialNoise, around: Surroundings, keep_poses: bool = False):
@@ -91,9 +109,9 @@ class Lander:
 
     status: Status
     noise: InertialNoise
-    """Of the inertial unit."""
+    """Noise of the inertial unit."""
     _since: Stretch | None
-    """What came after `_state`."""
+    """Measurements since `_state`."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -118,46 +136,52 @@ class Lander:
         return self._since
 
     def inertial(self, measured: Increments) -> None:
-        """Propagate to the end of inertial measurements; those that are older, or not finite, are ignored."""
+        """Propagate to the end of inertial measurements; those that are older than the state or not finite are
+        ignored."""
         self._stretch.inertial(measured)
 
     def coast(self, until_s: float) -> None:
-        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
+        """Propagate without inertial measurements: constant velocity and attitude, with growing uncertainty."""
         self._stretch.coast(until_s)
 
     def range(self, range_m: float) -> bool:
-        """Update by a range at the present time; whether it was accepted. One that is no length is not."""
+        """Update by a range at the present time; returns whether it was accepted.
+
+        A range that is not a positive, finite length is refused.
+        """
         return bool(range_update(self._stretch, range_m, [self._around])[0])
 
     def sightings(self, seen: Sightings) -> Located | None:
-        """Update by the craters of a frame at the present time; the fix, if one was accepted."""
-        found = self._matched(seen)
+        """Update by the craters of a frame at the present time; returns the fix if it was accepted."""
+        located = self._matched(seen)
         if self._keep_poses:
             self.state = self.state.keeping_pose()
-        return found
+        return located
 
-    def _matched(self, seen: Sightings) -> Located | None:
-        found = locate(seen, self._around.catalogue, self._around.camera, self._expected())
-        if found is None:
+    def _matched(self, sightings: Sightings) -> Located | None:
+        located = locate(sightings, self._around.catalogue, self._around.camera, self._expected())
+        if located is None:
             self._unmatched()
             return None
-        fix, mounting = found.fix, self._around.rotation_camera_from_body
-        if not pose_fits(self.state, fix.pose, fix.covariance, mounting):
+        fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
+        if not pose_fits(self.state, fix.pose, fix.covariance, rotation_camera_from_body):
             if not self._replaces(fix):
                 self._unmatched()
                 return None
-            self._restart(found)
+            self._restart(located)
         else:
-            around = self._around
-            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
+            local = self._around
+            self.state = craters_update(
+                self.state, fix, sightings, local.catalogue, local.camera, rotation_camera_from_body
+            )
         self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
-        return found
+        return located
 
     def _replaces(self, fix: Fix) -> bool:
-        """Whether a fix that contradicts the state shall replace it: if the fix before has the same offset.
+        """Whether to replace the state by a fix that contradicts it: only if the previous fix had the same offset.
 
-        A fix whose attitude contradicts the state is itself wrong, since a gyroscope does not jump; but not if the
-        state is lost.
+        A fix whose attitude contradicts the state is itself wrong, since a gyroscope does not jump, unless the state is
+        lost.
         """
         expected, state = self._expected(), self.state
         turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)
@@ -175,31 +199,34 @@ class Lander:
     def _unmatched(self) -> None:
         self.status = "lost" if self._late or self._contradiction is not None else "coasting"
 
-    def _restart(self, found: Located) -> None:
-        """Take position and attitude from a fix; the velocity becomes uncertain by what the position was wrong."""
-        fix, mounting = found.fix, self._around.rotation_camera_from_body
+    def _restart(self, located: Located) -> None:
+        """Take position and attitude from a fix, and add `_UNKNOWN_VELOCITY_MPS` to the uncertainty of the velocity."""
+        fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
         state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
         covariance = state.covariance.copy()
         for part in (POSITION, ATTITUDE):
             covariance[part], covariance[:, part] = 0, 0
         covariance[VELOCITY, VELOCITY] += np.eye(3) * _UNKNOWN_VELOCITY_MPS**2
         body = np.zeros((6, 6))
-        body[:3, :3], body[3:, 3:] = np.eye(3), -mounting.T
-        own = body @ fix.covariance @ body.T
-        covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = own[:3, :3], own[3:, 3:]
-        covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = own[:3, 3:], own[3:, :3]
+        body[:3, :3], body[3:, 3:] = np.eye(3), -rotation_camera_from_body.T
+        of_body = body @ fix.covariance @ body.T
+        covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = of_body[:3, :3], of_body[3:, 3:]
+        covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = of_body[:3, 3:], of_body[3:, :3]
         self.state = replace(
             state,
             position_m=fix.pose.position_m,
-            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ mounting,
+            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ rotation_camera_from_body,
             covariance=covariance,
         )
 
     def _expected(self) -> PosePrior:
-        """The camera's expected pose, with its covariance as of a step of `Pose`."""
-        mounting, state = self._around.rotation_camera_from_body, self.state
-        own = [*range(3), *range(6, 9)]
+        """The expected pose of the camera, with its covariance (6, 6): shift, metres, O_L, then turn from the left,
+        radians, O_C."""
+        rotation_camera_from_body, state = self._around.rotation_camera_from_body, self.state
+        pose_parts = [*range(3), *range(6, 9)]
         to_camera = np.zeros((6, 6))
-        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -mounting
-        covariance = to_camera @ state.covariance[np.ix_(own, own)] @ to_camera.T
-        return PosePrior(Pose(state.position_m, mounting @ state.rotation_site_from_body.T), covariance)
+        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -rotation_camera_from_body
+        covariance = to_camera @ state.covariance[np.ix_(pose_parts, pose_parts)] @ to_camera.T
+        return PosePrior(
+            Pose(state.position_m, rotation_camera_from_body @ state.rotation_site_from_body.T), covariance
+        )

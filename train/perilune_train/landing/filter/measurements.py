@@ -1,4 +1,4 @@
-"""Poses from craters, craters, and relative motions as measurements of the state."""
+"""Craters, and poses from craters, as measurements of the state."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,38 +13,31 @@ from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.landing.filter.state import (
     ATTITUDE,
     COMMON,
-    LAST_ATTITUDE,
-    LAST_POSITION,
     N_ERRORS,
     POSITION,
     State,
     common_pattern,
 )
-from perilune_train.landing.filter.update import Update, passes_gate, updated, updated_by
+from perilune_train.landing.filter.update import passes_gate, updated
 
 _LEAST_WEIGHT = 0.1
-"""Matches with a smaller weight in a fix are not used."""
+"""Matches with a smaller weight in the fix are not used."""
 _ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
-"""Parts of the error state that displace every sighting."""
+"""Parts of the error state that displace all sightings."""
 
 
 def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
     """Whether a pose of the camera passes the gate.
 
-    `covariance` (6, 6): shift in O_L, metres, then turn from the left in O_C, radians.
+    `covariance` (6, 6) has the shift in O_L, metres, then the turn from the left in O_C, radians.
     """
     innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
     spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
     return passes_gate(innovation, spread)
 
 
-def pose_update(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> Update:
-    """Update by a pose of the camera, with a covariance as of `pose_fits`."""
-    return updated(state, *_pose_innovation(state, pose, rotation_camera_from_body), covariance)
-
-
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Shift and turn (6,) from the expected pose, and their derivative (6, 27)."""
+    """Shift and turn (6,) from the expected pose, and their derivative (6, 21) by the error state."""
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
     by_error = np.zeros((6, N_ERRORS))
@@ -54,34 +47,6 @@ def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array)
     return np.concatenate([pose.position_m - state.position_m, turn]), by_error
 
 
-def motion_update(
-    state: State,
-    translation_m: Array,
-    rotation_c2_from_c1: Array,
-    covariance: Array,
-    rotation_camera_from_body: Array,
-) -> Update:
-    """Update by the motion of the camera since the last frame.
-
-    `covariance` (6, 6) is that of an alignment: of the turn from the left, radians, and the shift, metres, O_C of the
-    later frame.
-    """
-    mounting = rotation_camera_from_body
-    first, second = (
-        mounting @ rotation.T for rotation in (state.last_rotation_site_from_body, state.rotation_site_from_body)
-    )
-    turned = second @ first.T
-    moved = first @ (state.position_m - state.last_position_m)
-    turn = rotation_vectors(rotation_c2_from_c1 @ turned.T)
-    innovation = np.concatenate([turn, turned @ (moved - translation_m)])
-    by_error = np.zeros((6, N_ERRORS))
-    by_error[:3, ATTITUDE], by_error[:3, LAST_ATTITUDE] = -mounting, turned @ mounting
-    by_error[3:, POSITION], by_error[3:, LAST_POSITION] = -second, second
-    x, y, z = moved
-    by_error[3:, LAST_ATTITUDE] = -turned @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ mounting
-    return updated(state, innovation, by_error, covariance)
-
-
 def craters_update(
     state: State,
     fix: Fix,
@@ -89,16 +54,17 @@ def craters_update(
     catalogue: Catalogue,
     camera: Camera,
     rotation_camera_from_body: Array,
-) -> Update:
-    """Update by the craters that a fix has matched, with their offsets as part of the state.
+) -> State:
+    """Update by the craters that a fix has matched; their offsets over ground are parts of the state.
 
-    Craters that are in view but not matched stay in the state: a crater that is missed in one frame must not bring its
-    error of the catalogue as new information in the next.
-    The measurement is linear about the pose of the fix, which is nearer to the truth than the state (iterated filter,
-    Bell & Cathey 1993, doi 10.1109/9.250476).
+    Craters in view that are not matched stay in the state: if a crater is missed in one frame, its catalogue error must
+    not count as new information in the next.
+
+    The measurement is linearised about the pose of the fix, which is closer to the truth than the state (iterated
+    filter, Bell & Cathey 1993, doi 10.1109/9.250476).
     """
     used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
-    own, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
+    sighting, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
     unmatched = np.setdiff1d(state.craters, crater)
     unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]
     known = np.concatenate([crater, unmatched])
@@ -108,7 +74,7 @@ def craters_update(
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
     from_fix = np.concatenate([state.position_m - fix.pose.position_m, turn])
-    # A crater that is shifted one way looks like a camera that is shifted the other way.
+    # Shifting a crater looks like shifting the camera the other way.
     by_offset = -by_pose[:, :, :2]
     pattern = common_pattern(camera.rays(seen.centre_px)[:, :2])
     predicted = (
@@ -118,23 +84,24 @@ def craters_update(
         + pattern @ state.common_px
     )
     by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
-    innovation = (sightings.centre_px[own[seen.index]] - predicted).ravel()
-    variance = sightings.noise_px[own[seen.index]] ** 2 / weight[seen.index]
-    # Errors of heights in the catalogue shift craters in the image, away from its middle. As parts of the state they
-    # gave the same errors and normalised errors, for a state that is half as large again.
+    innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
+    variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
+    # Height errors of the catalogue shift craters in the image, away from its centre. They are added as noise: as parts
+    # of the state they gave equal errors and normalised errors, for a state half as large again.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
     noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
     number = np.arange(len(noise))
     spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
-    return updated_by(state, innovation, crossed, spread, gated=False)
+    return updated(state, innovation, crossed, spread)
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
-    """Covariance of N sightings with the error state (2 N, M) and with one another (2 N, 2 N), without their noise.
+    """Covariance of N sightings with the error state (2 N, M) and with each other (2 N, 2 N), without measurement
+    noise.
 
-    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are their derivatives by the errors `_ALL_SEE` and by the offsets of
-    their craters, whose places in the state are `crater` (N,). The other derivatives are zero.
+    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are the derivatives of the sightings by the errors `_ALL_SEE` and by
+    the offsets of their craters, which are the craters `crater` (N,) of the state. All other derivatives are zero.
     """
     by_error = by_error.reshape(-1, len(_ALL_SEE))
     crossed = by_error @ state.covariance[_ALL_SEE]
@@ -147,18 +114,20 @@ def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offs
 
 @compiled
 def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDArray[np.int64]) -> None:
-    """Add what the offsets of the craters, from rows `first` on, give to the covariance `crossed` of `_crossed`."""
+    """Add the contribution of the craters' offsets to `crossed` of `_crossed`; they begin at rows `first` of the
+    state."""
     for k in range(len(first)):
         east = first[k]
         for axis in range(2):
-            own, by_east, by_north = crossed[2 * k + axis], by_offset[k, axis, 0], by_offset[k, axis, 1]
-            for column in range(len(own)):
-                own[column] += by_east * covariance[east, column] + by_north * covariance[east + 1, column]
+            row, by_east, by_north = crossed[2 * k + axis], by_offset[k, axis, 0], by_offset[k, axis, 1]
+            for column in range(len(row)):
+                row[column] += by_east * covariance[east, column] + by_north * covariance[east + 1, column]
 
 
 @compiled
 def _add_own(spread: Array, by_offset: Array, crossed: Array, first: NDArray[np.int64]) -> None:
-    """Add what the offsets of the craters, from rows `first` on, give to the covariance `spread` of `_crossed`."""
+    """Add the contribution of the craters' offsets to `spread` of `_crossed`; they begin at rows `first` of the
+    state."""
     for row in range(len(crossed)):
         for k in range(len(first)):
             east = first[k]

@@ -17,12 +17,12 @@ from perilune_train.landing.filter.state import (
 )
 
 _INERTIAL = 15
-"""Parts of the error state that inertial measurements change: the first."""
+"""Number of parts of the error state that inertial measurements change; they come first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """N measurements of an inertial unit, means over intervals, in the order of time; of one flight or of F."""
+    """N measurements of an inertial unit, means over intervals, in order of time, for one flight or for F."""
 
     time_s: Array
     """Ends of the intervals (N,), seconds since the first frame."""
@@ -31,7 +31,7 @@ class Increments:
     angular_rate_radps: Array
     """Mean angular rates (N, 3) or (F, N, 3), O_B; NaN where they are missing."""
     specific_force_mps2: Array
-    """Mean specific forces, as the rates, O_B."""
+    """Mean specific forces, shaped like the rates, O_B."""
 
     @classmethod
     def single(cls, time_s: float, interval_s: float, rate_radps: Array, force_mps2: Array) -> "Increments":
@@ -47,19 +47,19 @@ class Increments:
         return Increments(self.time_s[chosen], self.interval_s[chosen], rate, force)
 
     def measured(self) -> "Increments":
-        """Those that are finite, in all flights."""
+        """The measurements that are finite in all flights."""
         finite = np.isfinite(self.angular_rate_radps) & np.isfinite(self.specific_force_mps2)
         finite = finite.all(axis=(*range(finite.ndim - 2), -1))
         return self if finite.all() else self.part(finite)
 
     def until(self, time_s: float) -> "Increments":
-        """A single measurement up to a time within its interval."""
+        """A single measurement, cut at a time within its interval."""
         interval_s = np.maximum(time_s - (self.time_s - self.interval_s), 0.0)
         return Increments(np.array([time_s]), interval_s, self.angular_rate_radps, self.specific_force_mps2)
 
 
 def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, unit: InertialErrors) -> Array:
-    """Standard deviations (15,) of the first errors of `State` at the start, from those on each axis."""
+    """Standard deviations (15,) of the first errors of `State` at the start, from the deviations on each axis."""
     gyro_bias_radps = np.radians(unit.gyro_bias_deg_per_h) / HOUR_S
     force_bias_mps2 = unit.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
     return np.repeat([position_m, velocity_mps, np.radians(attitude_deg), gyro_bias_radps, force_bias_mps2], 3)
@@ -67,16 +67,16 @@ def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, un
 
 @dataclass(frozen=True, slots=True)
 class InertialNoise:
-    """Variances that a unit adds in one second, per axis."""
+    """Variances that an inertial unit adds in one second, per axis."""
 
     turn: float
-    """Of the attitude, square radians."""
+    """Variance of the attitude, square radians."""
     velocity: float
-    """Of the velocity, square metres per square second."""
+    """Variance of the velocity, square metres per square second."""
     gyro_bias: float
-    """Of the gyroscope's bias."""
+    """Variance of the gyroscope's bias, square radians per square second."""
     force_bias: float
-    """Of the accelerometer's bias."""
+    """Variance of the accelerometer's bias, square metres per second^4."""
 
     @classmethod
     def of(cls, errors: InertialErrors) -> "InertialNoise":
@@ -92,7 +92,7 @@ class InertialNoise:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """What moves, of F flights."""
+    """The moving parts of the states of F flights."""
 
     position_m: Array
     """Positions (F, 3), O_L."""
@@ -108,10 +108,10 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motions of F flights over the same time, and what they do to the first 15 parts of the error state."""
+    """Motions of F flights over the same time, and their effect on the first 15 parts of the error state."""
 
     end: Moving
-    """What moves, at the end."""
+    """The moving parts at the end."""
     change: Array
     """Derivative (F, 15, 15) of the errors at the end by those at the start."""
     added: Array
@@ -119,8 +119,8 @@ class Motion:
 
 
 def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Motion:
-    """The motions by consecutive inertial measurements, each over its interval."""
-    position, velocity, rotation = start.position_m, start.velocity_mps, start.rotation_site_from_body
+    """Integrate consecutive inertial measurements, each over its interval."""
+    position, velocity, rotation_site_from_body = start.position_m, start.velocity_mps, start.rotation_site_from_body
     n, step_s = len(measured), measured.interval_s
     # Time is the first axis.
     rate = np.moveaxis(measured.angular_rate_radps - start.gyro_bias_radps[:, None], 1, 0)
@@ -128,13 +128,13 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
     half = rotation_matrices(rate * (step_s / 2)[:, None, None])
     middle = np.empty_like(half)
     for k in range(n):
-        middle[k] = rotation @ half[k]
-        rotation = middle[k] @ half[k]
+        middle[k] = rotation_site_from_body @ half[k]
+        rotation_site_from_body = middle[k] @ half[k]
         acceleration = (middle[k] @ force[k][..., None])[..., 0] + gravity_mps2(position[:, 2])
         position = position + velocity * step_s[k] + acceleration * (step_s[k] ** 2 / 2)
         velocity = velocity + acceleration * step_s[k]
     changes = _changes(middle, half, force, step_s)
-    # From each measurement to the end, the last first.
+    # Multiply from the last measurement to the first.
     onward = np.empty((len(position), _INERTIAL, n, _INERTIAL))
     change = np.eye(_INERTIAL)
     for k in reversed(range(n)):
@@ -142,16 +142,16 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
         change = change @ changes[k]
     per_s = np.repeat([0.0, noise.velocity, noise.turn, noise.gyro_bias, noise.force_bias], 3)
     onward = (onward * np.sqrt(per_s * step_s[:, None])).reshape(len(position), _INERTIAL, -1)
-    end = replace(start, position_m=position, velocity_mps=velocity, rotation_site_from_body=rotation)
+    end = replace(start, position_m=position, velocity_mps=velocity, rotation_site_from_body=rotation_site_from_body)
     return Motion(end, change, onward @ np.swapaxes(onward, 1, 2))
 
 
 def _changes(middle: Array, half: Array, force: Array, step_s: Array) -> Array:
     """Derivatives (N, F, 15, 15) of the errors after each step by the errors before it.
 
-    An error of the attitude turns the measured force; errors of the biases are integrated over the step.
-
-    `middle` and `half` (N, F, 3, 3) are the attitudes in the middle of the steps and the turns up to there.
+    An error of the attitude turns the measured force; errors of the biases are integrated over the step. `middle` and
+    `half` (N, F, 3, 3) are the attitudes at the middle of the steps, and the turns from the start of each step to its
+    middle.
     """
     step = step_s[:, None, None, None]
     by_turn = -middle @ cross_matrices(force)

@@ -1,13 +1,21 @@
 """State of the lander, and small errors of it.
 
-The error state begins with 21 parts: shift and change of velocity in O_L (metres, metres per second), turn of the body
-from the right (radians, O_B), errors of the gyroscope's and the accelerometer's bias, and shift and turn of the pose at
-the last frame, which measurements of relative motion refer to (Roumeliotis & Burdick 2002, doi
-10.1109/ROBOT.2002.1014801). Behind them come five numbers of an error that all sightings of craters share, the height
-of the ground below, and an offset over ground of every crater in view. Errors of the catalogue, of the detector and of
-the ground's height repeat from frame to frame; taken for noise, they would make the filter sure of what it does not
-know. Last come the poses of earlier frames, if they are kept: later measurements correct them, which makes a smoother
-(stochastic cloning of all poses).
+Parts of the error state, in this order:
+
+    POSITION     shift, metres, O_L                                              3
+    VELOCITY     change of velocity, metres per second, O_L                      3
+    ATTITUDE     turn of the body from the right, radians, O_B                   3
+    GYRO_BIAS    error of the gyroscope's bias, radians per second, O_B          3
+    FORCE_BIAS   error of the accelerometer's bias, metres per second^2, O_B     3
+    COMMON       image error that all sightings of craters share, pixels         5
+    GROUND       height of the ground below, metres                              1
+    (craters)    offset of each crater in view over ground, metres, O_L          2 each
+    (poses)      shift and turn of each kept pose, as POSITION and ATTITUDE      6 each
+
+Errors of the catalogue, of the detector and of the ground's height repeat from frame to frame. A filter that treats
+them as noise averages them over frames and states too small a covariance, so they are parts of the state. Poses of
+earlier frames are kept on request: later measurements correct them, which makes the filter a smoother (stochastic
+cloning, Roumeliotis & Burdick 2002, doi 10.1109/ROBOT.2002.1014801).
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,13 +28,12 @@ from perilune_train.compiled import compiled
 
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
-LAST_POSITION, LAST_ATTITUDE = slice(15, 18), slice(18, 21)
-COMMON, GROUND = slice(21, 26), slice(26, 27)
-N_ERRORS = 27
-"""Parts of the error state without the craters."""
+COMMON, GROUND = slice(15, 20), slice(20, 21)
+N_ERRORS = 21
+"""Parts of the error state without craters and kept poses."""
 
 _COMMON_SIGMAS_PX = np.array([0.08, 0.08, 0.15, 0.2, 0.2])
-"""Deviations of what sightings share, from the validation scenes of `shipped-nav`."""
+"""Standard deviations of the shared image error, pixels, measured on the validation scenes of `shipped-nav`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +52,16 @@ class State:
     """Bias of the gyroscope (3,), O_B."""
     force_bias_mps2: Array
     """Bias of the accelerometer (3,), O_B."""
-    last_position_m: Array
-    """Position (3,) at the last frame."""
-    last_rotation_site_from_body: Array
-    """Attitude (3, 3) at the last frame."""
     common_px: Array
-    """What all sightings share (5,), pixels: as `common_pattern` has it."""
+    """Coefficients (5,), pixels, of the error that all sightings share, see `common_pattern`."""
     ground_m: float
-    """Height of the ground below, by that of the nearest craters of the catalogue."""
+    """Height of the ground below, relative to the median height of the nearest craters of the catalogue."""
     craters: NDArray[np.integer]
-    """Craters in view (n,): places in the catalogue."""
+    """Craters in view (n,): rows of the catalogue."""
     offsets_m: Array
-    """How far they appear from their place in the catalogue (n, 2), O_L, x and y."""
+    """Offsets (n, 2), x and y in O_L, of their detected centres from those of the catalogue."""
     covariance: Array
-    """Covariance of the error state (27 + 2 n + 6 m, 27 + 2 n + 6 m)."""
+    """Covariance of the error state (21 + 2 n + 6 m, 21 + 2 n + 6 m)."""
     past_position_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """Positions at earlier frames (m, 3), O_L."""
     past_rotation_site_from_body: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
@@ -70,19 +73,17 @@ class State:
     ) -> "State":
         """The state at the first frame.
 
-        `sigmas` (15,) are the deviations of the first 15 errors; `relief_m` is that of the ground's height.
+        `sigmas` (15,) are the standard deviations of the first 15 errors, `relief_m` that of the ground's height.
         """
         none = np.zeros(3)
-        pose = position_m, rotation_site_from_body
-        covariance = np.diag(np.square(np.concatenate([sigmas, np.zeros(6), _COMMON_SIGMAS_PX, [relief_m]])))
-        state = cls(
-            0.0, position_m, velocity_mps, rotation_site_from_body, none, none, *pose,
+        covariance = np.diag(np.square(np.concatenate([sigmas, _COMMON_SIGMAS_PX, [relief_m]])))
+        return cls(
+            0.0, position_m, velocity_mps, rotation_site_from_body, none, none,
             np.zeros(5), 0.0, np.zeros(0, int), np.zeros((0, 2)), covariance,
         )  # fmt: skip
-        return state.with_frame()
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """The state with an estimated error (27 + 2 n + 6 m,) removed, and its new covariance, which is symmetric."""
+        """Remove an estimated error (21 + 2 n + 6 m,) from the state; `covariance` is the new, symmetric covariance."""
         end = N_ERRORS + 2 * len(self.craters)
         past = error[end:].reshape(-1, 6)
         return State(
@@ -92,8 +93,6 @@ class State:
             self.rotation_site_from_body @ matrix_from_rotation_vector(error[ATTITUDE]),
             self.gyro_bias_radps + error[GYRO_BIAS],
             self.force_bias_mps2 + error[FORCE_BIAS],
-            self.last_position_m + error[LAST_POSITION],
-            self.last_rotation_site_from_body @ matrix_from_rotation_vector(error[LAST_ATTITUDE]),
             self.common_px + error[COMMON],
             self.ground_m + float(error[GROUND][0]),
             self.craters,
@@ -103,19 +102,8 @@ class State:
             self.past_rotation_site_from_body @ rotation_matrices(past[:, 3:]),
         )
 
-    def with_frame(self) -> "State":
-        """The state with its present pose as that of the last frame."""
-        copy = np.eye(len(self.covariance))
-        copy[LAST_POSITION], copy[LAST_ATTITUDE] = copy[POSITION].copy(), copy[ATTITUDE].copy()
-        return replace(
-            self,
-            last_position_m=self.position_m,
-            last_rotation_site_from_body=self.rotation_site_from_body,
-            covariance=copy @ self.covariance @ copy.T,
-        )
-
     def keeping_pose(self) -> "State":
-        """The state with its present pose added to those of earlier frames."""
+        """The state with its present pose added to the kept poses."""
         pose = [*range(3), *range(6, 9)]
         wider = np.concatenate([np.eye(len(self.covariance)), np.eye(len(self.covariance))[pose]])
         return replace(
@@ -128,10 +116,11 @@ class State:
         )
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
-        """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
-        place = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
-        place[self.craters] = np.arange(len(self.craters))
-        before = place[craters]
+        """The state with the offsets of `craters` (n,) alone; `sigma_m` (n,) are the standard deviations of new
+        ones."""
+        row_of = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
+        row_of[self.craters] = np.arange(len(self.craters))
+        before = row_of[craters]
         known, new = before >= 0, np.flatnonzero(before < 0)
         rows = np.full((len(craters), 2), -1)
         rows[known] = N_ERRORS + 2 * before[known, None] + [0, 1]
@@ -145,43 +134,43 @@ class State:
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
-        """Shift and turn (6,) from the kept pose of an earlier frame to a true one, and their covariance (6, 6)."""
+        """Shift and turn (6,) from the kept pose of an earlier frame to the true pose, and their covariance (6, 6)."""
         turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
         start = N_ERRORS + 2 * len(self.craters) + 6 * number
-        own = slice(start, start + 6)
-        return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[own, own]
+        parts = slice(start, start + 6)
+        return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[parts, parts]
 
     def pose_error(self, position_m: Array, rotation_site_from_body: Array) -> Array:
-        """Shift and turn (6,) from the estimate to a true pose."""
+        """Shift and turn (6,) from the estimated to the true pose."""
         turn = rotation_vectors(self.rotation_site_from_body.T @ rotation_site_from_body)
         return np.concatenate([position_m - self.position_m, turn])
 
 
 @compiled
 def _rearranged(covariance: Array, source: NDArray[np.int64]) -> Array:
-    """The covariance (n, n) of n parts, from their places in another one; those with the place -1 are zero."""
-    found = np.zeros((len(source), len(source)))
+    """A covariance (n, n) whose part i is part `source[i]` of another covariance; parts with -1 are zero."""
+    rearranged = np.zeros((len(source), len(source)))
     for i in range(len(source)):
         if source[i] < 0:
             continue
         for j in range(len(source)):
             if source[j] >= 0:
-                found[i, j] = covariance[source[i], source[j]]
-    return found
+                rearranged[i, j] = covariance[source[i], source[j]]
+    return rearranged
 
 
 _CROSS = np.zeros((3, 9))
 _CROSS[[0, 0, 1, 1, 2, 2], [5, 7, 2, 6, 1, 3]] = -1, 1, 1, -1, -1, 1
-"""Parts of the matrix of a cross product, row by row, of each axis."""
+"""The matrix of the cross product with each axis, row by row."""
 
 
 def cross_matrices(vectors: Array) -> Array:
-    """Matrices (..., 3, 3) whose products with u are the cross products v x u, of vectors v (..., 3)."""
+    """Matrices (..., 3, 3) whose products with u are the cross products v x u, for vectors v (..., 3)."""
     return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
 def rotation_matrices(turns_rad: Array) -> Array:
-    """Matrices (..., 3, 3) of rotation vectors (..., 3): `matrix_from_rotation_vector` of many."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians: `matrix_from_rotation_vector` for many."""
     angle = np.sqrt((turns_rad**2).sum(axis=-1))[..., None]
     cross = cross_matrices(turns_rad / np.where(angle > 0, angle, 1.0))
     angle = angle[..., None]
@@ -189,13 +178,13 @@ def rotation_matrices(turns_rad: Array) -> Array:
 
 
 def common_pattern(ray: Array) -> Array:
-    """Displacements (n, 2, 5) in the image by what sightings share, at rays (n, 2) on the plane at depth 1.
+    """Derivatives (n, 2, 5) of the image error that all sightings share, at rays (n, 2) on the plane at depth 1.
 
-    A shift, a scale and two parts that grow with the square of the distance from the middle: a pose that is off in
-    position, altitude and tilt displaces craters likewise, and no frame can tell one from the other.
+    A shift, a scale and two terms that grow with the square of the distance from the image centre. Errors of position,
+    altitude and tilt displace craters in the same way, so a single frame cannot tell them apart.
     """
     x, y = ray.T
-    none, one = np.zeros_like(x), np.ones_like(x)
+    zero, ones = np.zeros_like(x), np.ones_like(x)
     return np.stack(
-        [np.stack([one, none, x, x**2, x * y], axis=1), np.stack([none, one, y, x * y, y**2], axis=1)], axis=1
+        [np.stack([ones, zero, x, x**2, x * y], axis=1), np.stack([zero, ones, y, x * y, y**2], axis=1)], axis=1
     )

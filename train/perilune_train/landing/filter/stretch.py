@@ -1,12 +1,18 @@
 """Flights between two frames: inertial measurements and ranges.
 
-They change and measure 16 parts of the error state alone: the first 15 and the height of the ground (the core). What
-they tell about the others - craters, earlier poses - is a linear function of the errors of the core at the start of the
-stretch. It is gathered and applied once, at the end (compressed filter, Guivant & Nebot 2001, doi 10.1109/70.938382):
-the result is that of the whole filter, and a range costs as much as if there were no craters. Only corrections of
-earlier attitudes differ, by products of two of them: they are added up, and not applied one after the other.
+Inertial measurements and ranges change and measure only 16 parts of the error state: the first 15 and the height of the
+ground (the core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
+errors at the start of the stretch. So the other parts wait (compressed filter, Guivant & Nebot 2001, doi
+10.1109/70.938382):
 
-All flights of a stretch have measurements at the same times. Every operation is done on all of them at once.
+1. `inertial`, `coast` and `range` change the core, its covariance and its derivative by the core at the start.
+2. `range` also keeps its derivative by the core at the start, and its innovation.
+3. `states` applies all kept ranges to the other parts at once.
+
+The result equals that of the whole filter, and a range costs as much as if there were no craters. Only the attitudes of
+earlier frames differ, by products of two corrections: corrections are added up, not applied one after the other.
+
+All flights of a stretch have measurements at the same times, and every operation acts on all of them at once.
 """
 
 from collections.abc import Sequence
@@ -31,14 +37,14 @@ from perilune_train.landing.filter.update import gate
 
 _INERTIAL = FORCE_BIAS.stop
 _HEIGHT = _INERTIAL
-"""Place of the ground's height in the core."""
+"""Index of the ground's height in the core."""
 CORE = np.r_[0:_INERTIAL, GROUND]
-"""Places of the core in the error state."""
+"""Indices of the core in the error state."""
 _GROUND_S = 10.0
-"""Time in which the ground below a lander becomes another, at 10 to 30 m/s over ground."""
+"""Correlation time of the height of the ground below a lander, seconds, at 10 to 30 m/s over ground."""
 _GAP_S = 0.05
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
-"""Standard deviations of the motion while inertial measurements are missing."""
+"""Standard deviations of acceleration and angular rate while inertial measurements are missing."""
 
 
 class Stretch:
@@ -49,14 +55,14 @@ class Stretch:
         self._begin, self._noise, self._relief_m = list(states), noise, relief_m
         self.time_s = states[0].time_s
         self._moving = Moving(
-            np.stack([one.position_m for one in states]),
-            np.stack([one.velocity_mps for one in states]),
-            np.stack([one.rotation_site_from_body for one in states]),
-            np.stack([one.gyro_bias_radps for one in states]),
-            np.stack([one.force_bias_mps2 for one in states]),
+            np.stack([state.position_m for state in states]),
+            np.stack([state.velocity_mps for state in states]),
+            np.stack([state.rotation_site_from_body for state in states]),
+            np.stack([state.gyro_bias_radps for state in states]),
+            np.stack([state.force_bias_mps2 for state in states]),
         )
-        self._ground_m = np.array([one.ground_m for one in states])
-        self._covariance = np.stack([one.covariance[np.ix_(CORE, CORE)] for one in states])
+        self._ground_m = np.array([state.ground_m for state in states])
+        self._covariance = np.stack([state.covariance[np.ix_(CORE, CORE)] for state in states])
         self._change = np.tile(np.eye(len(CORE)), (len(states), 1, 1))
         self._told: list[tuple[Array, Array]] = []
 
@@ -76,23 +82,23 @@ class Stretch:
             return
         start_s = measured.time_s - measured.interval_s
         after_s = np.concatenate([[self.time_s], measured.time_s[:-1]])
-        done = 0
+        n_done = 0
         for gap in np.flatnonzero(start_s > after_s + _GAP_S):
-            self._propagate(measured.part(slice(done, gap)))
+            self._propagate(measured.part(slice(n_done, gap)))
             self.coast(float(start_s[gap]))
-            done = int(gap)
-        self._propagate(measured.part(slice(done, None)))
+            n_done = int(gap)
+        self._propagate(measured.part(slice(n_done, None)))
 
     def _propagate(self, measured: Increments) -> None:
         """Propagate by measurements that follow one another; each begins where the one before ends."""
         if not len(measured):
             return
         measured = replace(measured, interval_s=np.diff(measured.time_s, prepend=self.time_s))
-        done = integrated(self._moving, measured, self._noise)
-        self._moving = done.end
+        motion = integrated(self._moving, measured, self._noise)
+        self._moving = motion.end
         kept = np.exp(-(measured.time_s[-1] - self.time_s) / _GROUND_S)
         self._ground_m = kept * self._ground_m
-        self._moved(float(measured.time_s[-1]), done.change, done.added, kept)
+        self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
 
     def coast(self, until_s: float) -> None:
         """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""

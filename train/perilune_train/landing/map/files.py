@@ -1,4 +1,4 @@
-"""Files of a map: one catalogue per scene, and what is stated about them."""
+"""Files of a map: one catalogue per scene, and their stated errors."""
 
 import json
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class SceneMap:
     errors: pd.DataFrame
     """Errors by diameter."""
     picture: NDArray[np.uint8]
-    """Part of the first image with what is mapped."""
+    """Part of the first image with the mapped craters."""
 
 
 def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
@@ -39,15 +39,15 @@ def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
     columns = ["scene_id", "sun_azimuth_deg", "sun_elevation_deg", "content_sha256"]
     by_scene = dataset.table("scenes", columns).to_pandas().set_index("scene_id").to_dict("index")
     scenes = {}
-    for one in maps:
-        craters = {f"{axis}_m": one.catalogue.centre_m[:, place] for place, axis in enumerate("xyz")}
-        craters |= {"diameter_m": 2 * one.catalogue.radius_m, "score": one.score}
-        pd.DataFrame(craters).to_parquet(folder / f"{one.scene_id}.parquet", index=False)
-        scenes[one.scene_id] = {
-            "craters": len(one.catalogue),
-            "position_sigma_m": round(one.catalogue.position_sigma_m, 4),
-            "diameter_sigma_share": one.catalogue.radius_sigma_share,
-            **by_scene[one.scene_id],
+    for scene_map in maps:
+        craters = {f"{axis}_m": scene_map.catalogue.centre_m[:, axis_number] for axis_number, axis in enumerate("xyz")}
+        craters |= {"diameter_m": 2 * scene_map.catalogue.radius_m, "score": scene_map.score}
+        pd.DataFrame(craters).to_parquet(folder / f"{scene_map.scene_id}.parquet", index=False)
+        scenes[scene_map.scene_id] = {
+            "craters": len(scene_map.catalogue),
+            "position_sigma_m": round(scene_map.catalogue.position_sigma_m, 4),
+            "diameter_sigma_share": scene_map.catalogue.radius_sigma_share,
+            **by_scene[scene_map.scene_id],
         }
     write_text(folder / SETTINGS, json.dumps({"dataset": dataset.info.name, "scenes": scenes}, indent=2) + "\n")
 
@@ -55,32 +55,36 @@ def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
 def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
     """Read the catalogues that `write_maps` wrote, by scene_id.
 
-    Scenes that only one of both has are left out. Raises UserError if map.json or a catalogue is damaged, if both have
-    no scene in common, or if a scene of the dataset has other ground than that of the map.
+    Scenes that only the map or only the dataset has are left out. Raises UserError if map.json or a catalogue is
+    damaged, if map and dataset have no scene in common, or if the ground of a scene differs between them.
     """
     path, expected = folder / SETTINGS, "the folder of a map, from `perilune-train navigate map`"
     try:
         scenes = json.loads(path.read_text(encoding="utf-8"))["scenes"]
-        sigmas = {str(name): _sigmas(one) for name, one in scenes.items()}
-        hashes = {str(name): str(one["content_sha256"]) for name, one in scenes.items()}
+        sigmas = {str(name): _sigmas(record) for name, record in scenes.items()}
+        hashes = {str(name): str(record["content_sha256"]) for name, record in scenes.items()}
     except OSError:
         raise UserError(path, "map", "no such file", expected) from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(path, "map", repr(error), expected) from None
-    own = dict(zip(*dataset.table("scenes", ["scene_id", "content_sha256"]).to_pydict().values(), strict=True))
-    shared = sorted(set(own) & set(sigmas))
+    hash_of_scene = dict(
+        zip(*dataset.table("scenes", ["scene_id", "content_sha256"]).to_pydict().values(), strict=True)
+    )
+    shared = sorted(set(hash_of_scene) & set(sigmas))
     if not shared:
         raise UserError(path, "scenes", sorted(sigmas)[:3], f"scenes of {dataset.store}")
     for name in shared:
-        if hashes[name] != own[name]:
-            raise UserError(path, f"{name}: content_sha256", hashes[name], f"{own[name]}, the ground of the dataset")
+        if hashes[name] != hash_of_scene[name]:
+            raise UserError(
+                path, f"{name}: content_sha256", hashes[name], f"{hash_of_scene[name]}, the ground of the dataset"
+            )
     # Only names of scenes of the dataset become names of files.
     return {name: read_catalogue(folder / f"{name}.parquet", CatalogueUse(*sigmas[name])) for name in shared}
 
 
-def _sigmas(one: dict[str, float]) -> tuple[float, float]:
-    """Stated deviations of position and diameter. Raises ValueError if they are none."""
-    values = float(one["position_sigma_m"]), float(one["diameter_sigma_share"])
+def _sigmas(record: dict[str, float]) -> tuple[float, float]:
+    """Stated standard deviations of position and diameter. Raises ValueError if they are not finite and at least 0."""
+    values = float(record["position_sigma_m"]), float(record["diameter_sigma_share"])
     if not all(0 <= value < 1e3 for value in values):
         raise ValueError(f"deviations {values}, expected 0 to 1000")
     return values

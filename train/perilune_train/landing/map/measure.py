@@ -10,16 +10,18 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.catalogue import Catalogue
 
 DIAMETERS_M = (3.0, 5.0, 7.0, 10.0, 20.0, 40.0, 100.0, np.inf)
-"""Limits of the bins."""
+"""Limits of the bins of diameter, metres."""
 _CANDIDATES = 12
 _MOST_APART = 0.8
-"""Largest distance of a mapped crater and the true one, in radii, plus twice the difference of their logarithms."""
+"""Largest distance between a mapped and a true crater, in radii, plus twice the difference of the logarithms of the
+radii."""
 
 
 def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFrame:
-    """One row per bin of the diameter: number, share of true craters, share found, errors.
+    """One row per bin of the diameter: number, share of true craters, share of craters that are mapped, errors.
 
-    `covered_m` is the largest |x| and |y| (2,) of the ground that both images show; craters beyond it are not missed.
+    `covered_m` (2,) is the largest |x| and |y| of the ground that both images show; craters beyond it do not count as
+    missed.
     """
     truth = KDTree(exact.centre_m[:, :2])
     distance_m, index = truth.query(mapped.centre_m[:, :2], min(_CANDIDATES, len(exact)))
@@ -29,23 +31,23 @@ def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFr
     rows, best = np.arange(len(mapped)), cost.argmin(axis=1)
     nearest, by_size, true = index[rows, best], by_size[rows, best], cost[rows, best] < _MOST_APART
     error_m = mapped.centre_m - exact.centre_m[nearest]
-    found = np.zeros(len(exact), bool)
-    found[nearest[true]] = True
+    is_found = np.zeros(len(exact), bool)
+    is_found[nearest[true]] = True
     covered = (np.abs(exact.centre_m[:, :2]) < covered_m).all(axis=1)
     table = []
     for low, high in itertools.pairwise(DIAMETERS_M):
-        own = (2 * mapped.radius_m >= low) & (2 * mapped.radius_m < high)
-        good, there = own & true, covered & (2 * exact.radius_m >= low) & (2 * exact.radius_m < high)
+        in_bin = (2 * mapped.radius_m >= low) & (2 * mapped.radius_m < high)
+        mapped_true, true_in_bin = in_bin & true, covered & (2 * exact.radius_m >= low) & (2 * exact.radius_m < high)
         table.append(
             {
                 "diameter_m": f"{low:g} to {high:g}" if np.isfinite(high) else f"{low:g} or more",
-                "mapped": int(own.sum()),
-                "true_share": _mean(true[own]),
-                "found_share": _mean(found[there]),
-                "position_rmse_m": _rms(error_m[good][:, :2]),
-                "height_rmse_m": _rms(error_m[good][:, 2]),
-                "diameter_bias_share": _mean(by_size[good]),
-                "diameter_sigma_share": float(by_size[good].std()) if good.any() else np.nan,
+                "mapped": int(in_bin.sum()),
+                "true_share": _mean(true[in_bin]),
+                "found_share": _mean(is_found[true_in_bin]),
+                "position_rmse_m": _rms(error_m[mapped_true][:, :2]),
+                "height_rmse_m": _rms(error_m[mapped_true][:, 2]),
+                "diameter_bias_share": _mean(by_size[mapped_true]),
+                "diameter_sigma_share": float(by_size[mapped_true].std()) if mapped_true.any() else np.nan,
             }
         )
     return pd.DataFrame(table)

@@ -1,4 +1,4 @@
-"""Craters in space, from the craters that a detector finds in two images of known poses."""
+"""Craters in space, from detections in two images of known poses."""
 
 from dataclasses import dataclass, field
 
@@ -13,21 +13,21 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _CLASSES_PX = (30.0, 12.0, 5.0, 0.0)
-"""Smallest radii of the classes, largest first. The heights of one class narrow the search for the next."""
+"""Smallest radii of the classes, pixels, largest first. The heights of one class narrow the search for the next."""
 _RELIEF_M = 30.0
-"""Standard deviation of heights before any crater is matched, metres."""
+"""Standard deviation of heights, metres, before any crater is matched."""
 _LEAST_RELIEF_M = 1.0
 _SIZE_SIGMA = 0.15
 """Standard deviation of the logarithm of the ratio of two radii of one crater."""
 _GATE = 3.0
 """Largest difference of a match, in standard deviations, on each axis."""
 _NEIGHBOURS = 16
-"""Number of matched craters whose heights give that of the ground in between."""
+"""Number of matched craters whose heights give the height of the ground between them."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image of known pose, with what a detector found in it."""
+    """One image of known pose, with its detections."""
 
     camera: Camera
     """Intrinsics, without distortion."""
@@ -43,15 +43,17 @@ class View:
         return np.asarray(towards / -towards[:, 2:])
 
     def place_m(self, height_m: Array) -> Array:
-        """Points (M, 2), O_L, of the rays at given heights (M,)."""
+        """Points (M, 2), O_L, at which the rays have given heights (M,)."""
         return np.asarray(self.pose.position_m[:2] + self.rays[:, :2] * (self.pose.position_m[2] - height_m)[:, None])
 
     def radius_m(self, height_m: Array) -> Array:
         """Radii (M,), metres, of the craters as level circles at given heights (M,)."""
-        rotation = self.pose.rotation_camera_from_site
-        centres = camera_from_site(np.column_stack([self.place_m(height_m), height_m]), self.pose.position_m, rotation)
+        rotation_camera_from_site = self.pose.rotation_camera_from_site
+        centres = camera_from_site(
+            np.column_stack([self.place_m(height_m), height_m]), self.pose.position_m, rotation_camera_from_site
+        )
         guess_m = self.sightings.radius_px * centres[:, 2] / self.camera.fx_px
-        level = np.tile(rotation[:, 2], (len(centres), 1))
+        level = np.tile(rotation_camera_from_site[:, 2], (len(centres), 1))
         boxes = project_circles(self.camera, centres, level, guess_m).bounding_boxes()
         size_px = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)) / 2
         return np.asarray(guess_m * self.sightings.radius_px / size_px)
@@ -66,10 +68,10 @@ class Ground:
     height_m: Array = field(default_factory=lambda: np.zeros(0))
     """Heights (N,)."""
     sigma_m: float = _RELIEF_M
-    """Standard deviation of a crater's height from `at`."""
+    """Standard deviation of a crater's height from the height of `at`, metres."""
 
     def at(self, place_m: Array, without_nearest: bool = False) -> Array:
-        """Heights (M,) of points (M, 2): the median of the nearest craters; 0 while there are few."""
+        """Heights (M,) of points (M, 2): the median of the nearest craters; 0 while there are too few."""
         if len(self.height_m) <= _NEIGHBOURS:
             return np.full(len(place_m), np.median(self.height_m) if len(self.height_m) else 0.0)
         _, near = KDTree(self.place_m).query(place_m, _NEIGHBOURS + without_nearest)
@@ -78,18 +80,18 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """N craters that are seen in both images."""
+    """N craters seen in both images."""
 
     first: NDArray[np.intp]
-    """Places (N,) in the sightings of the first view."""
+    """Indices (N,) among the sightings of the first view."""
     second: NDArray[np.intp]
-    """Places (N,) in those of the second view."""
+    """Indices (N,) among the sightings of the second view."""
     centre_m: Array
     """Centres (N, 3), O_L."""
     radius_m: Array
     """Radii (N,)."""
     apart_m: Array
-    """What is left between the two rays at that height (N, 2), metres, O_L."""
+    """Horizontal distance (N, 2) between both rays at that height, metres, O_L."""
     score: Array
     """The lower of both scores (N,)."""
 
@@ -97,16 +99,18 @@ class Matched:
 def matched(first: View, second: View) -> Matched:
     """Match the craters of two views and intersect their rays, from the largest craters to the smallest.
 
-    Heights of single small craters are far less accurate than those of the ground around them, so a crater gets the
-    median height of its neighbours.
+    The height of a single small crater is far less accurate than the height of the ground around it, so a crater gets
+    the median height of its neighbours.
     """
     ground, pairs = Ground(), np.zeros((0, 2), np.intp)
-    for place, least_px in enumerate(_CLASSES_PX):
-        most_px = _CLASSES_PX[place - 1] if place else np.inf
+    for number, least_px in enumerate(_CLASSES_PX):
+        most_px = _CLASSES_PX[number - 1] if number else np.inf
         # A crater near the limit of a class may be beyond it in the other view.
         parts = [
-            np.flatnonzero((one.sightings.radius_px >= share * least_px) & (one.sightings.radius_px < most_px / share))
-            for one, share in ((first, 1.0), (second, 0.75))
+            np.flatnonzero(
+                (view.sightings.radius_px >= share * least_px) & (view.sightings.radius_px < most_px / share)
+            )
+            for view, share in ((first, 1.0), (second, 0.75))
         ]
         parts[0] = parts[0][first.sightings.radius_px[parts[0]] < most_px]
         parts[1] = np.setdiff1d(parts[1], pairs[:, 1])
@@ -114,8 +118,14 @@ def matched(first: View, second: View) -> Matched:
         pairs = np.concatenate([pairs, new])
         ground = _ground(first, second, pairs)
     heights = ground.at(ground.place_m)
-    places = [one.place_m(_spread(heights, own, one))[own] for one, own in zip((first, second), pairs.T, strict=True)]
-    radii = [one.radius_m(_spread(heights, own, one))[own] for one, own in zip((first, second), pairs.T, strict=True)]
+    places = [
+        view.place_m(_spread(heights, chosen, view))[chosen]
+        for view, chosen in zip((first, second), pairs.T, strict=True)
+    ]
+    radii = [
+        view.radius_m(_spread(heights, chosen, view))[chosen]
+        for view, chosen in zip((first, second), pairs.T, strict=True)
+    ]
     score = np.minimum(first.sightings.score[pairs[:, 0]], second.sightings.score[pairs[:, 1]])
     middle = (places[0] + places[1]) / 2
     return Matched(
@@ -128,15 +138,15 @@ def matched(first: View, second: View) -> Matched:
     )
 
 
-def _spread(values: Array, own: NDArray[np.intp], view: View) -> Array:
-    """Values of some sightings as an array for all of them; 0 elsewhere."""
+def _spread(values: Array, chosen: NDArray[np.intp], view: View) -> Array:
+    """The values of some sightings as an array for all sightings; 0 elsewhere."""
     every = np.zeros(len(view.sightings))
-    every[own] = values
+    every[chosen] = values
     return every
 
 
 def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Ground) -> NDArray[np.intp]:
-    """Pairs (N, 2) of sightings that are each other's nearest, on the ground and in size."""
+    """Pairs (N, 2) of sightings that are nearest to each other in position on the ground and in size."""
     if not len(parts[0]) or not len(parts[1]):
         return np.zeros((0, 2), np.intp)
     baseline = second.pose.position_m - first.pose.position_m
@@ -144,16 +154,18 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
     across = np.array([-along[1], along[0]])
     steepness = float(np.linalg.norm(baseline[:2]) / first.pose.position_m[2])
     points = []
-    for one, part in zip((first, second), parts, strict=True):
-        height = np.zeros(len(one.sightings))
+    for view, part in zip((first, second), parts, strict=True):
+        height = np.zeros(len(view.sightings))
         for _ in range(3):
-            height = ground.at(one.place_m(height))
-        place, radius = one.place_m(height)[part], one.radius_m(height)[part]
-        noise_m = radius / one.sightings.radius_px[part] * one.sightings.noise_px[part]
-        points.append((place, radius, noise_m))
+            height = ground.at(view.place_m(height))
+        position, radius = view.place_m(height)[part], view.radius_m(height)[part]
+        noise_m = radius / view.sightings.radius_px[part] * view.sightings.noise_px[part]
+        points.append((position, radius, noise_m))
     typical = float(np.median(np.concatenate([noise for _, _, noise in points]))) * 2**0.5
     scale = np.array([np.hypot(steepness * ground.sigma_m, typical), typical, _SIZE_SIGMA]) * _GATE
-    spots = [np.column_stack([place @ along, place @ across, np.log(radius)]) / scale for place, radius, _ in points]
+    spots = [
+        np.column_stack([position @ along, position @ across, np.log(radius)]) / scale for position, radius, _ in points
+    ]
     trees = [KDTree(spot) for spot in spots]
     _, forth = trees[1].query(spots[0], p=2)
     _, back = trees[0].query(spots[1], p=2)
@@ -164,17 +176,17 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
 
 
 def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
-    """The ground of matched craters: heights at which their rays pass nearest to each other."""
-    start = [one.pose.position_m for one in (first, second)]
-    rays = [one.rays[own] for one, own in zip((first, second), pairs.T, strict=True)]
-    # Along both rays z falls alike, so their distance at a height is linear in it.
+    """The ground of matched craters, from the heights at which their rays come closest to each other."""
+    start = [view.pose.position_m for view in (first, second)]
+    rays = [view.rays[chosen] for view, chosen in zip((first, second), pairs.T, strict=True)]
+    # Both rays have z = -1, so their distance is a linear function of the height.
     apart = start[1][:2] + rays[1][:, :2] * start[1][2] - start[0][:2] - rays[0][:, :2] * start[0][2]
     by_height = rays[0][:, :2] - rays[1][:, :2]
     height = -(apart * by_height).sum(axis=1) / np.square(by_height).sum(axis=1)
-    place = start[0][:2] + rays[0][:, :2] * (start[0][2] - height)[:, None]
-    raw = Ground(place, height)
-    off = height - raw.at(place, without_nearest=True)
+    position = start[0][:2] + rays[0][:, :2] * (start[0][2] - height)[:, None]
+    raw = Ground(position, height)
+    off = height - raw.at(position, without_nearest=True)
     sigma = max(1.4826 * float(np.median(np.abs(off))), _LEAST_RELIEF_M) if len(off) > _NEIGHBOURS else _RELIEF_M
     good = np.abs(off) < 4 * sigma
-    kept = Ground(place[good], height[good], sigma)
-    return Ground(place, np.where(good, height, kept.at(place)), sigma)
+    kept = Ground(position[good], height[good], sigma)
+    return Ground(position, np.where(good, height, kept.at(position)), sigma)

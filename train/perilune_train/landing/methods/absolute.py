@@ -30,17 +30,17 @@ class Catalogues:
     exact: Mapping[str, Catalogue]
     """Without errors."""
     rough: Mapping[str, Catalogue]
-    """With the stated errors of one made from orbit."""
+    """With the errors that a catalogue made from orbit has."""
     mapped: Mapping[str, Catalogue]
-    """Made by our own detector from images of an orbiter; may be empty."""
+    """Made by the project's own detector from images of an orbiter; may be empty."""
 
 
 def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, Catalogue]) -> Catalogues:
     """The catalogues of some scenes. Raises UserError if the map lacks one of them."""
     exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in scene_ids}
     rough = {
-        scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(place))
-        for place, scene in enumerate(scene_ids)
+        scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(number))
+        for number, scene in enumerate(scene_ids)
     }
     missing = sorted(set(scene_ids) - set(mapped))
     if mapped and missing:

@@ -11,9 +11,9 @@ from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_train.landing.map.files import read_maps
 from perilune_train.landing.methods.absolute import absolute_errors, absolute_summary, catalogues_of
-from perilune_train.landing.methods.figures import draw_by_altitude
 from perilune_train.landing.methods.fixes import WRONG_PX
 from perilune_train.landing.methods.page import COLUMNS_ABSOLUTE, cell
+from perilune_train.landing.methods.pictures import draw_by_altitude
 from perilune_train.landing.methods.seen import seen_descents
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.records.benchmark_parts import Part, open_parts, part_names
@@ -31,11 +31,11 @@ POSITION = "position_rmse_m"
 def score_landing(
     detector: Path, data: Address, manifests: Address, out: Path, maps: Path | None = None, allow_overlap: bool = False
 ) -> Metrics:
-    """Score fixes, lost in space and the filter with a detector, and return the figures.
+    """Score fixes, lost-in-space fixes and the filter with a detector; returns the figures.
 
-    `maps` has one folder of `navigate map` for each part, by its name; parts without one have no rows of the map.
-    Writes page, figures, the table of all frames and a picture to the new folder `out`, or nothing.
-    Raises UserError if the benchmark is missing or changed, or if the detector was fitted to its terrain, unless
+    `maps` has one folder of `navigate map` for each part, named after it; a part without a folder gets no rows for the
+    map. Writes page, figures, the table of all frames and a picture to the new folder `out`, or nothing. Raises
+    UserError if the benchmark is missing or changed, or if the detector was fitted to its terrain, unless
     `allow_overlap`.
     """
     parts = open_parts("nav", data, manifests)
@@ -48,26 +48,30 @@ def score_landing(
         tables, seconds = [], {}
         for part in parts:
             trajectories = load_split(part.dataset, "test")
-            known = catalogues_of(part.dataset, sorted({one.ids[0] for one in trajectories}), catalogues[part.name])
+            known = catalogues_of(
+                part.dataset, sorted({trajectory.ids[0] for trajectory in trajectories}), catalogues[part.name]
+            )
             descents, seconds[part.name] = seen_descents(part.dataset, trajectories, detector)
             for method, errors in absolute_errors(part.dataset, descents, known).items():
                 names = part.name + "/" + errors["scene_id"]
                 tables.append(errors.assign(method=method, region=part.region, scene_id=names))
         frames = pd.concat(tables, ignore_index=True)
-        by_method = {str(method): own for method, own in frames.groupby("method", sort=False)}
+        by_method = {str(method): rows_of_method for method, rows_of_method in frames.groupby("method", sort=False)}
         figures: Metrics = {"terrain/mark": mark}
         for part in parts:
             figures[f"frames/{part.name}"] = part.dataset.info.counts.frames
             figures[f"locked_frames/{part.name}"] = part.n_locked
             figures[f"detection_s/{part.name}"] = seconds[part.name]
-        for method, own in by_method.items():
-            figures |= {f"{method}/{key}": value for key, value in absolute_summary(method, own).items()}
-            figures |= _spread(method, own).keys(f"{method}/{POSITION}")
-            for region, rows in own.groupby("region"):
-                found = absolute_summary(method, rows)
-                figures |= {f"{method}/region/{region}/{key}": value for key, value in found.items()}
+        for method, rows_of_method in by_method.items():
+            figures |= {f"{method}/{key}": value for key, value in absolute_summary(method, rows_of_method).items()}
+            figures |= _spread(method, rows_of_method).keys(f"{method}/{POSITION}")
+            for region, rows in rows_of_method.groupby("region"):
+                summary = absolute_summary(method, rows)
+                figures |= {f"{method}/region/{region}/{key}": value for key, value in summary.items()}
         frames.to_parquet(folder / FRAMES, index=False)
-        draw_by_altitude(folder / PICTURE, {name: own for name, own in by_method.items() if "lost" not in name})
+        draw_by_altitude(
+            folder / PICTURE, {name: rows_of_method for name, rows_of_method in by_method.items() if "lost" not in name}
+        )
         write_markdown(folder / PAGE, _page(detector, by_method, figures))
         mark_files(folder, [PAGE, FRAMES, PICTURE], mark)
         write_metrics(folder, figures | {"scored": f"run {detector.resolve().name}"}, FIGURES)
@@ -75,14 +79,14 @@ def score_landing(
 
 
 def _mapped(part: Part, maps: Path | None) -> Mapping:
-    """The catalogues of a part by our own detector; none if there is no map of it."""
+    """The catalogues that were mapped for a part; empty if there is no map of it."""
     if maps is None or not (maps / part.name).is_dir():
         return {}
     return read_maps(maps / part.name, part.dataset)
 
 
 def _spread(method: str, errors: pd.DataFrame) -> Spread:
-    """Spread of the RMSE of position between scenes; of fixes those that are right."""
+    """Spread of the RMSE of position over scenes; for fixes, over the right ones only."""
     used = errors[errors["error_px"] < WRONG_PX] if method.startswith(("fix", "lost")) else errors
     used = used.dropna(subset=["error_m"])
     rows, squares = np.arange(len(used)), np.square(used["error_m"].to_numpy())
@@ -110,20 +114,20 @@ def _page(detector: Path, by_method: dict[str, pd.DataFrame], figures: Metrics) 
     ]
     used = {key: title for key, title in COLUMNS_ABSOLUTE.items() if key != POSITION}
     rows = []
-    for method, own in by_method.items():
-        values = absolute_summary(method, own)
-        spread = _spread(method, own).text(values[POSITION])
+    for method, rows_of_method in by_method.items():
+        values = absolute_summary(method, rows_of_method)
+        spread = _spread(method, rows_of_method).text(values[POSITION])
         rows.append([f"`{method}`", spread, *(cell(key, values.get(key, np.nan)) for key in used)])
     lines += [*table(["method", COLUMNS_ABSOLUTE[POSITION], *used.values()], rows), ""]
     lines += ["In brackets: 95 % intervals over scenes, or the value of each scene if there are fewer than five.", ""]
-    regions = sorted({region for own in by_method.values() for region in own["region"]})
+    regions = sorted({region for rows_of_method in by_method.values() for region in rows_of_method["region"]})
     for key, title in ((POSITION, "Position RMSE (m)"), ("position_end_rmse_m", "Position RMSE at the end (m)")):
         lines += [f"## {title} by region", ""]
         head = ["method", *regions]
         cells = [
             [f"`{method}`", *(number(figures.get(f"{method}/region/{region}/{key}")) for region in regions)]
-            for method, own in by_method.items()
-            if key in absolute_summary(method, own)
+            for method, rows_of_method in by_method.items()
+            if key in absolute_summary(method, rows_of_method)
         ]
         lines += [*table(head, cells), ""]
     caption = "Errors by altitude, and normalised errors squared"

@@ -1,4 +1,4 @@
-"""Poses of single frames from craters: near a prior that is off, and lost in space."""
+"""Poses of single frames from craters: with an inaccurate prior, and lost in space."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -16,28 +16,28 @@ from perilune_train.landing.craters.search import Area
 from perilune_train.landing.methods.seen import SeenDescent
 
 PRIOR_M, PRIOR_DEG = 100.0, 1.0
-"""Standard deviations of the prior on each axis."""
+"""Standard deviations of the prior on each axis, metres and degrees."""
 WRONG_PX = 5.0
-"""A fix that is off by more pixels on the ground is wrong."""
+"""Fixes with a larger error, in pixels on the ground, are wrong."""
 LOST_ABOVE_M, LOST_ALTITUDE_SHARE = 800.0, 0.1
-"""Lost in space: least altitude, and by how much the altitude may be off."""
+"""Lost in space: smallest altitude, metres, and largest relative error of the known altitude."""
 
 
 def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames; their priors are off by 100 m and 1 degree (standard deviations) per axis."""
+    """Errors of the fixes of all frames; priors have errors of 100 m and 1 degree (standard deviations) per axis."""
     rng, sigma = np.random.default_rng(seed), np.repeat([PRIOR_M, np.radians(PRIOR_DEG)], 3)
     rows = []
     for descent in _followed("fixes", descents):
         for true, sightings in zip(descent.true, descent.sightings, strict=True):
             prior = PosePrior(true.changed(sigma * rng.normal(size=6)), np.diag(sigma**2))
             begun = time.process_time()
-            found = locate(sightings, catalogues[descent.ids[0]], descent.camera, prior)
-            rows.append(_row(descent, true, found, time.process_time() - begun))
+            located = locate(sightings, catalogues[descent.ids[0]], descent.camera, prior)
+            rows.append(_row(descent, true, located, time.process_time() - begun))
     return pd.DataFrame(rows)
 
 
 def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames above 800 m, from no more than the altitude within 10 % and a level camera.
+    """Errors of the fixes of all frames above 800 m, if only a level camera and the altitude within 10 % are known.
 
     Position over the whole catalogue and heading are unknown.
     """
@@ -57,8 +57,8 @@ def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Ca
             )
             assumed = Pose(np.array([*area.centre_m, altitude_m]), descent.level_rotation_camera_from_site @ turned)
             begun = time.process_time()
-            found = lost_in_space(sightings, catalogue, descent.camera, PosePrior(assumed, np.eye(6)), area)
-            rows.append(_row(descent, true, found, time.process_time() - begun))
+            located = lost_in_space(sightings, catalogue, descent.camera, PosePrior(assumed, np.eye(6)), area)
+            rows.append(_row(descent, true, located, time.process_time() - begun))
     return pd.DataFrame(rows)
 
 
@@ -71,18 +71,25 @@ def _followed(name: str, descents: list[SeenDescent]) -> Iterator[SeenDescent]:
             progress.advance(task)
 
 
-def _row(descent: SeenDescent, true: Pose, found: Located | None, seconds: float) -> dict[str, object]:
-    own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1], "altitude_m": true.position_m[2]}
-    if found is None:
-        return {**own, "error_m": np.nan, "error_px": np.nan, "turn_deg": np.nan, "squared": np.nan, "seconds": seconds}
-    error = step_to(found.fix.pose, true)
+def _row(descent: SeenDescent, true: Pose, located: Located | None, seconds: float) -> dict[str, object]:
+    frame = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1], "altitude_m": true.position_m[2]}
+    if located is None:
+        return {
+            **frame,
+            "error_m": np.nan,
+            "error_px": np.nan,
+            "turn_deg": np.nan,
+            "squared": np.nan,
+            "seconds": seconds,
+        }
+    error = step_to(located.fix.pose, true)
     length_m = float(np.linalg.norm(error[:3]))
     return {
-        **own,
+        **frame,
         "error_m": length_m,
         "error_px": length_m * descent.camera.fx_px / true.position_m[2],
         "turn_deg": float(np.degrees(np.linalg.norm(error[3:]))),
-        "squared": float(error @ np.linalg.solve(found.fix.covariance, error)),
+        "squared": float(error @ np.linalg.solve(located.fix.covariance, error)),
         "seconds": seconds,
     }
 
@@ -94,7 +101,7 @@ def step_to(pose: Pose, true: Pose) -> Array:
 
 
 def fix_summary(fixes: pd.DataFrame) -> dict[str, float]:
-    """Figures of a method: errors over the right fixes, shares of frames without fix and with a wrong one."""
+    """Figures of a method: errors of the right fixes, and shares of frames without a fix and with a wrong fix."""
     right = fixes[fixes["error_px"] < WRONG_PX]
     return {
         "n_frames": float(len(fixes)),

@@ -1,7 +1,8 @@
-"""The filter over descents: errors at every frame with their stated sizes."""
+"""The filter over descents: errors at every frame with their stated standard deviations."""
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -19,9 +20,9 @@ from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
 from perilune_train.landing.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
-"""Standard deviations of position and velocity at the start, on each axis."""
+"""Standard deviations of position, metres, and velocity, metres per second, at the start, on each axis."""
 BAND = (1.24, 14.45)
-"""Where a sum of six squares lies in 95 % of cases."""
+"""Interval that holds the sum of six squared standard normal numbers in 95 % of cases."""
 
 
 def flights(
@@ -34,19 +35,20 @@ def flights(
 ) -> pd.DataFrame:
     """Errors of the filter, or of the smoother, at every frame of all descents.
 
-    The starts are off, drawn by the place of the descent.
+    The errors of the starts are random; the number of the descent is their seed.
     """
     tables = []
-    mounting, sigmas = mounting_of(dataset), default_sigmas(grade, attitude_deg)
+    rotation_camera_from_body, sigmas = mounting_of(dataset), default_sigmas(grade, attitude_deg)
     with progress_bar() as progress:
         task = progress.add_task(
             f"{'smoother' if smooth else 'filter'}, {attitude_deg:g} deg", total=len(descents), unit="descents", note=""
         )
-        for place, descent in enumerate(descents):
+        for number, descent in enumerate(descents):
             instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
-            off = sigmas[:9] * np.random.default_rng(place).normal(size=9)
+            start = Start(grade, sigmas, sigmas[:9] * np.random.default_rng(number).normal(size=9))
+            catalogue = catalogues[descent.ids[0]]
             begun = time.process_time()
-            flown = flight(descent, instruments, mounting, catalogues[descent.ids[0]], grade, sigmas, off, smooth)
+            flown = flight(descent, instruments, rotation_camera_from_body, catalogue, start, smooth)
             tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
             progress.advance(task)
     return pd.concat(tables, ignore_index=True)
@@ -66,73 +68,78 @@ def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
     return start_sigmas(START_M, START_MPS, attitude_deg, GRADES[grade])
 
 
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What the filter assumes at the first frame, and its true error."""
+
+    grade: InertialGrade
+    """Grade of the inertial unit."""
+    sigmas: Array
+    """Standard deviations (15,) with which the filter starts, see `start_sigmas`."""
+    error: Array
+    """Difference (9,) from the true state: position, m, velocity, m/s, both O_L, and attitude, rad, O_B."""
+
+
 def flight(
     descent: SeenDescent,
     instruments: Instruments,
-    mounting: Array,
+    rotation_camera_from_body: Array,
     catalogue: Catalogue,
-    grade: InertialGrade,
-    sigmas: Array,
-    off: Array,
+    start: Start,
     smooth: bool = False,
 ) -> pd.DataFrame:
-    """Errors of the filter at every frame of a descent, or with `smooth` of the smoother, which knows all frames.
-
-    `mounting` is rotation_camera_from_body (3, 3), `sigmas` states the errors of the start, `off` (9,) has its true
-    errors: position, velocity, attitude.
-    """
-    lander = lander_of(descent, mounting, catalogue, grade, sigmas, off, smooth)
+    """Errors of the filter at every frame of a descent, or with `smooth` of the smoother, which uses all frames."""
+    lander = lander_of(descent, rotation_camera_from_body, catalogue, start, smooth)
     estimates = list(fly(lander, instruments, descent.time_s, descent.sightings))
-    rows = [row_of(descent, one, mounting) for one in estimates]
+    rows = [row_of(descent, estimate, rotation_camera_from_body) for estimate in estimates]
     if smooth:
         for number, row in enumerate(rows):
-            position, rotation = _true(descent, number, mounting)
-            error, covariance = lander.state.past_pose_error(number, position, rotation)
+            position, rotation_site_from_body = _true(descent, number, rotation_camera_from_body)
+            error, covariance = lander.state.past_pose_error(number, position, rotation_site_from_body)
             rows[number] = _row(position[2], row["status"], error, covariance)
     return table_of(descent, rows)
 
 
 def lander_of(
     descent: SeenDescent,
-    mounting: Array,
+    rotation_camera_from_body: Array,
     catalogue: Catalogue,
-    grade: InertialGrade,
-    sigmas: Array,
-    off: Array,
+    start: Start,
     smooth: bool = False,
 ) -> Lander:
-    """The lander at the first frame; arguments as of `flight`."""
-    turned = descent.true[0].changed(np.concatenate([off[:3], mounting @ off[6:]]))
-    attitude = turned.rotation_camera_from_site.T @ mounting
-    start = State.starting(turned.position_m, descent.velocity_mps + off[3:6], attitude, sigmas, RELIEF_M)
-    around = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
-    return Lander(start, InertialNoise.of(GRADES[grade]), around, keep_poses=smooth)
+    """The lander at the first frame; with `smooth` it keeps the pose of every frame."""
+    error = start.error
+    pose = descent.true[0].changed(np.concatenate([error[:3], rotation_camera_from_body @ error[6:]]))
+    attitude = pose.rotation_camera_from_site.T @ rotation_camera_from_body
+    state = State.starting(pose.position_m, descent.velocity_mps + error[3:6], attitude, start.sigmas, RELIEF_M)
+    surroundings = Surroundings(descent.camera, rotation_camera_from_body, catalogue, RANGE_SIGMA_M, RELIEF_M)
+    return Lander(state, InertialNoise.of(GRADES[start.grade]), surroundings, keep_poses=smooth)
 
 
 def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFrame:
     """The table of a flight from the rows of its frames."""
-    own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
-    return pd.DataFrame(rows).assign(**own, time_s=descent.time_s)
+    ids = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
+    return pd.DataFrame(rows).assign(**ids, time_s=descent.time_s)
 
 
-def row_of(descent: SeenDescent, estimate: Estimate, mounting: Array) -> dict[str, object]:
+def row_of(descent: SeenDescent, estimate: Estimate, rotation_camera_from_body: Array) -> dict[str, object]:
     """Errors of the filter at a frame."""
-    position, rotation = _true(descent, estimate.frame, mounting)
+    position, rotation_site_from_body = _true(descent, estimate.frame, rotation_camera_from_body)
     covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
-    return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation), covariance)
+    return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation_site_from_body), covariance)
 
 
 _POSE = np.r_[POSITION, ATTITUDE]
 
 
-def _true(descent: SeenDescent, frame: int, mounting: Array) -> tuple[Array, Array]:
+def _true(descent: SeenDescent, frame: int, rotation_camera_from_body: Array) -> tuple[Array, Array]:
     """True position and rotation_site_from_body at a frame."""
     true = descent.true[frame]
-    return true.position_m, true.rotation_camera_from_site.T @ mounting
+    return true.position_m, true.rotation_camera_from_site.T @ rotation_camera_from_body
 
 
 def _row(altitude_m: float, status: object, error: Array, covariance: Array) -> dict[str, object]:
-    """One frame, from the step (6,) to the true pose and its covariance (6, 6)."""
+    """One row, from the step (6,) to the true pose and its covariance (6, 6)."""
     return {
         "altitude_m": altitude_m,
         "status": status,
@@ -149,7 +156,7 @@ def _axes(name: str, values: Array) -> dict[str, float]:
 
 
 def flight_summary(flown: pd.DataFrame) -> dict[str, float]:
-    """Figures of the filter over all frames of all descents, none left out."""
+    """Figures of the filter over all frames of all descents."""
     ends = flown.groupby(["scene_id", "trajectory_id"])["error_m"].last()
     inside = flown["squared"].between(*BAND)
     return {

@@ -1,4 +1,4 @@
-"""The page of all methods: what each knows, its errors, and pictures."""
+"""The page of all methods: what each method knows, its errors, and pictures."""
 
 import math
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ def page_of(
     pictures: Sequence[str],
 ) -> str:
     """The page as Markdown."""
-    scenes = {one.ids[0] for one in descents}
+    scenes = {descent.ids[0] for descent in descents}
     lines = [
         "# Navigation methods",
         "",

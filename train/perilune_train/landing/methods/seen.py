@@ -1,4 +1,4 @@
-"""Descents with the craters that a detector finds in every frame."""
+"""Descents with the craters that a detector detects in every frame."""
 
 import time
 from dataclasses import dataclass
@@ -43,24 +43,28 @@ class SeenDescent:
 
 
 def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
-    """Descents with the craters that the detector of a run finds, and its seconds per frame."""
+    """Descents with the craters that the detector of a run detects, and its seconds per frame."""
     detector, threshold = open_detector(RunFolder(run).best, config_of_run(run)), chosen_threshold(run)
     descents, seconds = [], 0.0
-    n_frames = sum(len(one.images) for one in trajectories)
+    n_frames = sum(len(trajectory.images) for trajectory in trajectories)
     with progress_bar() as progress:
         bar = progress.add_task("detect", total=n_frames, unit="frames", note="")
-        for one in trajectories:
-            seen = []
-            for start in range(0, len(one.images), _BATCH):
+        for trajectory in trajectories:
+            sightings = []
+            for start in range(0, len(trajectory.images), _BATCH):
                 begun = time.perf_counter()
-                for found in detect_at_scales(detector, one.images[start : start + _BATCH]):
-                    kept = above(found, threshold)
-                    seen.append(Sightings.of_boxes(kept.boxes, kept.scores))
+                for predicted in detect_at_scales(detector, trajectory.images[start : start + _BATCH]):
+                    kept = above(predicted, threshold)
+                    sightings.append(Sightings.of_boxes(kept.boxes, kept.scores))
                 seconds += time.perf_counter() - begun
-                progress.advance(bar, len(one.images[start : start + _BATCH]))
-            rows = dataset.table("frames", ["time_s", "velocity_mps"], *one.ids).sort_by("time_s")
-            true = [Pose(*pose) for pose in zip(one.position_m, one.rotation_camera_from_site, strict=True)]
+                progress.advance(bar, len(trajectory.images[start : start + _BATCH]))
+            rows = dataset.table("frames", ["time_s", "velocity_mps"], *trajectory.ids).sort_by("time_s")
+            true = [
+                Pose(*pose) for pose in zip(trajectory.position_m, trajectory.rotation_camera_from_site, strict=True)
+            ]
             first = np.array(rows["velocity_mps"][0].as_py())
-            level = one.nominal_rotation_camera_from_site
-            descents.append(SeenDescent(one.ids, one.camera, rows["time_s"].to_numpy(), true, first, level, seen))
+            level = trajectory.nominal_rotation_camera_from_site
+            descents.append(
+                SeenDescent(trajectory.ids, trajectory.camera, rows["time_s"].to_numpy(), true, first, level, sightings)
+            )
     return descents, seconds / n_frames

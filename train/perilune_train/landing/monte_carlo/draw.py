@@ -1,4 +1,4 @@
-"""What one draw changes: the start, the catalogue, the inertial errors, and what goes wrong."""
+"""One draw of a descent: errors of the start and of the inertial unit, and the fault of the scenario."""
 
 from dataclasses import dataclass, replace
 
@@ -21,8 +21,8 @@ class Draw:
     """The descent, with the detections of the scenario."""
     instruments: Instruments
     """Measurements with the drawn inertial errors."""
-    off: Array
-    """True errors of the start (9,): position, m, velocity, m/s, attitude, rad."""
+    start_error: Array
+    """Error of the start (9,), as in `Start.error`."""
 
 
 def drawn(
@@ -33,26 +33,30 @@ def drawn(
     scenario: Scenario,
     rng: np.random.Generator,
 ) -> Draw:
-    """A draw of a descent.
+    """Draw a descent.
 
-    `reference` has inertial measurements whose own errors are small beside those of `grade`; they are taken as the true
+    `reference` has inertial measurements whose errors are small compared with those of `grade`; they count as the true
     motion. Ranges are as recorded. `sigmas` are the stated errors of the start, position, velocity and attitude first.
     """
-    off = sigmas[:9] * rng.normal(size=9)
+    start_error = sigmas[:9] * rng.normal(size=9)
     instruments = _measured(reference, grade, rng)
     if scenario == "wrong-prior":
         heading = rng.uniform(0, 2 * np.pi)
-        off[:2] = WRONG_PRIOR_M * np.array([np.cos(heading), np.sin(heading)])
+        start_error[:2] = WRONG_PRIOR_M * np.array([np.cos(heading), np.sin(heading)])
     elif scenario == "outage":
         duration_s = descent.time_s[-1]
         start_s = rng.uniform(0.0, max(duration_s - OUTAGE_S, 0.0))
         blind = (descent.time_s >= start_s) & (descent.time_s < start_s + OUTAGE_S)
-        seen = [_none() if dark else own for own, dark in zip(descent.sightings, blind, strict=True)]
+        seen = [
+            _none() if dark else frame_sightings for frame_sightings, dark in zip(descent.sightings, blind, strict=True)
+        ]
         descent = replace(descent, sightings=seen)
     elif scenario == "false-detections":
         size_px = np.array([descent.camera.width_px, descent.camera.height_px])
-        descent = replace(descent, sightings=[_with_false(own, size_px, rng) for own in descent.sightings])
-    return Draw(descent, instruments, off)
+        descent = replace(
+            descent, sightings=[_with_false(frame_sightings, size_px, rng) for frame_sightings in descent.sightings]
+        )
+    return Draw(descent, instruments, start_error)
 
 
 def _measured(reference: Instruments, grade: InertialGrade, rng: np.random.Generator) -> Instruments:
@@ -66,11 +70,11 @@ def _none() -> Sightings:
     return Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
-def _with_false(seen: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
-    """As many false sightings as there are, of the same sizes and scores, anywhere in the image."""
-    places = rng.permutation(len(seen))
-    centre = np.concatenate([seen.centre_px, rng.uniform(0, size_px, (len(seen), 2))])
-    radius = np.concatenate([seen.radius_px, seen.radius_px[places]])
-    score = np.concatenate([seen.score, seen.score[places]])
+def _with_false(sightings: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
+    """Add a false sighting for each sighting, of the same sizes and scores, anywhere in the image."""
+    shuffled = rng.permutation(len(sightings))
+    centre = np.concatenate([sightings.centre_px, rng.uniform(0, size_px, (len(sightings), 2))])
+    radius = np.concatenate([sightings.radius_px, sightings.radius_px[shuffled]])
+    score = np.concatenate([sightings.score, sightings.score[shuffled]])
     order = np.argsort(-radius, kind="stable")
     return Sightings(centre[order], radius[order], score[order])

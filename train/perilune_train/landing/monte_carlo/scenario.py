@@ -1,5 +1,6 @@
-"""What goes wrong in the flights of a Monte Carlo run."""
+"""What is drawn, and what goes wrong, in the flights of a Monte Carlo run."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 Scenario = Literal["nominal", "outage", "wrong-prior", "false-detections"]
@@ -12,3 +13,17 @@ SCENARIOS: dict[Scenario, str] = {
     "false-detections": "a false detection is added for each detection",
 }
 """What each scenario is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Draws:
+    """Random draws of every descent of a Monte Carlo run."""
+
+    scenario: Scenario = "nominal"
+    """What goes wrong."""
+    count: int = 200
+    """Number of draws of each descent."""
+    attitude_deg: float = 0.5
+    """Standard deviation of the attitude at the start about each axis, degrees."""
+    seed: int = 0
+    """Random seed of all draws."""

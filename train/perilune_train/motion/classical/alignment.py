@@ -1,9 +1,15 @@
-"""Direct alignment of two frames: the motion, tilt and heights with which the second looks like the first.
+"""Direct alignment of two frames: the motion, tilt and heights of the ground that make the second look like the first.
 
-Gauss-Newton over all pixels (Lucas & Kanade 1981; with free heights of the ground as in direct odometry, Engel et al.
-2018, doi 10.1109/TPAMI.2017.2658577), on local contrast, with Tukey's weights (Beaton & Tukey 1974, doi
-10.1080/00401706.1974.10489171). The unknowns, in this order: turn (3) and shift (3) of the points of frame 2, tilt of
-frame 1 (2), heights at the nodes (25).
+Unknowns, in this order: turn (3) and shift (3) of the points of frame 2, tilt of frame 1 (2), heights at the nodes of a
+grid over the ground (25). Steps for each level of an image pyramid, coarsest first:
+
+1. Project the pixels of frame 1 onto the ground and into frame 2 (`_Residuals.normal_equations`).
+2. Compare local contrast (contrast.py), with Tukey's weights (Beaton & Tukey 1974, doi
+   10.1080/00401706.1974.10489171).
+3. Take a Gauss-Newton step, with the prior of motion, tilt and heights (`align`).
+
+Lucas & Kanade 1981; with free heights as in direct odometry, Engel et al. 2018, doi 10.1109/TPAMI.2017.2658577. Along a
+trajectory each pair starts from KLT's motion and the heights of the previous pair (`aligned_trajectory`).
 """
 
 from dataclasses import dataclass
@@ -14,44 +20,43 @@ from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
-from perilune_train.motion.classical.contrast import Level, sampled
-from perilune_train.motion.classical.ground import N_NODES, Heights, node_weights
-from perilune_train.motion.classical.klt import SHIFT_SHARE
+from perilune_train.motion.classical.contrast import Level, pyramid, sampled
+from perilune_train.motion.classical.estimate import EstimatedMotion, ExpectedMotion, GroundPlane
+from perilune_train.motion.classical.ground import N_NODES, Heights, carried, node_weights, unknown_heights
+from perilune_train.motion.classical.klt import NOMINAL_TURN_SIGMA_RAD, SHIFT_SHARE, klt_motion, stretched
+from perilune_train.motion.data.gyroscope import GyroscopeTurns
+from perilune_train.motion.data.trajectories import Trajectory
 
 _TUKEY = 4.685
 _DEPENDENT_PIXELS = 6.0
-"""Errors of neighbouring pixels are alike: so many pixels count as one. Chosen on training and validation scenes."""
+"""Number of pixels that count as one, because errors of neighbouring pixels are correlated. Chosen on training and
+validation scenes."""
 _TILT_SIGMA_RAD = float(np.radians(0.5))
-"""Standard deviation of the tilt around a level attitude, on each axis."""
+"""Standard deviation of the tilt about a level attitude, on each axis, radians."""
 _ITERATIONS = 8
 _SMALL_STEP = 1e-5
 """Step of turn, and of shift divided by altitude, below which the iteration ends."""
 _MARGIN_PX = 2
 _N_POSE = 8
 _N_UNKNOWN = _N_POSE + N_NODES
+_LEVELS = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known of a pair of frames before they are aligned."""
+    """Prior knowledge of a pair of frames."""
 
-    translation_m: Array
-    """Expected motion (3,), O_C of frame 1."""
-    rotation_c2_from_c1: Array
-    """Expected rotation (3, 3)."""
-    turn_sigma_rad: float
-    """Standard deviation of the rotation on each axis."""
-    down_c: Array
-    """Unit vector (3,) towards the ground in O_C of a level camera."""
-    altitude_m: float
-    """Altitude of frame 1 above the ground plane."""
+    motion: ExpectedMotion
+    """Expected motion."""
+    plane: GroundPlane
+    """The ground plane below frame 1, if the camera is level."""
     heights: Heights
     """Heights of the ground in view of frame 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The unknowns of a pair."""
+    """The unknowns of a pair of frames."""
 
     translation_m: Array
     """Motion (3,), O_C of frame 1."""
@@ -65,19 +70,20 @@ class State:
     def changed(self, step: Array) -> "State":
         """The state after a step of all unknowns (n_unknown,)."""
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
-        rotation = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
-        translation = self.translation_m - rotation.T @ step[3:6]
-        return State(translation, rotation, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
+        rotation_c2_from_c1 = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
+        translation = self.translation_m - rotation_c2_from_c1.T @ step[3:6]
+        return State(translation, rotation_c2_from_c1, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
 
     def offset(self, prior: Prior) -> Array:
-        """Difference of all unknowns (n_unknown,) to the prior."""
-        turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.rotation_c2_from_c1.T)
-        shift = self.rotation_c2_from_c1 @ (prior.translation_m - self.translation_m)
+        """Difference (n_unknown,) of all unknowns from the prior."""
+        turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.motion.rotation_c2_from_c1.T)
+        shift = self.rotation_c2_from_c1 @ (prior.motion.translation_m - self.translation_m)
         return np.concatenate([turn, shift, self.tilt_rad, self.height_m - prior.heights.mean_m])
 
     def down_c(self, prior: Prior) -> Array:
         """Unit vector (3,) towards the ground in O_C of frame 1."""
-        down = prior.down_c + self.tilt_rad @ _across(prior.down_c)
+        level = prior.plane.down_c
+        down = level + self.tilt_rad @ _across(level)
         return down / np.linalg.norm(down)
 
 
@@ -87,13 +93,13 @@ def align(first: list[Level], second: list[Level], prior: Prior, start: State) -
     Turns are from the left, radians; shifts are metres, O_C of frame 2.
     """
     precision = np.zeros((_N_UNKNOWN, _N_UNKNOWN))
-    shift_sigma_m = SHIFT_SHARE * prior.altitude_m
-    sigmas = [prior.turn_sigma_rad] * 3 + [shift_sigma_m] * 3 + [_TILT_SIGMA_RAD] * 2
+    shift_sigma_m = SHIFT_SHARE * prior.plane.altitude_m
+    sigmas = [prior.motion.turn_sigma_rad] * 3 + [shift_sigma_m] * 3 + [_TILT_SIGMA_RAD] * 2
     precision[range(_N_POSE), range(_N_POSE)] = 1 / np.square(sigmas)
     precision[_N_POSE:, _N_POSE:] = np.linalg.inv(prior.heights.covariance_m2)
     state = start
-    for one, other in zip(first, second, strict=True):
-        residuals = _Residuals(one, other, prior)
+    for coarse_first, coarse_second in zip(first, second, strict=True):
+        residuals = _Residuals(coarse_first, coarse_second, prior)
         for _ in range(_ITERATIONS):
             normal, gradient = residuals.normal_equations(state)
             normal, gradient = normal + precision, gradient + precision @ state.offset(prior)
@@ -103,7 +109,7 @@ def align(first: list[Level], second: list[Level], prior: Prior, start: State) -
             covariance = scale * np.linalg.inv(scale * normal)
             step = -covariance @ gradient
             state = state.changed(step)
-            if np.abs(step[:6] / np.repeat([1, prior.altitude_m], 3)).max() < _SMALL_STEP:
+            if np.abs(step[:6] / np.repeat([1, prior.plane.altitude_m], 3)).max() < _SMALL_STEP:
                 break
     return state, covariance
 
@@ -125,10 +131,10 @@ class _Residuals:
         """Weighted normal matrix (n_unknown, n_unknown) and gradient (n_unknown,) of the squared differences."""
         down = state.down_c(self._prior).astype(np.float32)
         along = self._rays @ down
-        drop_m = self._prior.altitude_m - self._nodes @ state.height_m.astype(np.float32)
+        drop_m = self._prior.plane.altitude_m - self._nodes @ state.height_m.astype(np.float32)
         points = self._rays * (drop_m / along)[:, None]
-        rotation = state.rotation_c2_from_c1.astype(np.float32)
-        moved = (points - state.translation_m.astype(np.float32)) @ rotation.T
+        rotation_c2_from_c1 = state.rotation_c2_from_c1.astype(np.float32)
+        moved = (points - state.translation_m.astype(np.float32)) @ rotation_c2_from_c1.T
         value, by_u, by_v = sampled(self._maps, self._camera.project(moved))
         used = np.isfinite(value)
         error = np.where(used, value - self._values, 0)
@@ -136,30 +142,69 @@ class _Residuals:
         spread = 1.4826 * float(np.median(np.abs(error[used]))) + 1e-6 if used.any() else 1.0
         weight = np.where(used, np.clip(1 - (error / (_TUKEY * spread)) ** 2, 0, None) ** 2, 0)
         weight /= spread**2 * _DEPENDENT_PIXELS
-        jacobian = self._jacobian(points, moved, along, by_moved, by_moved @ rotation)
+        jacobian = self._jacobian(points, moved, along, by_moved, by_moved @ rotation_c2_from_c1)
         scaled = jacobian * weight[:, None].astype(np.float32)
         return (scaled.T @ jacobian).astype(np.float64), (scaled.T @ error).astype(np.float64)
 
     def _jacobian(self, points: Array, moved: Array, along: Array, by_moved: Array, by_first: Array) -> Array:
-        """Derivatives (n, n_unknown) of the differences, from those by the points of frame 2 and of frame 1 (n, 3)."""
-        found: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
-        # By a turn w from the left a point X moves by w x X, and the value by w . (X x derivative).
-        found[:, :3], found[:, 3:6] = np.cross(moved, by_moved), by_moved
-        tilted = self._rays @ _across(self._prior.down_c).T.astype(np.float32)
-        found[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
-        found[:, _N_POSE:] = self._nodes * (-np.einsum("ni,ni->n", by_first, self._rays) / along)[:, None]
-        return found
+        """Derivatives (n, n_unknown) of the differences, from their derivatives by the points of frame 2 and of frame 1
+        (n, 3)."""
+        jacobian: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
+        # A turn w from the left moves a point X by w x X, so it changes the value by w . (X x derivative).
+        jacobian[:, :3], jacobian[:, 3:6] = np.cross(moved, by_moved), by_moved
+        tilted = self._rays @ _across(self._prior.plane.down_c).T.astype(np.float32)
+        jacobian[:, 6:_N_POSE] = -(np.einsum("ni,ni->n", by_first, points) / along)[:, None] * tilted
+        jacobian[:, _N_POSE:] = self._nodes * (-np.einsum("ni,ni->n", by_first, self._rays) / along)[:, None]
+        return jacobian
 
 
 def _by_point(by_u: Array, by_v: Array, points: Array, camera: Camera) -> Array:
-    """Derivatives (n, 3) by points (n, 3), O_C, from those by image coordinates."""
+    """Derivatives (n, 3) by points (n, 3), O_C, from the derivatives by image coordinates."""
     x, y, z = points.T
     by_x, by_y = by_u * np.float32(camera.fx_px) / z, by_v * np.float32(camera.fy_px) / z
     return np.stack([by_x, by_y, -(by_x * x + by_y * y) / z], axis=1)
 
 
 def _across(down_c: Array) -> Array:
-    """Two unit vectors (2, 3) at right angles to a direction and to each other."""
-    one = np.cross(down_c, np.eye(3)[np.argmin(np.abs(down_c))])
-    one /= np.linalg.norm(one)
-    return np.stack([one, np.cross(down_c, one)])
+    """Two unit vectors (2, 3) perpendicular to a direction and to each other."""
+    first = np.cross(down_c, np.eye(3)[np.argmin(np.abs(down_c))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(down_c, first)])
+
+
+def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
+    """Motions of a whole trajectory, from images and, if given, a gyroscope.
+
+    The altitude is true at the first frame and then updated by the estimated motions.
+    """
+    nominal_translation, nominal_rotation_c2_from_c1 = trajectory.nominal_motion
+    turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
+    if turns is not None:
+        nominal_rotation_c2_from_c1, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
+    grey = stretched(trajectory.images)
+    camera, down = trajectory.camera, trajectory.down_c
+    altitude_m = float(trajectory.position_m[0, 2])
+    heights = unknown_heights(camera, down, altitude_m)
+    first = pyramid(trajectory.images[0], camera, _LEVELS)
+    motions, covariances = [], []
+    for i in range(trajectory.n_pairs):
+        second = pyramid(trajectory.images[i + 1], camera, _LEVELS)
+        expected, plane = (
+            ExpectedMotion(nominal_translation[i], nominal_rotation_c2_from_c1[i], turn_sigma[i]),
+            GroundPlane(down, altitude_m),
+        )
+        # KLT must know the gyroscope's rotation too: its shift compensates errors of its own rotation.
+        tracked = klt_motion(camera, grey[i], grey[i + 1], expected, plane)
+        prior = Prior(expected, plane, heights)
+        start = State(tracked.translation_m, tracked.rotation_c2_from_c1, np.zeros(2), heights.mean_m)
+        state, covariance = align(first, second, prior, start)
+        motion = state.translation_m, state.rotation_c2_from_c1
+        down_1 = state.down_c(prior)
+        lower_m = altitude_m - float(down_1 @ motion[0])
+        seen = Heights(state.height_m, covariance[-N_NODES:, -N_NODES:])
+        heights = carried(seen, camera, (down_1, motion[1] @ down_1), (altitude_m, lower_m), motion)
+        altitude_m, first = lower_m, second
+        motions.append(motion)
+        covariances.append(covariance[:6, :6])
+    translation, turned = (np.stack(parts) for parts in zip(*motions, strict=True))
+    return EstimatedMotion((translation, turned), np.stack(covariances))

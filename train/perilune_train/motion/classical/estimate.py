@@ -1,9 +1,31 @@
-"""What a method of relative motion returns for a trajectory."""
+"""Prior knowledge of the classical methods about a pair of frames, and their result for a trajectory."""
 
 from dataclasses import dataclass
 
 from perilune_shared.geometry.frames import Array
 from perilune_train.motion.data.trajectories import Motion
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedMotion:
+    """Prior knowledge of the motion between two frames."""
+
+    translation_m: Array
+    """Motion (3,), metres, O_C of frame 1."""
+    rotation_c2_from_c1: Array
+    """Rotation (3, 3)."""
+    turn_sigma_rad: float
+    """Standard deviation of the rotation about each axis, radians."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroundPlane:
+    """The plane below a camera."""
+
+    down_c: Array
+    """Unit vector (3,) towards the ground, O_C."""
+    altitude_m: float
+    """Distance of the camera from the plane, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,4 +35,5 @@ class EstimatedMotion:
     motion: Motion
     """translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
     covariance: Array
-    """Of each rotation (turn from the left, radians) and shift (metres, O_C of the later frame): (n - 1, 6, 6)."""
+    """Covariances (n - 1, 6, 6) of rotation (turn from the left, radians) and shift (metres, O_C of the later
+    frame)."""

@@ -13,9 +13,9 @@ N_NODES = N_SIDE**2
 _HEIGHT_SHARE = 0.01
 """Standard deviation of the heights, divided by altitude."""
 _LENGTH_SHARE = 0.35
-"""Length over which heights are alike, divided by the width of the ground in view."""
+"""Correlation length of the heights, divided by the width of the ground in view."""
 _NEW_SHARE = 0.03
-"""How far the heights tend to those of a plane from one frame to the next: finer relief comes into view."""
+"""Share by which heights tend towards a plane from one frame to the next: finer relief comes into view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,8 @@ def node_pixels(camera: Camera) -> Array:
 
 def node_weights(camera: Camera, pixels: Array) -> Array:
     """Bilinear weights (n, N_NODES) of the nodes at image coordinates (n, 2)."""
-    place = pixels / np.array([camera.width_px, camera.height_px]) * (N_SIDE - 1)
-    across, down = (np.clip(1 - np.abs(place[:, k, None] - np.arange(N_SIDE)), 0, None) for k in (0, 1))
+    node = pixels / np.array([camera.width_px, camera.height_px]) * (N_SIDE - 1)
+    across, down = (np.clip(1 - np.abs(node[:, k, None] - np.arange(N_SIDE)), 0, None) for k in (0, 1))
     return (down[:, :, None] * across[:, None, :]).reshape(len(pixels), N_NODES).astype(np.float32)
 
 
@@ -48,7 +48,7 @@ def unknown_heights(camera: Camera, down_c: Array, altitude_m: float) -> Heights
 
 
 def ground_points(camera: Camera, pixels: Array, down_c: Array, altitude_m: float) -> Array:
-    """Points (n, 3), O_C, in which the rays of pixels (n, 2) meet the ground plane."""
+    """Points (n, 3), O_C, at which the rays of pixels (n, 2) meet the ground plane."""
     rays = camera.rays(pixels)
     return rays * (altitude_m / (rays @ down_c))[:, None]
 
@@ -60,20 +60,21 @@ def carried(
     altitudes_m: tuple[float, float],
     motion: tuple[Array, Array],
 ) -> Heights:
-    """Heights at the nodes of frame 2 from those at the nodes of frame 1, by regression with the prior's covariance.
+    """Heights at the nodes of frame 2 from the heights at the nodes of frame 1, by regression with the prior
+    covariance.
 
-    `downs_c` and `altitudes_m` are those of both frames, `motion` is translation_m and rotation_c2_from_c1.
+    `downs_c` and `altitudes_m` belong to frames 1 and 2; `motion` is translation_m and rotation_c2_from_c1.
     """
-    translation, rotation = motion
+    translation, rotation_c2_from_c1 = motion
     nodes = node_pixels(camera)
     first = ground_points(camera, nodes, downs_c[0], altitudes_m[0])
-    second = ground_points(camera, nodes, downs_c[1], altitudes_m[1]) @ rotation + translation
-    among, between, own = (
+    second = ground_points(camera, nodes, downs_c[1], altitudes_m[1]) @ rotation_c2_from_c1 + translation
+    among, between, within = (
         _kernel(camera, altitudes_m[0], a, b) for a, b in ((first, first), (second, first), (second, second))
     )
     regression = np.linalg.solve(among, between.T).T
     mean = regression @ heights.mean_m
-    covariance = own - regression @ (among - heights.covariance_m2) @ regression.T
+    covariance = within - regression @ (among - heights.covariance_m2) @ regression.T
     kept = 1 - _NEW_SHARE
     new = unknown_heights(camera, downs_c[1], altitudes_m[1]).covariance_m2
     return Heights(kept * mean, kept**2 * covariance + (1 - kept**2) * new)

@@ -1,9 +1,11 @@
 """The classical baseline: corners tracked from frame to frame, and a robust motion fit over the ground plane.
 
-The second frame is first warped onto the first by the nominal motion, so that the tracker (Lucas & Kanade 1981,
-pyramids after Bouguet 2001, as in OpenCV) only has to find a small residual at the same scale. The points of frame 1
-are projected onto the ground plane at the estimated altitude. The motion is fitted to them by Gauss-Newton on the
-reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171).
+1. Warp frame 2 onto frame 1 by the expected motion, so that only a small residual at one scale is left.
+2. Find corners in frame 1, track them into frame 2 and back, and drop tracks that do not return (`_tracks`). Lucas &
+   Kanade 1981, with pyramids after Bouguet 2001, as in OpenCV.
+3. Project the corners of frame 1 onto the ground plane at the estimated altitude.
+4. Fit the motion by Gauss-Newton on the reprojection error, with Tukey's weights and a weak prior (`_fit`). Beaton
+   & Tukey 1974, doi 10.1080/00401706.1974.10489171.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,7 @@ import numpy as np
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.data.frames import normalised
-from perilune_train.motion.classical.estimate import EstimatedMotion
+from perilune_train.motion.classical.estimate import EstimatedMotion, ExpectedMotion, GroundPlane
 from perilune_train.motion.data.gyroscope import GyroscopeTurns
 from perilune_train.motion.data.trajectories import Trajectory
 from perilune_train.motion.geometry import (
@@ -26,16 +28,14 @@ from perilune_train.motion.geometry import (
 _N_CORNERS = 600
 _WINDOW_PX = 11
 _CONSISTENCY_PX = 0.5
-"""Largest distance, pixels, between a track's start and its end after tracking back."""
+"""Largest distance, pixels, between the start of a track and its end after tracking back."""
 _TUKEY = 4.685
 NOMINAL_TURN_SIGMA_RAD = float(np.radians(0.5))
 SHIFT_SHARE = 0.02
-"""Standard deviations of a weak prior around the nominal motion: of rotation, and of shift divided by altitude. Few or
-crowded corners cannot separate tilt from sideways shift, which look alike from above."""
+"""Standard deviations of a weak prior about the nominal motion: of the rotation, radians, and of the shift divided by
+altitude. Few or clustered corners cannot separate tilt from sideways shift, which look alike from above."""
 _ITERATIONS = 15
 _MIN_TRACKS = 8
-
-
 _MEDIAN_OF_SIGMA = 1.1774
 """Median length of a vector with two normal components, divided by their standard deviation."""
 
@@ -49,45 +49,39 @@ class Tracked:
     rotation_c2_from_c1: Array
     """Rotation (3, 3)."""
     covariance: Array
-    """Of the turn from the left (radians) and the shift (metres, O_C of frame 2), (6, 6): the Cramer-Rao bound of the
-    tracks used, if their errors are independent and the ground is the plane. The size of the errors is that of the
-    residuals."""
+    """Covariance (6, 6) of the turn from the left (radians) and the shift (metres, O_C of frame 2): the Cramer-Rao
+    bound of the tracks, if their errors are independent and the ground is a plane. Residuals give the size of the
+    errors."""
     n_tracks: int
     """Number of consistent tracks."""
 
 
 def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
-    """Motions of a whole trajectory, from images and, where it is given, a gyroscope.
+    """Motions of a whole trajectory, from images and, if given, a gyroscope.
 
-    One pair gives the translation only relative to the altitude. The altitude is the true one at the first frame, then
-    updated with the estimated motions; the attitude is assumed level.
+    One pair gives the translation only relative to the altitude. The altitude is true at the first frame and then
+    updated by the estimated motions; the attitude is assumed to be level.
     """
-    nominal_translation, rotation = trajectory.nominal_motion
+    nominal_translation, nominal_rotation_c2_from_c1 = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
     if turns is not None:
-        rotation, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
+        nominal_rotation_c2_from_c1, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
     images = stretched(trajectory.images)
     altitude_m = float(trajectory.position_m[0, 2])
-    found = []
+    pairs = []
     for i in range(trajectory.n_pairs):
-        one = klt_motion(
-            trajectory.camera,
-            images[i],
-            images[i + 1],
-            nominal_translation[i],
-            rotation[i],
-            trajectory.down_c,
-            altitude_m,
-            turn_sigma[i],
-        )
-        altitude_m -= float(trajectory.down_c @ one.translation_m)
-        found.append(one)
-    motion = np.stack([one.translation_m for one in found]), np.stack([one.rotation_c2_from_c1 for one in found])
-    return EstimatedMotion(motion, np.stack([one.covariance for one in found]))
+        expected = ExpectedMotion(nominal_translation[i], nominal_rotation_c2_from_c1[i], turn_sigma[i])
+        plane = GroundPlane(trajectory.down_c, altitude_m)
+        tracked = klt_motion(trajectory.camera, images[i], images[i + 1], expected, plane)
+        altitude_m -= float(trajectory.down_c @ tracked.translation_m)
+        pairs.append(tracked)
+    motion = np.stack([pair.translation_m for pair in pairs]), np.stack([pair.rotation_c2_from_c1 for pair in pairs])
+    return EstimatedMotion(motion, np.stack([pair.covariance for pair in pairs]))
 
 
 def stretched(images: np.ndarray) -> np.ndarray:
-    """Frames (n, height, width) of one mean and contrast, 8 bits: OpenCV rejects flat windows by a fixed threshold."""
+    """Frames (n, height, width) with equal mean and contrast, 8 bits: OpenCV rejects flat windows by a fixed
+    threshold."""
     return np.clip(110 + 45 * normalised(images), 0, 255).astype(np.uint8)
 
 
@@ -95,64 +89,58 @@ def klt_motion(
     camera: Camera,
     image_1: np.ndarray,
     image_2: np.ndarray,
-    nominal_translation_m: Array,
-    nominal_rotation_c2_from_c1: Array,
-    plane_normal_c1: Array,
-    altitude_m: float,
-    turn_sigma_rad: float = NOMINAL_TURN_SIGMA_RAD,
+    expected: ExpectedMotion,
+    plane: GroundPlane,
 ) -> Tracked:
-    """Motion between two 8-bit images.
+    """Motion between two 8-bit images (height, width), over the ground plane below the first.
 
-    `turn_sigma_rad` is the standard deviation of the nominal rotation; that of a gyroscope if it gave the rotation.
-    If fewer than 8 corners can be tracked, returns the nominal motion with the prior's covariance and 0 tracks.
+    If fewer than 8 corners can be tracked, returns the expected motion with the prior's covariance and 0 tracks.
     """
-    nominal = plane_homography(
-        camera.matrix, nominal_translation_m, nominal_rotation_c2_from_c1, plane_normal_c1, altitude_m
+    homography = plane_homography(
+        camera.matrix, expected.translation_m, expected.rotation_c2_from_c1, plane.down_c, plane.altitude_m
     )
-    pixels_1, pixels_2 = _tracks(image_1, image_2, nominal)
+    pixels_1, pixels_2 = _tracks(image_1, image_2, homography)
     if len(pixels_1) < _MIN_TRACKS:
-        variance = np.square([turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
-        return Tracked(nominal_translation_m, nominal_rotation_c2_from_c1, np.diag(variance), 0)
+        variance = np.square([expected.turn_sigma_rad] * 3 + [SHIFT_SHARE * plane.altitude_m] * 3)
+        return Tracked(expected.translation_m, expected.rotation_c2_from_c1, np.diag(variance), 0)
     rays = camera.rays(pixels_1)
-    points_c1 = rays * (altitude_m / (rays @ plane_normal_c1))[:, None]
-    return _fit(camera, points_c1, pixels_2, nominal_translation_m, nominal_rotation_c2_from_c1, turn_sigma_rad)
+    points_c1 = rays * (plane.altitude_m / (rays @ plane.down_c))[:, None]
+    return _fit(camera, points_c1, pixels_2, expected)
 
 
 def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tuple[Array, Array]:
-    """Corresponding points (N, 2) of both images, in image coordinates."""
+    """Corresponding points (N, 2) of both frames, in image coordinates."""
     size = image_1.shape[::-1]
     warp = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP}
     index_homography = pixel_index_homography(homography)
     warped = cv2.warpPerspective(image_2, index_homography, size, **warp)
-    seen = cv2.warpPerspective(np.full_like(image_2, 255), index_homography, size, **warp)
-    seen = cv2.erode(seen, np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8))
-    corners = cv2.goodFeaturesToTrack(image_1, _N_CORNERS, 0.001, 5, mask=seen)
+    covered = cv2.warpPerspective(np.full_like(image_2, 255), index_homography, size, **warp)
+    covered = cv2.erode(covered, np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8))
+    corners = cv2.goodFeaturesToTrack(image_1, _N_CORNERS, 0.001, 5, mask=covered)
     if corners is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     window = (_WINDOW_PX, _WINDOW_PX)
-    found, good, _ = cv2.calcOpticalFlowPyrLK(
+    tracked, good, _ = cv2.calcOpticalFlowPyrLK(
         image_1, warped, corners, corners.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     back, good_back, _ = cv2.calcOpticalFlowPyrLK(
-        warped, image_1, found, found.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+        warped, image_1, tracked, tracked.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     kept = (good & good_back).ravel().astype(bool)
     kept &= np.linalg.norm(back - corners, axis=-1).ravel() < _CONSISTENCY_PX
     pixels_1 = corners.reshape(-1, 2)[kept].astype(np.float64) + 0.5
-    return pixels_1, apply_homography(homography, found.reshape(-1, 2)[kept].astype(np.float64) + 0.5)
+    return pixels_1, apply_homography(homography, tracked.reshape(-1, 2)[kept].astype(np.float64) + 0.5)
 
 
-def _fit(
-    camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array, turn_sigma_rad: float
-) -> Tracked:
-    """Fit the motion that maps points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
+def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMotion) -> Tracked:
+    """Fit the motion that maps points (N, 3), O_C of frame 1, to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
-    nominal_translation_m, nominal_rotation = translation_m, rotation
+    translation_m, rotation_c2_from_c1 = expected.translation_m, expected.rotation_c2_from_c1
     altitude_m = float(np.median(points_c1[:, 2]))
-    prior = 1 / np.square([turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
+    prior = 1 / np.square([expected.turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
     for _ in range(_ITERATIONS):
-        points = (points_c1 - translation_m) @ rotation.T
+        points = (points_c1 - translation_m) @ rotation_c2_from_c1.T
         error = camera.project(points) - pixels_2
         distance = np.linalg.norm(error, axis=1)
         spread = max(1.4826 * float(np.median(distance)), 1e-3)
@@ -169,7 +157,10 @@ def _fit(
         information = normal / (float(np.median(distance)) / _MEDIAN_OF_SIGMA) ** 2 + np.diag(prior)
         normal += np.diag(prior) * spread**2
         offset = np.concatenate(
-            [rotation_vectors(rotation @ nominal_rotation.T), rotation @ (nominal_translation_m - translation_m)]
+            [
+                rotation_vectors(rotation_c2_from_c1 @ expected.rotation_c2_from_c1.T),
+                rotation_c2_from_c1 @ (expected.translation_m - translation_m),
+            ]
         )
         # Metres and radians have very different scales; a unit diagonal keeps the system well conditioned.
         scale = 1 / np.sqrt(np.diag(normal))
@@ -177,11 +168,11 @@ def _fit(
         step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), gradient, rcond=None)[0]
         turn = matrix_from_rotation_vector(step[:3])
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
-        rotation = turn @ rotation
-        translation_m = translation_m - rotation.T @ step[3:]
+        rotation_c2_from_c1 = turn @ rotation_c2_from_c1
+        translation_m = translation_m - rotation_c2_from_c1.T @ step[3:]
         if np.linalg.norm(step[:3]) < 1e-8 and np.linalg.norm(step[3:]) < 1e-5:
             break
     unit: Array = 1 / np.sqrt(np.diag(information))
     scale_of_each: Array = unit[:, None] * unit
     covariance = scale_of_each * np.linalg.inv(scale_of_each * information)
-    return Tracked(translation_m, rotation, covariance, int((weights > 0).sum()))
+    return Tracked(translation_m, rotation_c2_from_c1, covariance, int((weights > 0).sum()))

@@ -1,4 +1,4 @@
-"""Items made ahead in a background thread, in a known order."""
+"""Items computed ahead in a background thread, in a known order."""
 
 import queue
 import threading
@@ -12,10 +12,10 @@ _POLL_S = 0.1
 
 
 class Ahead(Generic[Key, Item]):
-    """Makes items while others are used, at most `most` ahead.
+    """Computes items while others are used, at most `most` ahead.
 
-    `make(keys)` is called in the thread and yields the items of these keys. `following(key)` yields a key and those
-    that are needed after it. If another key than the expected one is taken, the thread starts again with that one.
+    `make(keys)` runs in the thread and yields the items of these keys. `following(key)` yields a key and the keys that
+    are needed after it. If another key than the expected one is taken, the thread restarts at that key.
     """
 
     def __init__(
@@ -30,17 +30,17 @@ class Ahead(Generic[Key, Item]):
         self._stop, self._thread = threading.Event(), threading.Thread()
 
     def take(self, key: Key) -> Item:
-        """The item of a key, once it is made. Raises what making it raised."""
+        """Wait for the item of a key. Raises the error that computing it raised."""
         if next(self._expected, None) != key:
             self._begin(key)
-        found = self._made.get()
-        if isinstance(found, BaseException):
+        result = self._made.get()
+        if isinstance(result, BaseException):
             self._expected = iter(())
-            raise found
-        return found[1]
+            raise result
+        return result[1]
 
     def close(self) -> None:
-        """End the thread; one that waits for a reply ends after it."""
+        """Stop the thread; if it waits for a reply, it stops after the reply."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(_STOP_S)
@@ -51,15 +51,15 @@ class Ahead(Generic[Key, Item]):
         next(self._expected)
         self._made, self._stop = queue.Queue(self._most), threading.Event()
         arguments = (self._following(key), self._made, self._stop)
-        # A daemon: it must not keep a process alive that ends with an error.
+        # A daemon thread: it must not keep a process alive that ends with an error.
         self._thread = threading.Thread(target=self._run, args=arguments, name="ahead", daemon=True)
         self._thread.start()
 
     def _run(self, keys: Iterator[Key], made: queue.Queue, stop: threading.Event) -> None:
-        def put(found: tuple[Key, Item] | BaseException) -> None:
+        def put(result: tuple[Key, Item] | BaseException) -> None:
             while not stop.is_set():
                 try:
-                    made.put(found, timeout=_POLL_S)
+                    made.put(result, timeout=_POLL_S)
                     return
                 except queue.Full:
                     continue

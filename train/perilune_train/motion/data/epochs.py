@@ -1,7 +1,5 @@
 """Order and augmentation of the sequences of every epoch of navigation training."""
 
-from dataclasses import replace
-
 import numpy as np
 from torch.utils import data as torch_data
 
@@ -10,15 +8,15 @@ from perilune_train.motion.data.sequences import Jitter, Sequence, pair_sequence
 from perilune_train.motion.data.trajectories import Trajectory
 
 Key = tuple[int, int, int, int]
-"""Epoch, place in its order, number of a trajectory and first pair of a sequence."""
+"""Epoch, position in its order, number of a trajectory, and first pair of a sequence."""
 
 
 class TrainingSequences(torch_data.Dataset):
     """The training sequences of a share; they depend on trajectories, seed and epoch only.
 
     A trajectory gives about as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into
-    it, each with its own random start. A sequence belongs to the process of its trajectory. `augmented` sequences are
-    mirrored and, with `jitter`, moved (see `pair_sequence`).
+    it, each with its own random start. A sequence belongs to the process of its trajectory. Sequences
+    of `warp` are mirrored and, with `jitter`, moved (see `pair_sequence`).
     """
 
     def __init__(
@@ -27,33 +25,32 @@ class TrainingSequences(torch_data.Dataset):
         n_pairs: int,
         *,
         warp: bool,
-        augmented: bool,
         jitter: Jitter | None,
         seed: int,
         share: Share,
     ):
-        self.trajectories, self.warp, self.augmented = trajectories, warp, augmented
+        self.trajectories, self.warp = trajectories, warp
         self.jitter, self.seed, self.share = jitter, seed, share
         self.n_pairs = min(n_pairs, *(trajectory.n_pairs for trajectory in trajectories))
         self.counts = [round(trajectory.n_pairs / self.n_pairs) for trajectory in trajectories]
 
     @property
     def fewest(self) -> int:
-        """Number of sequences of the process that has fewest."""
+        """Number of sequences of the process that has the fewest."""
         processes = self.share.processes
         return min(sum(self.counts[process::processes]) for process in range(processes))
 
     def keys(self, epoch: int) -> list[Key]:
         """Keys of the share's sequences in the order of an epoch."""
         rng = np.random.default_rng([self.seed, epoch])
-        places = [
+        windows = [
             (number, int(start))
             for number, (trajectory, count) in enumerate(zip(self.trajectories, self.counts, strict=True))
             for start in rng.integers(0, trajectory.n_pairs - self.n_pairs + 1, count)
         ]
-        rng.shuffle(places)
-        own = set(self.share.of(len(self.trajectories)))
-        return [(epoch, place, *sequence) for place, sequence in enumerate(places) if sequence[0] in own]
+        rng.shuffle(windows)
+        numbers = set(self.share.of(len(self.trajectories)))
+        return [(epoch, position, *sequence) for position, sequence in enumerate(windows) if sequence[0] in numbers]
 
     def __getitem__(self, key: Key) -> Sequence:
         _, _, number, start = key
@@ -61,7 +58,6 @@ class TrainingSequences(torch_data.Dataset):
 
     def augmented_sequence(self, key: Key, trajectory: Trajectory, start: int) -> Sequence:
         """The pairs of a trajectory from `start` on, with the augmentation of a key."""
-        epoch, place, number, first = key
-        rng = np.random.default_rng([self.seed, epoch, place]) if self.augmented else None
-        sequence = pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)
-        return replace(sequence, place=(number, first))
+        epoch, position, _, _ = key
+        rng = np.random.default_rng([self.seed, epoch, position]) if self.warp else None
+        return pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)

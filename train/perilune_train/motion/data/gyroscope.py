@@ -10,7 +10,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, InertialGrade
 
 _LATE_S = 1e-6
-"""Rounding of times: measurements must reach the last frame but for this."""
+"""Tolerance, seconds, with which measurements must reach the last frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class GyroscopeTurns:
     rotation_c2_from_c1: Array
     """Rotations (n - 1, 3, 3)."""
     sigma_rad: Array
-    """Standard deviation of each on every axis (n - 1,), by the errors of the grade."""
+    """Standard deviation of each rotation about every axis (n - 1,), radians, from the errors of the grade."""
 
 
 def gyroscope_turns(

@@ -40,8 +40,6 @@ class Sequence:
     """Nominal altitudes (n,), metres, at the earlier frames."""
     down_c: Array
     """Unit vector (3,) towards the ground in O_C of a level body, mirrored with the frames."""
-    place: tuple[int, int] = (0, 0)
-    """Number of the trajectory and first pair."""
     flow_px: Array | None = None
     """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), pixels, from first to second."""
 
@@ -55,31 +53,37 @@ def pair_sequence(
     rng: np.random.Generator | None = None,
     jitter: Jitter | None = None,
 ) -> Sequence:
-    """The pairs start to start + n_pairs - 1 of a trajectory; augmented if a generator is given.
+    """Pairs start to start + n_pairs - 1 of a trajectory; augmented if a generator is given.
 
     Augmentation applies one of the eight symmetries of the square image to the whole sequence (four if the image is not
     square). With `jitter` it also moves each second camera at random, so that a pair has new residuals in every epoch:
-    the second frame is resampled over the ground plane to what the moved camera would see. The plane is that of the
-    nominal altitude and attitude. The result is exact for a pure rotation, or if the ground is flat and the true
-    altitude and attitude are nominal. For true poses off nominal by 8 m and 0.3 degrees and a jitter of 0.3 times that,
-    the jitter moves points by 1.2 px and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of
-    128 px over 50 degrees at 200 to 1500 m; see tests/train/motion/test_data.py.
+    the second frame is resampled over the ground plane to the view of the moved camera. The plane has the nominal
+    altitude and attitude.
+
+    The result is exact for a pure rotation, or if the ground is flat and the true altitude and attitude are nominal.
+    For true poses off nominal by 8 m and 0.3 degrees and a jitter of 0.3 times that, the jitter moves points by 1.2 px
+    and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of 128 px over 50 degrees at 200 to
+    1500 m; see tests/train/motion/test_data.py.
     """
     span = slice(start, start + n_pairs)
-    translation, rotation = (values[span] for values in trajectory.motion)
+    translation, rotation_c2_from_c1 = (values[span] for values in trajectory.motion)
     nominal_translation, nominal_rotation = (values[span] for values in trajectory.nominal_motion)
     altitude = trajectory.altitude_m[span]
     images = trajectory.images[start : start + n_pairs + 1]
-    translation, rotation, seconds = translation.copy(), rotation.copy(), []
+    translation, rotation_c2_from_c1, seconds = translation.copy(), rotation_c2_from_c1.copy(), []
     for i in range(n_pairs):
         change = np.eye(3)
         if rng is not None and jitter is not None:
             shift = rng.normal(size=3) * jitter.translation_m
             turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
-            true = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
-            translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
-            # From the moved camera's image 2 over the plane to image 1, then to the original image 2.
-            moved = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
+            true = _homography(
+                trajectory.camera, trajectory.down_c, translation[i], rotation_c2_from_c1[i], altitude[i]
+            )
+            translation[i], rotation_c2_from_c1[i] = translation[i] + shift, turn @ rotation_c2_from_c1[i]
+            # Image 2 of the moved camera, over the plane, to image 1, then to the original image 2.
+            moved = _homography(
+                trajectory.camera, trajectory.down_c, translation[i], rotation_c2_from_c1[i], altitude[i]
+            )
             change = true @ np.linalg.inv(moved)
         if warp:
             change = change @ _homography(
@@ -90,7 +94,7 @@ def pair_sequence(
         np.stack([_normalised(image) for image in images[:-1]]),
         np.stack(seconds),
         translation,
-        rotation,
+        rotation_c2_from_c1,
         nominal_translation,
         altitude,
         trajectory.down_c,
@@ -127,8 +131,10 @@ def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Se
     )
 
 
-def _homography(camera: Camera, down_c: Array, translation_m: Array, rotation: Array, altitude_m: float) -> Array:
-    return plane_homography(camera.matrix, translation_m, rotation, down_c, altitude_m)
+def _homography(
+    camera: Camera, down_c: Array, translation_m: Array, rotation_c2_from_c1: Array, altitude_m: float
+) -> Array:
+    return plane_homography(camera.matrix, translation_m, rotation_c2_from_c1, down_c, altitude_m)
 
 
 def _residual_flow(sequence: Sequence, camera: Camera) -> Array:

@@ -20,9 +20,10 @@ _EXTENT_TOLERANCE = 1e-3
 
 
 class Stream:
-    """The server of a run. Raises UserError if it does not answer or does not fit a navigation dataset.
+    """The image server of a run.
 
-    A scene whose terrain is that of the dataset's validation or test split is refused when it is first rendered.
+    Raises UserError if it does not answer or does not fit a navigation dataset. A scene on terrain of the dataset's
+    validation or test split is refused when it is first rendered.
     """
 
     def __init__(self, settings: StreamConfig, dataset: Dataset):
@@ -59,7 +60,7 @@ class Stream:
             return [[number, *astuple(use)] for number, use in self._uses.items()]
 
     def load_state_dict(self, state: list[list]) -> None:
-        """Take over what an interrupted run rendered."""
+        """Restore the record of an interrupted run."""
         with self._lock:
             self._uses |= {number: TerrainUse(*use) for number, *use in state}
 
@@ -70,18 +71,19 @@ class Stream:
     def rendered(
         self, client: SceneClient, scene: int, following: int | None, part: Trajectory, velocity: Array, index: int
     ) -> Trajectory:
-        """The same poses (n) with images of a scene; `velocity` (n, 3) blurs them, `index` sets their noise.
+        """The poses of `part` (n) with images of a scene; `velocity` (n, 3) sets their motion blur, `index` their
+        noise.
 
-        The server is asked to generate the `following` scene meanwhile. Raises UserError if the server fails or the
-        terrain is held out.
+        Meanwhile the server generates the `following` scene. Raises UserError if the server fails or the terrain is
+        held out.
         """
         self._record(client, scene)
         if following is not None:
             client.ground(following, wait=False)
         images = []
         for k, position in enumerate(part.position_m):
-            rotation = quaternion_from_matrix(part.rotation_camera_from_site[k])
-            frame = client.frame(position, rotation, velocity_mps=velocity[k], index=index + k, scene=scene)
+            rotation_wxyz = quaternion_from_matrix(part.rotation_camera_from_site[k])
+            frame = client.frame(position, rotation_wxyz, velocity_mps=velocity[k], index=index + k, scene=scene)
             images.append(self._checked(frame.image))
         pixels, camera = undistorted(np.stack(images), self.served.camera)
         return replace(part, images=pixels, camera=camera)
@@ -89,7 +91,7 @@ class Stream:
     def _record(self, client: SceneClient, scene: int) -> None:
         """Record the terrain of a scene before its first frame in this process.
 
-        Raises UserError if it is held out, or not that which the run used before.
+        Raises UserError if it is held out, or differs from the terrain that the run used before.
         """
         if scene in self._known:
             return
@@ -124,13 +126,13 @@ def _velocities(dataset: Dataset) -> dict[tuple[str, str], Array]:
     return {(str(key[0]), str(key[1])): np.array(rows["velocity_mps"].tolist()) for key, rows in groups}
 
 
-def _check_camera(address: str, served: Camera, own: Camera) -> None:
+def _check_camera(address: str, served: Camera, expected_camera: Camera) -> None:
     """Raise UserError unless both cameras have the same view; sizes may differ."""
-    sizes = (served.width_px, served.height_px), (own.width_px, own.height_px)
+    sizes = (served.width_px, served.height_px), (expected_camera.width_px, expected_camera.height_px)
     views = [
         (c.fx_px / w, c.fy_px / h, c.cx_px / w, c.cy_px / h, w / h, *c.distortion)
-        for c, (w, h) in zip((served, own), sizes, strict=True)
+        for c, (w, h) in zip((served, expected_camera), sizes, strict=True)
     ]
     if not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
-        expected = f"{own}, that of the dataset, or one with the same view and another size"
+        expected = f"{expected_camera}, that of the dataset, or one with the same view and another size"
         raise UserError(address, "camera", served, expected)

@@ -1,8 +1,9 @@
 """Training sequences over new ground, rendered by an image server while the network trains.
 
-Such a sequence has the poses of a part of a training trajectory, turned about the vertical through the site by a random
-angle, over a scene of the server. Attitudes stay: a descent from another azimuth has the same axes of the camera. So
-positions, motions and attitudes have the distribution of the training trajectories, but for the azimuth, which is any.
+A rendered sequence has poses of a training trajectory, rotated about the vertical through the site by a random angle,
+over a scene of the server. Attitudes relative to the path stay, since a descent from another azimuth has equal camera
+axes. So positions, motions and attitudes are distributed as in the training trajectories, except for the azimuth, which
+is uniform.
 """
 
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from perilune_shared.errors import UserError
-from perilune_train.data.lost import DataLost
+from perilune_train.data.epochs import DataLost
 from perilune_train.motion.data.ahead import Ahead
 from perilune_train.motion.data.epochs import Key, TrainingSequences
 from perilune_train.motion.data.sequences import Sequence
@@ -21,15 +22,15 @@ from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import Trajectory
 
 _AHEAD = 8
-"""Largest number of rendered sequences that wait in memory."""
+"""Largest number of rendered sequences waiting in memory."""
 _INDICES = 2**30
 
 
 class StreamedSequences(TrainingSequences):
-    """Training sequences, a share of which is rendered by a server; otherwise those of the trajectories.
+    """Training sequences of which a share is rendered by a server; the others come from the trajectories.
 
-    Everything is derived from the seeds and a sequence's epoch and place: whether it is rendered, over which scene,
-    from which poses and with which noise. `size_px` is the width to which frames are shrunk. Close it at the end.
+    The seeds and the epoch and position of a sequence determine whether it is rendered, over which scene, from which
+    poses and with which noise. `size_px` is the width to which frames are shrunk. Call `close` at the end.
     """
 
     def __init__(self, stream: Stream, size_px: int, *arguments: Any, **named: Any):
@@ -41,24 +42,25 @@ class StreamedSequences(TrainingSequences):
         return self._ahead.take(key) if self.is_rendered(key) else super().__getitem__(key)
 
     def close(self) -> None:
-        """End the thread that asks the server."""
+        """Stop the thread that asks the server."""
         self._ahead.close()
 
     def is_rendered(self, key: Key) -> bool:
-        """Whether a sequence is rendered: a share of all, evenly spread over the order of an epoch."""
+        """Whether a sequence is rendered; rendered ones are evenly spread over the order of an epoch."""
         share = self.stream.settings.share
         return floor((key[1] + 1) * share) > floor(key[1] * share)
 
     def scene_of(self, key: Key) -> int:
-        """Number of the server's scene under a rendered sequence, from 1: each for `pairs_per_scene` pairs in turn."""
+        """Number of the server's scene under a rendered sequence, from 1; each scene serves `pairs_per_scene` pairs in
+        turn."""
         settings = self.stream.settings
         before = key[0] * floor(sum(self.counts) * settings.share) + floor(key[1] * settings.share)
         return 1 + before * self.n_pairs // settings.pairs_per_scene % settings.n_scenes
 
     def poses(self, key: Key) -> tuple[Trajectory, np.ndarray, int]:
         """The poses of a rendered sequence, without images, their velocities (n, 3), O_L, and the first noise index."""
-        epoch, place, number, start = key
-        rng = np.random.default_rng([self.stream.settings.seed, epoch, place])
+        epoch, position, number, start = key
+        rng = np.random.default_rng([self.stream.settings.seed, epoch, position])
         angle, index = rng.uniform(0, 2 * np.pi), int(rng.integers(_INDICES))
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -73,7 +75,7 @@ class StreamedSequences(TrainingSequences):
         return part, self.stream.velocities_mps(whole.ids)[frames] @ turn.T, index
 
     def _following(self, key: Key) -> Iterator[Key]:
-        """The rendered sequences of this process from one on, in the order of training, without end."""
+        """The rendered sequences of this process from `key` on, in training order, without end."""
         epoch, keys = key[0], self.keys(key[0])
         keys = keys[keys.index(key) :]
         while True:

@@ -99,8 +99,8 @@ class Trajectory:
 def own_trajectories(split: str, count: int, share: Share) -> list[int]:
     """Numbers of the trajectories of a split, among 0 .. count - 1, whose frames a process needs.
 
-    Those of train and val are divided among the processes; with fewer in val than processes, some validate the same
-    one. Only the first process evaluates test.
+    Trajectories of train and val are divided among the processes; if val has fewer than processes, some validate the
+    same one. Only the first process evaluates test.
     """
     if split == "test":
         return list(range(count)) if share.process == 0 else []
@@ -114,7 +114,7 @@ def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory
     is of another kind, a frame is missing or there are fewer training trajectories than processes. Frames of a
     distorting lens are undistorted.
     """
-    trajectories = [one for split in SPLITS for one in load_split(dataset, split, share)]
+    trajectories = [trajectory for split in SPLITS for trajectory in load_split(dataset, split, share)]
     if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
         raise UserError(dataset.store, "split", "a trajectory in two splits", "one split for each trajectory")
     return trajectories
@@ -137,12 +137,12 @@ def _split_trajectories(
     if split == "train" and len(groups) < share.processes:
         expected = f"at least {share.processes}, one for each process"
         raise UserError(dataset.store, "train trajectories", len(groups), expected)
-    own = set(own_trajectories(split, len(groups), share))
-    loaded = table.iloc[np.concatenate([[], *(groups[number][1].index for number in sorted(own))]).astype(int)]
+    numbers = set(own_trajectories(split, len(groups), share))
+    loaded = table.iloc[np.concatenate([[], *(groups[number][1].index for number in sorted(numbers))]).astype(int)]
     (images, camera), start = undistorted(load_images(dataset, loaded, split), dataset.camera), 0
     trajectories = []
     for number, (key, rows) in enumerate(groups):
-        stop = start + (len(rows) if number in own else 0)
+        stop = start + (len(rows) if number in numbers else 0)
         scene_id, trajectory_id = (str(part) for part in key)
         curve = curves[scene_id, trajectory_id]
         nominal = NominalTrajectory(
@@ -168,12 +168,14 @@ def _split_trajectories(
             )
         )
         start = stop
-        if split != "train" and number in own:
+        if split != "train" and number in numbers:
             trajectories[-1] = replace(trajectories[-1], gyroscopes=_gyroscopes(dataset, trajectories[-1], rows))
     return trajectories
 
 
 def _gyroscopes(dataset: Dataset, trajectory: Trajectory, rows: pd.DataFrame) -> dict[InertialGrade, GyroscopeTurns]:
-    time_s, mounting = rows["time_s"].to_numpy(), trajectory.nominal_rotation_camera_from_site
-    measured = {grade: gyroscope_turns(dataset, trajectory.ids, grade, time_s, mounting) for grade in GRADES}
+    time_s, rotation_camera_from_site = rows["time_s"].to_numpy(), trajectory.nominal_rotation_camera_from_site
+    measured = {
+        grade: gyroscope_turns(dataset, trajectory.ids, grade, time_s, rotation_camera_from_site) for grade in GRADES
+    }
     return {grade: turns for grade, turns in measured.items() if turns is not None}

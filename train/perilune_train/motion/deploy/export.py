@@ -20,7 +20,7 @@ from perilune_train.motion.data.sequences import pair_sequence
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.motion.deploy.flight_navigator import INPUTS, OUTPUTS, FlightNavigator
 from perilune_train.motion.deploy.readme import readme
-from perilune_train.motion.finished_run import fusion_of
+from perilune_train.motion.evaluate_runs import fusion_of
 from perilune_train.motion.network import Fusion, check_motion, load_navigator
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.provenance import read_provenance
@@ -28,7 +28,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 ONNX, METADATA, README = "navigator.onnx", "navigator.json", "README.md"
 LARGEST_DIFFERENCE = 1e-5
-"""Largest difference from torch, divided by the largest value of the same output, or by 1 if that is larger."""
+"""Largest difference from torch, divided by the larger of 1 and the largest value of that output."""
 _OPSET = 17
 _PAIRS = 12
 
@@ -47,18 +47,18 @@ class Pairs:
     """Nominal altitudes (n,), metres."""
 
     def inputs(self, pair: int, fusion: Fusion) -> list[Tensor]:
-        """The inputs of one pair without the state."""
-        own = slice(pair, pair + 1)
-        known = [self.nominal_translation_m[own], self.altitude_m[own]] if fusion == "warp" else []
-        return [self.first[own], self.second[own], *known]
+        """The inputs of one pair, without the state."""
+        rows = slice(pair, pair + 1)
+        known = [self.nominal_translation_m[rows], self.altitude_m[rows]] if fusion == "warp" else []
+        return [self.first[rows], self.second[rows], *known]
 
 
 def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> float:
     """Export a run's navigator to the new folder `out`; returns its largest relative difference from torch.
 
-    Writes navigator.onnx, navigator.json (metadata) and README.md. ONNX Runtime, pair by pair with the state carried,
-    is compared with torch over the whole sequence at once, on the first validation descent of the dataset, or on noise.
-    With a dataset the graph is for its camera. Raises UserError, and writes nothing, if they differ.
+    Writes navigator.onnx, navigator.json (metadata) and README.md. ONNX Runtime runs pair by pair and carries the
+    state; torch runs over the whole sequence at once. Both are compared on the first validation descent of the dataset,
+    or on noise. With a dataset, the graph is for its camera. Raises UserError, and writes nothing, if they differ.
     """
     for name in ("onnx", "onnxruntime"):
         package(name)
@@ -153,8 +153,8 @@ def _largest_difference(
     names, state = INPUTS[fusion], [np.zeros((2, 1, architecture["hidden"]), np.float32)] * 2
     streamed = []
     for pair in range(len(pairs.first)):
-        given = [part.numpy() for part in pairs.inputs(pair, fusion)]
-        translation, rotation, *state = session.run(list(OUTPUTS), dict(zip(names, [*given, *state], strict=True)))
+        inputs = [part.numpy() for part in pairs.inputs(pair, fusion)]
+        translation, rotation, *state = session.run(list(OUTPUTS), dict(zip(names, [*inputs, *state], strict=True)))
         streamed.append(np.concatenate([translation[0], rotation[0].ravel()]))
     whole = FlightNavigator(network, architecture, focal)
     with torch.no_grad():
@@ -167,7 +167,7 @@ def _largest_difference(
 def _at_once(
     flight: FlightNavigator, network: nn.Module, pairs: Pairs, fusion: Fusion, focal: float
 ) -> tuple[Tensor, Tensor]:
-    """Translations (n, 3) and rotations (n, 3, 3) of all pairs in one pass of the network itself."""
+    """Translations (n, 3) and rotations (n, 3, 3) of all pairs in one pass of the torch network."""
     if fusion == "warp":
         network.focal_over_width = focal  # type: ignore[assignment]
         output, _, _ = network(pairs.first[None], pairs.second[None], pairs.altitude_m[None])

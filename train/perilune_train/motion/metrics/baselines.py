@@ -7,22 +7,22 @@ import numpy as np
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
-from perilune_train.motion.classical.descent import aligned_trajectory
+from perilune_train.motion.classical.alignment import aligned_trajectory
 from perilune_train.motion.classical.estimate import EstimatedMotion
 from perilune_train.motion.classical.klt import klt_trajectory
 from perilune_train.motion.data.trajectories import Motion, Trajectory
 from perilune_train.motion.geometry import mean_rotation
 
 GYROSCOPE: InertialGrade = "tactical"
-"""The grade whose rotations `klt_gyroscope` and `alignment_gyroscope` use."""
+"""Grade of the inertial unit whose rotations `klt_gyroscope` and `alignment_gyroscope` use."""
 
 CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
 """Methods that read the images, in the order of the tables."""
 
 
 @dataclass(frozen=True, slots=True)
-class Baselines:
-    """Motions of the test trajectories by each method, and their covariances by those methods that state them."""
+class MethodMotions:
+    """Motions of trajectories by each method, and their covariances where a method states them."""
 
     motions: dict[str, list[Motion]]
     """Motions of each trajectory, by method."""
@@ -30,9 +30,10 @@ class Baselines:
     """Covariances (n - 1, 6, 6) of each trajectory, as in `EstimatedMotion`, by method."""
 
 
-def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
-    """Estimate by all methods. Without training trajectories there are no mean motions, without gyroscope no method
-    that uses one.
+def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotions:
+    """Estimate the motions of test trajectories by all methods.
+
+    Without training trajectories there are no mean motions; without a gyroscope, no methods that use one.
     """
     with progress_bar() as progress:
         task = progress.add_task("classical methods", total=len(test), unit="trajectories", note="")
@@ -45,31 +46,31 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
                     estimated.setdefault(f"{name}_gyroscope", []).append(method(trajectory, gyroscope))
             progress.advance(task)
     whole = {name: estimated[name] for name in CLASSICAL if len(estimated.get(name, [])) == len(test)}
-    found = {name: [one.motion for one in own] for name, own in whole.items()}
-    covariances = {name: [one.covariance for one in own] for name, own in whole.items()}
-    found["nominal"] = [trajectory.nominal_motion for trajectory in test]
+    motions = {name: [estimate.motion for estimate in estimates] for name, estimates in whole.items()}
+    covariances = {name: [estimate.covariance for estimate in estimates] for name, estimates in whole.items()}
+    motions["nominal"] = [trajectory.nominal_motion for trajectory in test]
     if training:
-        found["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
-        found["mean"] = [mean_motion(training, trajectory) for trajectory in test]
-    return Baselines(found, covariances)
+        motions["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
+        motions["mean"] = [mean_motion(training, trajectory) for trajectory in test]
+    return MethodMotions(motions, covariances)
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
     """The training set's mean motion, for every pair of the trajectory."""
-    translation = np.concatenate([one.motion[0] for one in training]).mean(0)
-    rotation = mean_rotation(np.concatenate([one.motion[1] for one in training]))
-    return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation, (trajectory.n_pairs, 1, 1))
+    translation = np.concatenate([trajectory.motion[0] for trajectory in training]).mean(0)
+    rotation_c2_from_c1 = mean_rotation(np.concatenate([trajectory.motion[1] for trajectory in training]))
+    return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation_c2_from_c1, (trajectory.n_pairs, 1, 1))
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:
-    """The training set's mean motion at each step; that of its last step for all later steps."""
+    """The training set's mean motion at each step; beyond its last step, the mean motion at its last step."""
     translations, rotations = [], []
-    longest = max(one.n_pairs for one in training)
+    longest = max(trajectory.n_pairs for trajectory in training)
     for step in range(trajectory.n_pairs):
         motions = [
-            (one.motion[0][min(step, longest - 1)], one.motion[1][min(step, longest - 1)])
-            for one in training
-            if one.n_pairs > min(step, longest - 1)
+            (trajectory.motion[0][min(step, longest - 1)], trajectory.motion[1][min(step, longest - 1)])
+            for trajectory in training
+            if trajectory.n_pairs > min(step, longest - 1)
         ]
         translations.append(np.mean([t for t, _ in motions], axis=0))
         rotations.append(mean_rotation(np.stack([r for _, r in motions])))

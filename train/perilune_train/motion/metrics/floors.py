@@ -1,4 +1,4 @@
-"""What a pose network must beat: mean poses of the training set, and ridge regression on the frozen features."""
+"""Baselines that a pose network must beat: mean poses of the training set, and ridge regression on frozen features."""
 
 from dataclasses import dataclass
 
@@ -13,29 +13,36 @@ FLOORS = {
     "mean_pose_at_frame": "mean pose of the training at that frame, without images",
     "ridge": "ridge regression on the frozen features",
 }
-"""Methods beside a pose network, with their names in tables."""
+"""Names in tables of the methods that a pose network is compared with."""
 _PENALTIES = np.logspace(-6, 2, 17)
 """Penalties of the ridge regression, in units of the mean squared length of a standardised feature vector."""
 
 
 def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Pose]]:
     """The training set's mean pose, and its mean pose at each frame, for every test trajectory."""
-    position_m, rotation = (np.concatenate([one.pose[i] for one in training]) for i in range(2))
-    mean, turn = position_m.mean(0), mean_rotation(rotation)
-    constant = [constant_pose(mean, turn, one.n_pairs) for one in test]
-    return {"mean_pose": constant, "mean_pose_at_frame": [_mean_pose_at_frame(training, one.n_pairs) for one in test]}
+    position_m, rotation_camera_from_site = (
+        np.concatenate([trajectory.pose[i] for trajectory in training]) for i in range(2)
+    )
+    mean_position_m, mean_rotation_camera_from_site = position_m.mean(0), mean_rotation(rotation_camera_from_site)
+    constant = [
+        constant_pose(mean_position_m, mean_rotation_camera_from_site, trajectory.n_pairs) for trajectory in test
+    ]
+    return {
+        "mean_pose": constant,
+        "mean_pose_at_frame": [_mean_pose_at_frame(training, trajectory.n_pairs) for trajectory in test],
+    }
 
 
-def constant_pose(position_m: Array, rotation: Array, n_pairs: int) -> Pose:
-    """The same pose for every pair."""
-    return np.tile(position_m, (n_pairs, 1)), np.tile(rotation, (n_pairs, 1, 1))
+def constant_pose(position_m: Array, rotation_camera_from_site: Array, n_pairs: int) -> Pose:
+    """One pose, repeated for every pair."""
+    return np.tile(position_m, (n_pairs, 1)), np.tile(rotation_camera_from_site, (n_pairs, 1, 1))
 
 
 def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
-    """Mean pose of the training set at each frame; at its last frame for all later ones."""
-    last, positions, rotations = max(one.n_pairs for one in training) - 1, [], []
+    """Mean pose of the training set at each frame; beyond its last frame, the mean pose at its last frame."""
+    last, positions, rotations = max(trajectory.n_pairs for trajectory in training) - 1, [], []
     for step in np.minimum(np.arange(n_pairs), last):
-        known = [one.pose for one in training if one.n_pairs > step]
+        known = [trajectory.pose for trajectory in training if trajectory.n_pairs > step]
         positions.append(np.mean([pose[0][step] for pose in known], axis=0))
         rotations.append(mean_rotation(np.stack([pose[1][step] for pose in known])))
     return np.stack(positions), np.stack(rotations)
@@ -52,21 +59,24 @@ class Known:
 
 
 def ridge_poses(training: Known, validation: Known, features: list[Array]) -> list[Pose]:
-    """Poses from features (pairs, inputs) of each test trajectory by ridge regression fitted to the training pairs.
+    """Poses by ridge regression, fitted to the training pairs, from features (pairs, inputs) of each test trajectory.
 
-    Features are standardised. The penalty is the one of the lowest squared error of position on validation.
+    Features are standardised. The penalty is the one with the lowest squared error of position on validation.
     """
-    position_m, rotation = (np.concatenate([one.pose[i] for one in training.trajectories]) for i in range(2))
-    turn = mean_rotation(rotation)
-    targets = np.concatenate([position_m, rotation_vectors(rotation @ turn.T)], axis=1)
+    position_m, rotation_camera_from_site = (
+        np.concatenate([trajectory.pose[i] for trajectory in training.trajectories]) for i in range(2)
+    )
+    turn = mean_rotation(rotation_camera_from_site)
+    targets = np.concatenate([position_m, rotation_vectors(rotation_camera_from_site @ turn.T)], axis=1)
     fit = _Ridge(np.concatenate(training.features), targets)
-    known = np.concatenate([one.pose[0] for one in validation.trajectories])
+    known = np.concatenate([trajectory.pose[0] for trajectory in validation.trajectories])
     unseen = fit.projected(np.concatenate(validation.features))
     costs = [np.sum((fit.targets(unseen, penalty)[:, :3] - known) ** 2) for penalty in _PENALTIES]
     best = _PENALTIES[int(np.argmin(costs))]
-    found = [fit.targets(fit.projected(one), best) for one in features]
+    predicted = [fit.targets(fit.projected(trajectory_features), best) for trajectory_features in features]
     return [
-        (one[:, :3], np.stack([matrix_from_rotation_vector(vector) @ turn for vector in one[:, 3:]])) for one in found
+        (target[:, :3], np.stack([matrix_from_rotation_vector(vector) @ turn for vector in target[:, 3:]]))
+        for target in predicted
     ]
 
 
@@ -77,7 +87,7 @@ class _Ridge:
         self.mean, spread = features.mean(0), features.std(0)
         self.scale = np.maximum(np.maximum(spread, 0.1 * spread.mean()), 1e-12)
         self.centre, standard = targets.mean(0), self._standardised(features)
-        # With more features than pairs the matrix of inner products is the smaller one.
+        # With more features than pairs, the matrix of inner products is the smaller one.
         self.known = standard if features.shape[1] > len(features) else None
         gram = standard @ standard.T if self.known is not None else standard.T @ standard
         self.values, self.vectors = np.linalg.eigh(gram.astype(np.float64))

@@ -1,4 +1,4 @@
-"""The evaluation of a run that learned the pose in O_L, beside its floors."""
+"""Evaluation of a run that learned the pose in O_L, together with its floors."""
 
 import time
 from typing import Any
@@ -38,46 +38,52 @@ def evaluate_pose_run(
 ) -> None:
     """Evaluate the best weights of a run on the test trajectories; write the tables and print the page."""
     device = torch.device(choose_device(task.settings.device))
-    test = [one for one in trajectories if one.split == "test"]
+    test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     network, architecture = load_navigator(run.best, "stack")
     network.to(device)
     started = time.monotonic()
-    poses: dict[str, list[Pose]] = {"stack": [predict_pose(network, architecture, one) for one in test]}
-    pairs, seconds = sum(one.n_pairs for one in test), time.monotonic() - started
-    poses |= mean_poses([one for one in trajectories if one.split == "train"], test)
+    poses: dict[str, list[Pose]] = {"stack": [predict_pose(network, architecture, trajectory) for trajectory in test]}
+    pairs, seconds = sum(trajectory.n_pairs for trajectory in test), time.monotonic() - started
+    poses |= mean_poses([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     if task.stores and backbone is not None:
-        poses["ridge"] = _ridge(task, backbone, [one.shrunk(task.own.size_px) for one in test], device)
+        poses["ridge"] = _ridge(task, backbone, [trajectory.shrunk(task.own.size_px) for trajectory in test], device)
     _, seconds_by_pairs = predict_pose_by_pairs(network.cpu(), architecture, test[0])
-    own: Metrics = {
+    measured: Metrics = {
         "test/pairs": pairs,
         "test/ms_per_pair": round(1e3 * seconds / pairs, 2),
         "test/ms_per_single_pair": round(1e3 * seconds_by_pairs, 2),
         "network/parameters": sum(p.numel() for p in network.parameters()),
     }
-    say_page(write_pose_evaluation(run.root, "stack", "test", test, poses, own | details))
+    say_page(write_pose_evaluation(run.root, "stack", "test", test, poses, measured | details))
 
 
 def _ridge(
     task: NavigationTask, backbone: dict[str, Tensor], test: list[Trajectory], device: torch.device
 ) -> list[Pose]:
-    """Poses by ridge regression on the features of the backbone as the detector gave it."""
+    """Poses by ridge regression on the features of the detector's backbone, before training."""
     frozen: Any = build(task.architecture)
     frozen.backbone.load_state_dict(backbone, strict=False)
-    # The coarse stage stored its features at this scale.
+    # Scale features as the coarse stage did when it stored them.
     for name in ("feature_mean", "feature_spread"):
         getattr(frozen, name).copy_(getattr(task.network, name))
     frozen.to(device, memory_format=torch.channels_last)
     bf16 = choose_bf16(task.settings.precision, device.type)
 
-    def features(own: list[Trajectory]) -> list[Array]:
-        return [frozen.scaled(one).cpu().numpy() for one in stored_features(frozen, own, device, bf16)]
+    def features(some_trajectories: list[Trajectory]) -> list[Array]:
+        return [
+            frozen.scaled(features).cpu().numpy()
+            for features in stored_features(frozen, some_trajectories, device, bf16)
+        ]
 
     numbers = task.share.of(len(task.training_trajectories))
     training = [task.training_trajectories[number] for number in numbers]
     validation = [task.validation_trajectories[number] for number in task.validated]
     known = {}
-    for split, own in (("train", training), ("val", validation)):
-        # Features of views come after those of the trajectories.
-        stored = [one[: sum(t.n_pairs for t in own)].cpu().numpy() for one in task.stored.get(split, [])]
-        known[split] = Known(own, stored or features(own))
+    for split, split_trajectories in (("train", training), ("val", validation)):
+        # Features of views follow the features of the trajectories.
+        stored = [
+            split_features[: sum(t.n_pairs for t in split_trajectories)].cpu().numpy()
+            for split_features in task.stored.get(split, [])
+        ]
+        known[split] = Known(split_trajectories, stored or features(split_trajectories))
     return ridge_poses(known["train"], known["val"], features(test))

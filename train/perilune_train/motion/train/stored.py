@@ -1,4 +1,4 @@
-"""Features of a frozen backbone, computed once: a coarse epoch then trains the recurrent layers only."""
+"""Features of a frozen backbone, computed once: a coarse epoch then trains only the recurrent layers."""
 
 from collections.abc import Sequence
 
@@ -20,15 +20,14 @@ def stored_features(
     bf16: bool,
     views: Sequence[Trajectory] = (),
 ) -> list[Tensor]:
-    """Averages (pairs, inputs), float32, of the frozen backbone's features of all pairs of each trajectory.
+    """Averages (pairs, inputs), float32, of the frozen backbone's features over all pairs of each trajectory.
 
-    Those of `views`, further versions of the trajectories in the same order (`other_views`), come after them. The
-    backbone is in evaluation mode, and each frame has one warp, so the features are those of every coarse epoch. They
-    stay on the device.
+    Features of `views`, further versions of the trajectories in equal order (`other_views`), follow. The backbone is in
+    evaluation mode and each frame has one warp, so all coarse epochs have equal features. They stay on the device.
     """
     modes = [(module, module.training) for module in network.backbone.modules()]
     network.backbone.eval()
-    found = []
+    features = []
     with progress_bar() as progress, torch.autocast(device.type, torch.bfloat16, enabled=bf16):
         total = sum(trajectory.n_pairs for trajectory in [*trajectories, *views])
         bar = progress.add_task("backbone", total=total, unit="pairs", note="")
@@ -39,7 +38,7 @@ def stored_features(
             for part in pooled_features(network, torch.from_numpy(trajectory.images), warp):
                 parts.append(part.float())
                 progress.advance(bar, len(part))
-            found.append(torch.cat(parts))
+            features.append(torch.cat(parts))
     for module, training in modes:
         module.training = training
-    return found
+    return features

@@ -1,7 +1,7 @@
 """Training of the navigation networks."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import lightning
@@ -20,7 +20,7 @@ from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.streamed import StreamedSequences
 from perilune_train.motion.data.trajectories import Motion, Pose, Trajectory, own_trajectories
 from perilune_train.motion.geometry import euler_from_rotation
-from perilune_train.motion.metrics.metrics import motion_errors, pose_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, pose_errors, summary
 from perilune_train.motion.network import (
     Batch,
     Collate,
@@ -34,14 +34,14 @@ from perilune_train.motion.network import (
 from perilune_train.motion.pose import predict_pose
 from perilune_train.motion.train.stored import stored_features
 from perilune_train.motion.train.views import other_views
-from perilune_train.motion.train.windows import WindowPlaces, Windows, collated
+from perilune_train.motion.train.windows import OutputUnits, WindowPlaces, Windows, collated
 from perilune_train.records.provenance import Provenance
 from perilune_train.training.runs import choose_bf16, choose_device
 
 _OF_STACK = ("target", "pool", "stages", "dropout", "sequence_pairs")
 """Settings in the architecture of a stack network."""
 _VALIDATIONS = 10
-"""About so many validations of a coarse stage on stored features, whose epochs take a second or less."""
+"""Approximate number of validations of a coarse stage on stored features, whose epochs take a second or less."""
 _WARM_STEPS = 50
 
 
@@ -69,13 +69,28 @@ def learning_rate_factor(
 def axis_weights(scales: Scales, target: Target) -> Tensor:
     """Weights (3,) of the standardised errors of the axes in the loss.
 
-    Positions spread over hundreds of metres along the descent and over a few across it. Equal weights then leave the
-    first inaccurate, and errors in metres the second. The weights are the geometric mean of both.
+    Positions spread over hundreds of metres along the descent and over a few metres across it. Equal weights of
+    standardised errors would leave the first inaccurate, equal weights of errors in metres the second. The weights are
+    the geometric mean of both.
     """
     if target == "motion":
         return torch.ones(3)
     spread_m = torch.tensor(scales.spread_m)
     return (spread_m / spread_m.square().mean().sqrt()).sqrt()
+
+
+@dataclass(frozen=True, slots=True)
+class Initial:
+    """What a training starts from in place of random weights and measured scales."""
+
+    backbone: dict[str, Tensor] | None = None
+    """Weights of a detector's backbone, by name."""
+    scales: Scales | None = None
+    """Scales of a network whose weights are loaded later."""
+
+
+RANDOM = Initial()
+"""Random weights; scales measured on the training trajectories."""
 
 
 class NavigationTask(lightning.LightningModule):
@@ -97,17 +112,16 @@ class NavigationTask(lightning.LightningModule):
         settings: NavigateConfig,
         fusion: Fusion,
         trajectories: list[Trajectory],
-        pretrained: dict[str, Tensor] | None = None,
         share: Share = ALONE,
         stream: Stream | None = None,
-        scales: Scales | None = None,
+        initial: Initial = RANDOM,
     ):
         super().__init__()
         self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
         # Initial weights predict motions on the scales of their own training.
-        training = [one for one in trajectories if one.split == "train"]
-        self.scales = scales or Scales.measured(training, fusion, self.own.target)
+        training = [trajectory for trajectory in trajectories if trajectory.split == "train"]
+        self.scales = initial.scales or Scales.measured(training, fusion, self.own.target)
         self.architecture = {
             "fusion": fusion,
             "size_px": self.own.size_px,
@@ -124,15 +138,17 @@ class NavigationTask(lightning.LightningModule):
         self.network = network.to(memory_format=torch.channels_last)
         self.axis_weights: Tensor
         self.register_buffer("axis_weights", axis_weights(self.scales, self.own.target), persistent=False)
-        self.pretrained = frozenset(pretrained or ())
-        if pretrained:
-            self.network.backbone.load_state_dict(pretrained, strict=False)
+        self.pretrained = frozenset(initial.backbone or ())
+        if initial.backbone:
+            self.network.backbone.load_state_dict(initial.backbone, strict=False)
         self.provenance: Provenance | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.share = share
-        self.training_trajectories = [one.shrunk(self.own.size_px) for one in training]
+        self.training_trajectories = [trajectory.shrunk(self.own.size_px) for trajectory in training]
         self.views = other_views(self.training_trajectories, self.own.views, self.own.view_spread, settings.seed)
-        self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
+        self.validation_trajectories = [
+            trajectory.shrunk(self.own.size_px) for trajectory in trajectories if trajectory.split == "val"
+        ]
         given = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
         self.stores = fusion == "stack" and given and self.own.coarse_epochs > 0
         self.stored: dict[str, list[Tensor]] = {}
@@ -144,7 +160,7 @@ class NavigationTask(lightning.LightningModule):
         self.sequences = self._sequences()
 
     def close(self) -> None:
-        """End what runs beside the training."""
+        """Stop the thread that renders sequences."""
         if isinstance(self.sequences, StreamedSequences):
             self.sequences.close()
 
@@ -167,21 +183,20 @@ class NavigationTask(lightning.LightningModule):
         return self.current_epoch < self.own.coarse_epochs
 
     def _sequences(self) -> TrainingSequences:
-        own: dict[str, Any] = {
+        options: dict[str, Any] = {
             "warp": self.fusion == "warp",
-            "augmented": self.fusion == "warp",
             "jitter": self.jitter,
             "seed": self.settings.seed,
             "share": self.share,
         }
-        place = self.training_trajectories, self.own.sequence_pairs
+        trajectories_and_length = self.training_trajectories, self.own.sequence_pairs
         if self.fusion == "stack":
-            places = WindowPlaces(*place, **own)
+            places = WindowPlaces(*trajectories_and_length, **options)
             places.views = self.own.views
             return places
         if self.stream is None:
-            return TrainingSequences(*place, **own)
-        return StreamedSequences(self.stream, self.own.size_px, *place, **own)
+            return TrainingSequences(*trajectories_and_length, **options)
+        return StreamedSequences(self.stream, self.own.size_px, *trajectories_and_length, **options)
 
     def train_dataloader(self) -> DataLoader:
         # The current epoch is one too low here if the run is resumed.
@@ -196,8 +211,8 @@ class NavigationTask(lightning.LightningModule):
         return batch_loader(self.sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
     def val_dataloader(self) -> DataLoader:
-        own = [self.validation_trajectories[number] for number in self.validated]
-        return DataLoader(own, batch_size=None)  # type: ignore[arg-type]
+        trajectories = [self.validation_trajectories[number] for number in self.validated]
+        return DataLoader(trajectories, batch_size=None)  # type: ignore[arg-type]
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         if isinstance(batch, Tensor):
@@ -230,7 +245,8 @@ class NavigationTask(lightning.LightningModule):
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
-            self.windows = Windows(*place, self.scales, self.own.target, self.device, self.views)
+            units = OutputUnits(self.own.target, self.scales)
+            self.windows = Windows(*place, units, self.device, self.views)
         stores, last = self.coarse and self.stores, self.current_epoch + 1 == self.own.coarse_epochs
         if stores and not self.stored:
             self._store()
@@ -246,19 +262,21 @@ class NavigationTask(lightning.LightningModule):
         validation = [self.validation_trajectories[number] for number in self.validated]
         bf16 = choose_bf16(self.settings.precision, self.device.type)
         pooled = [
-            stored_features(self.network, own, self.device, bf16, others)
-            for own, others in ((training, views), (validation, ()))
+            stored_features(self.network, split_features, self.device, bf16, others)
+            for split_features, others in ((training, views), (validation, ()))
         ]
         if self.network.standardised:
             self.network.measure(torch.cat(pooled[0]))
-        train, val = ([self.network.scaled(one) for one in own] for own in pooled)
+        train, val = (
+            [self.network.scaled(pair_features) for pair_features in split_features] for split_features in pooled
+        )
         self.stored = {"train": [torch.cat(train)], "val": val}
 
     def _loss(self, output: Tensor, true_position: Tensor, true_angles: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of the stage, and its parts."""
-        found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
+        angles = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
         position = ((output[..., :3] - true_position) * self.axis_weights).square().sum(-1).mean()
-        orientation = (found - true_angles).square().sum(-1).mean()
+        orientation = (angles - true_angles).square().sum(-1).mean()
         if self.coarse:
             loss = position + self.settings.kappa * orientation
         else:
@@ -279,12 +297,12 @@ class NavigationTask(lightning.LightningModule):
         return loss
 
     def _stack_step(self, places: Tensor, batch_idx: int) -> Tensor:
-        """The step of a stack network on the sequences at some places (see `Windows`)."""
+        """A training step of a stack network on the sequences at `places` (see `Windows`)."""
         assert self.windows is not None
         if self.own.dropout:
-            # A resumed run has the same dropout.
-            place = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
-            torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0]))
+            # Seed the dropout, so that a resumed run draws the same.
+            seeds = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
+            torch.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]))
         pairs = self.windows.pairs(places)
         if self.coarse and self.stores:
             output, _ = self.network.recurrent(self.stored["train"][0][pairs])
@@ -326,7 +344,7 @@ class NavigationTask(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         steps = -(-len(self.train_dataloader()) // self.own.accumulate)
-        # The two loss weights must change by about 1 during the run, whatever the learning rate of the network is.
+        # The two loss weights must change by about 1 during the run, whatever the learning rate of the network.
         rate, factor = self.own.learning_rate, self.own.backbone_factor
         slower = {f"backbone.{name}" for name in self.pretrained} if factor < 1 else set()
         named = list(self.network.named_parameters())
@@ -339,13 +357,13 @@ class NavigationTask(lightning.LightningModule):
             groups.append({"params": own_values, "lr": factor * rate, "weight_decay": 1e-3})
         optimizer = torch.optim.AdamW(
             groups,
-            # One pass over memory: ten times as fast on a CPU, where it is half of a step on stored features.
+            # Fused: one pass over memory, ten times as fast on a CPU, where it is half of a step on stored features.
             fused=True,
         )
-        own = self.own
-        coarse = own.coarse_learning_rate and own.coarse_learning_rate / own.learning_rate
-        stages = own.coarse_epochs * steps, own.fine_epochs * steps
+        settings = self.own
+        coarse = settings.coarse_learning_rate and settings.coarse_learning_rate / settings.learning_rate
+        stages = settings.coarse_epochs * steps, settings.fine_epochs * steps
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: learning_rate_factor(step, *stages, own.cycles, coarse)
+            optimizer, lambda step: learning_rate_factor(step, *stages, settings.cycles, coarse)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

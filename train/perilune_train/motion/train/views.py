@@ -15,44 +15,52 @@ from perilune_train.motion.metrics.floors import mean_poses
 def other_views(trajectories: list[Trajectory], count: int, spread: float, seed: int) -> list[Trajectory]:
     """`count` further versions of each training trajectory: all of the first version, then all of the second one.
 
-    A version has the poses of its view; its images are still those of the original. The pose of each frame is moved by
-    `spread` times the deviation of a random descent from the mean pose of that frame, with a random sign for each axis
-    of position and attitude. So the moves of a sequence are as large and change as smoothly as those of the descents.
+    A version has other poses; its images are still those of the original. The pose of each frame is moved by `spread`
+    times the deviation of a random descent from the mean pose of that frame, with a random sign for each axis of
+    position and attitude. So moves are as large, and change as smoothly along a sequence, as the deviations of real
+    descents.
     """
     deviations, versions = _deviations(trajectories) if count else [], []
     for version in range(count):
-        for number, own in enumerate(trajectories):
+        for number, trajectory in enumerate(trajectories):
             rng = np.random.default_rng([seed, version, number])
             moves = spread * rng.choice([-1.0, 1.0], 6) * deviations[rng.integers(len(deviations))]
-            # Beyond the end of the other descent its last deviation stays.
-            moves = moves[np.minimum(np.arange(len(own.position_m)), len(moves) - 1)]
-            turns = np.stack([matrix_from_rotation_vector(one) for one in moves[:, 3:]])
-            rotation = turns @ own.rotation_camera_from_site
-            versions.append(replace(own, position_m=own.position_m + moves[:, :3], rotation_camera_from_site=rotation))
+            # Beyond the end of the other descent, repeat its last deviation.
+            moves = moves[np.minimum(np.arange(len(trajectory.position_m)), len(moves) - 1)]
+            turns = np.stack([matrix_from_rotation_vector(vector) for vector in moves[:, 3:]])
+            rotation_camera_from_site = turns @ trajectory.rotation_camera_from_site
+            versions.append(
+                replace(
+                    trajectory,
+                    position_m=trajectory.position_m + moves[:, :3],
+                    rotation_camera_from_site=rotation_camera_from_site,
+                )
+            )
     return versions
 
 
 def _deviations(trajectories: list[Trajectory]) -> list[Array]:
     """Each trajectory's deviation (n, 6) from the mean pose of each frame: metres in O_L, rotation vector in O_C."""
-    found = []
-    for own, (position_m, rotation) in zip(
+    deviations = []
+    for trajectory, (position_m, rotation) in zip(
         trajectories, mean_poses(trajectories, trajectories)["mean_pose_at_frame"], strict=True
     ):
-        turns = rotation_vectors(own.pose[1] @ np.swapaxes(rotation, 1, 2))
-        pairs = np.concatenate([own.pose[0] - position_m, turns], axis=1)
-        # Poses are those of the later frames of pairs. The first frame moves like the second one.
-        found.append(np.concatenate([pairs[:1], pairs]))
-    return found
+        turns = rotation_vectors(trajectory.pose[1] @ np.swapaxes(rotation, 1, 2))
+        pairs = np.concatenate([trajectory.pose[0] - position_m, turns], axis=1)
+        # Poses belong to the later frames of pairs. The first frame moves like the second one.
+        deviations.append(np.concatenate([pairs[:1], pairs]))
+    return deviations
 
 
 def view_homographies(trajectory: Trajectory, view: Trajectory) -> Tensor:
-    """Homographies (n, 3, 3), float32, from image coordinates of a view's frames to those of the trajectory's frames.
+    """Homographies (n, 3, 3), float32, from image coordinates of a view's frames to image coordinates of the
+    trajectory's.
 
-    They are exact for points of the mean ground plane, z = 0 of O_L. A point h above it appears off by about
-    f h m / a^2 pixels, for a move by m metres, altitude a and focal length f.
+    They are exact for points of the mean ground plane, z = 0 of O_L. A point h above it is displaced by about f h m /
+    a^2 pixels, for a move by m metres, altitude a and focal length f.
     """
-    own, other = (
-        ground_homography(trajectory.camera.matrix, one.position_m, one.rotation_camera_from_site)
-        for one in (trajectory, view)
+    from_ground, other = (
+        ground_homography(trajectory.camera.matrix, poses.position_m, poses.rotation_camera_from_site)
+        for poses in (trajectory, view)
     )
-    return torch.from_numpy(own @ np.linalg.inv(other)).float()
+    return torch.from_numpy(from_ground @ np.linalg.inv(other)).float()

@@ -1,10 +1,11 @@
-"""Training sequences of a stack network on the training device: frames, features and truths gathered by their places.
+"""Training sequences of a stack network on the training device, gathered from frames, features and truths by index.
 
-Nothing is prepared for a step but the places of its sequences, so that a GPU waits for nothing. With views
-(navigate/train/views.py), version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
+Only the indices of a step's sequences are prepared, so that a GPU does not wait. With views (motion/train/views.py),
+version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,36 +20,46 @@ from perilune_train.motion.pose import normalised_frames, warped_frames
 from perilune_train.motion.train.views import view_homographies
 
 _LARGEST_SHARE = 0.25
-"""Share of the free memory of a GPU that frames may take; more stay in the memory of the machine."""
+"""Share of a GPU's free memory that frames may take; larger sets stay in the memory of the machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutputUnits:
+    """What a stack network outputs, and in which units."""
+
+    target: Target
+    """Motion of the camera, or pose at the later frame."""
+    scales: Scales
+    """Scales between standardised outputs and metres or radians."""
 
 
 class WindowPlaces(TrainingSequences):
-    """The places of training sequences: number of the trajectory and first pair.
+    """Indices of training sequences: number of the trajectory and first pair.
 
-    With `views`, each sequence is of a version of its trajectory that is drawn at random.
+    With `views`, each sequence uses a random version of its trajectory.
     """
 
     views: int = 0
-    """Number of versions beside the trajectories themselves."""
+    """Number of versions in addition to the trajectories themselves."""
 
     def __getitem__(self, key: Key) -> tuple[int, int]:  # type: ignore[override]
-        epoch, place, number, start = key
+        epoch, position, number, start = key
         if not self.views:
             return number, start
-        version = int(np.random.default_rng([self.seed, epoch, place]).integers(self.views + 1))
+        version = int(np.random.default_rng([self.seed, epoch, position]).integers(self.views + 1))
         return version * len(self.trajectories) + number, start
 
 
 def collated(places: list[tuple[int, int]]) -> Tensor:
-    """Places as a tensor (batch, 2)."""
+    """Indices as a tensor (batch, 2)."""
     return torch.tensor(places)
 
 
 class Windows:
-    """Sequences of `n_pairs` consecutive pairs of some of the trajectories, which `numbers` has, and of their views.
+    """Sequences of `n_pairs` consecutive pairs of the trajectories `numbers`, and of their views.
 
-    `views` are further versions of all trajectories, as `other_views` gives them. `places` (batch, 2) are number of the
-    trajectory and first pair, on the device.
+    `views` are further versions of all trajectories, from `other_views`. `places` (batch, 2), on the device, are number
+    of the trajectory and first pair.
     """
 
     def __init__(
@@ -56,18 +67,17 @@ class Windows:
         trajectories: Sequence[Trajectory],
         numbers: Sequence[int],
         n_pairs: int,
-        scales: Scales,
-        target: Target,
+        units: OutputUnits,
         device: torch.device,
         views: Sequence[Trajectory] = (),
     ):
-        own = [trajectories[number] for number in numbers]
+        chosen = [trajectories[number] for number in numbers]
         count, versions = len(trajectories), 1 + len(views) // len(trajectories)
-        self.images, self.device = [one.images for one in own], device
+        self.images, self.device = [trajectory.images for trajectory in chosen], device
         self.frames: Tensor | None = None
         every = [*trajectories, *views]
         numbers = [version * count + number for version in range(versions) for number in numbers]
-        truths = [truth(every[number], scales, target) for number in numbers]
+        truths = [truth(every[number], units) for number in numbers]
         self.position, self.angles = (torch.cat(parts).to(device) for parts in zip(*truths, strict=True))
         """Standardised truths (pairs of all versions of all trajectories, 3)."""
         self.steps = torch.arange(n_pairs + 1, device=device)
@@ -75,7 +85,7 @@ class Windows:
         sizes = [(every[number].n_pairs, every[number].n_pairs + 1) for number in numbers]
         before[numbers] = np.cumsum([(0, 0), *sizes], axis=0)[:-1]
         self.first_pair, self.first_frame = torch.from_numpy(before).to(device).unbind(1)
-        self.n_frames = sum(one.n_pairs + 1 for one in own)
+        self.n_frames = sum(trajectory.n_pairs + 1 for trajectory in chosen)
         self.homographies = (
             torch.cat([view_homographies(trajectories[number % count], every[number]) for number in numbers]).to(device)
             if views
@@ -108,12 +118,13 @@ class Windows:
         return frames.to(self.device)
 
 
-def truth(trajectory: Trajectory, scales: Scales, target: Target) -> tuple[Tensor, Tensor]:
+def truth(trajectory: Trajectory, units: OutputUnits) -> tuple[Tensor, Tensor]:
     """What a stack network should output for the pairs of a trajectory: positions and Euler angles (pairs, 3).
 
-    Both are standardised: translations or positions by mean and spread, angles by `rotation_rad` of `scales`.
+    Both are standardised: translations or positions by mean and spread, angles by `rotation_rad` of the scales.
     """
-    position_m, rotation = trajectory.pose if target == "pose" else trajectory.motion
+    scales = units.scales
+    position_m, rotation = trajectory.pose if units.target == "pose" else trajectory.motion
     if scales.mean_rotation is not None:
         rotation = rotation @ np.array(scales.mean_rotation).T
     position = (torch.from_numpy(position_m) - torch.tensor(scales.mean_m)) / torch.tensor(scales.spread_m)

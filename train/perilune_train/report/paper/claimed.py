@@ -6,7 +6,7 @@ DETECTION = {
 }
 """Table II."""
 TARGET_AP = DETECTION["YOLOv3"]["ap50_paper"]
-"""AP of YOLOv3 without attention, by which the headline ground is chosen."""
+"""AP of YOLOv3 without attention; it selects the headline ground."""
 NAVIGATION = {
     "Darknet53-LSTM": {"position_m": 7.61, "orientation_deg": 1.1e-2, "seconds": 0.22},
     "attention-Darknet53-LSTM": {"position_m": 1.14, "orientation_deg": 5.5e-3, "seconds": 0.22},
@@ -19,7 +19,7 @@ DEEP_ALIKE_GATES = ("B_48", "B_51", "B_52", "B_53", "B_54")
 """Gates with PCC2 above `DEEP_ALIKE`."""
 DEEP_ALIKE = 0.75
 MODERATE = 0.3
-"""Smallest correlation that we call moderate; the paper gives no number (Cohen 1988 has 0.3 to 0.5)."""
+"""Smallest correlation that we call moderate; the paper gives no number (Cohen 1988: 0.3 to 0.5)."""
 MOTION_GATES = ("B_11", "B_21", "B_22", "B_31", "B_32", "B_34")
 """Gates with PCC4 above PCC3."""
 STILL_GATES = ("B_37", "B_38", *(f"B_4{k}" for k in range(1, 9)), *(f"B_5{k}" for k in range(1, 5)))

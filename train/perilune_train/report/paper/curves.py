@@ -25,14 +25,14 @@ _ERRORS = {"position_error_m": "position error (m)", "orientation_error_deg": "o
 
 
 def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -> None:
-    """Draw AP of YOLOv3 against equilibrium_share, one place for each run; mark the paper's AP and the headline."""
+    """Draw AP of YOLOv3 against equilibrium_share, evenly spaced by run; mark the paper's AP and the headline."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     shares = list(curve)
     for key, name in _AP_LINES.items():
         heights = [curve[share].get(key) for share in shares]
-        known = [(place, value) for place, value in enumerate(heights) if isinstance(value, int | float)]
-        axes.plot([place for place, _ in known], [value for _, value in known], marker="o", label=name)
+        known = [(position, value) for position, value in enumerate(heights) if isinstance(value, int | float)]
+        axes.plot([position for position, _ in known], [value for _, value in known], marker="o", label=name)
     axes.axhline(TARGET_AP, color="black", linestyle="--", label=f"the paper's YOLOv3, {TARGET_AP:.3f}")
     if headline in shares:
         axes.axvline(shares.index(headline), color="gray", linestyle=":", label="headline ground")
@@ -44,7 +44,7 @@ def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -
 
 
 def learning_curve(run: Path, key: str) -> list[float]:
-    """Values of a metric at each validation, from a run's TensorBoard events; of a repeated step, the last one."""
+    """Values of a metric at each validation, from a run's TensorBoard events; the last value of a repeated step."""
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -58,18 +58,18 @@ def learning_curve(run: Path, key: str) -> list[float]:
 
 
 def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]]]) -> bool:
-    """Draw learning curves, one panel for each title, of a metric's key and runs by name; whether there are any."""
+    """Draw learning curves of a metric, one panel for each title, by run; returns whether there are any."""
     values = {
-        title: {name: own for name, run in runs.items() if (own := learning_curve(run, key))}
+        title: {name: heights for name, run in runs.items() if (heights := learning_curve(run, key))}
         for title, (key, runs) in panels.items()
     }
-    values = {title: own for title, own in values.items() if own}
+    values = {title: heights for title, heights in values.items() if heights}
     if not values:
         return False
     figure = Figure(figsize=(6 * len(values), 4.5), layout="constrained")
     for axes, (title, curves) in zip(figure.subplots(1, len(values), squeeze=False)[0], values.items(), strict=True):
-        for name, own in curves.items():
-            axes.plot(range(1, len(own) + 1), own, marker="o", label=name)
+        for name, heights in curves.items():
+            axes.plot(range(1, len(heights) + 1), heights, marker="o", label=name)
         axes.set(xlabel="validation", ylabel=_TITLES[panels[title][0]], title=title)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
@@ -79,7 +79,7 @@ def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]
 
 
 def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]]) -> bool:
-    """Draw errors along the first test trajectory, one row for each reading, of errors.parquet by network.
+    """Draw errors along the first test trajectory, one row for each reading, from errors.parquet by network.
 
     Returns whether there are any.
     """
@@ -87,16 +87,16 @@ def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]
         reading: {network: _first_trajectory(file) for network, file in files.items() if file.is_file()}
         for reading, files in readings.items()
     }
-    tables = {reading: own for reading, own in tables.items() if own}
+    tables = {reading: errors for reading, errors in tables.items() if errors}
     if not tables:
         return False
     figure = Figure(figsize=(12, 4.5 * len(tables)), layout="constrained")
     grid = figure.subplots(len(tables), 2, squeeze=False)
-    for row, (reading, own) in zip(grid, tables.items(), strict=True):
+    for row, (reading, errors) in zip(grid, tables.items(), strict=True):
         for axes, (column, title) in zip(row, _ERRORS.items(), strict=True):
-            for network, table in own.items():
+            for network, table in errors.items():
                 axes.plot(table["step"], table[column], label=network)
-            name = "/".join(next(iter(own.values()))[_TRAJECTORY].iloc[0])
+            name = "/".join(next(iter(errors.values()))[_TRAJECTORY].iloc[0])
             axes.set(xlabel="step", title=f"{reading}: {title}, {name}")
             axes.grid(alpha=0.3)
             axes.legend()
@@ -106,5 +106,5 @@ def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]
 
 def _first_trajectory(file: Path) -> pd.DataFrame:
     table = pd.read_parquet(file)
-    own = table[table["method"] == "stack"]
-    return own[(own[_TRAJECTORY] == own[_TRAJECTORY].iloc[0]).all(axis=1)]
+    rows = table[table["method"] == "stack"]
+    return rows[(rows[_TRAJECTORY] == rows[_TRAJECTORY].iloc[0]).all(axis=1)]

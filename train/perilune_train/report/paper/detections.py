@@ -1,4 +1,4 @@
-"""Detections that a finished detect run wrote for its test split: sizes, and pictures as in the paper."""
+"""Detections that a finished detect run wrote for its test split: sizes, and pictures like the paper's."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +37,7 @@ class Detected:
 def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
     """Read a run's detections. Raises UserError if they are missing, damaged or of other frames.
 
-    `trained` is the folder of the network's run, by default `run`; it has the settings and the threshold.
+    `trained` is the folder of the network's training, by default `run`; it has the settings and the threshold.
     """
     trained = trained or run
     split = load_split(open_single(dataset), "test", config_of_run(trained).labels)
@@ -55,7 +55,7 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
         if len(unusable):
             raise UserError(path, name, unusable.iloc[0], "finite numbers")
     table = table[table["score"] >= chosen_threshold(trained)]
-    of_frame = {str(name): own for name, own in table.groupby("frame_id")}
+    of_frame = {str(name): rows for name, rows in table.groupby("frame_id")}
     names = split.frames.table["frame_id"].tolist()
     unknown = set(of_frame) - set(names)
     if unknown:
@@ -77,7 +77,7 @@ class WidthRatio:
 
 
 def width_ratio(detected: Detected) -> WidthRatio | None:
-    """Width of the large craters that were found, relative to the truth; None if none was found."""
+    """Width of the detected large craters, relative to the truth; None if none was detected."""
     split = detected.split
     height, width = split.frames.images.shape[1:]
     sizes = np.tile((width, height), (len(split), 1))
@@ -107,7 +107,7 @@ def width_ratio(detected: Detected) -> WidthRatio | None:
 def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
     """Draw the frames with the smallest and with the largest labels: truth red, detections cyan, as in the paper.
 
-    Both frames have at least a quarter of the most labels that a frame has.
+    Both frames have at least a quarter of the largest number of labels in a frame.
     """
     split = next(iter(by_network.values())).split
     counts = np.array([int(labels.selected.sum()) for labels in split.labels])
@@ -122,14 +122,14 @@ def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
     figure = Figure(figsize=(6 * len(chosen), 6.3 * len(by_network)), layout="constrained")
     axes = np.atleast_2d(figure.subplots(len(by_network), len(chosen), squeeze=False))
     for row, (network, detected) in zip(axes, by_network.items(), strict=True):
-        for one, (what, index) in zip(row, chosen.items(), strict=True):
+        for panel, (what, index) in zip(row, chosen.items(), strict=True):
             image = split.frames.images[index]
-            one.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, image.shape[1], image.shape[0], 0))
+            panel.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, image.shape[1], image.shape[0], 0))
             labels = split.labels[index]
             for boxes, colour in ((labels.boxes[labels.selected], "red"), (detected.found[index].boxes, "cyan")):
                 for x0, y0, x1, y1 in boxes:
-                    one.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.8, color=colour))
-            one.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
-            one.set_title(f"{network}, {what}: {split.frames.table['frame_id'][index]}", fontsize=9)
-            one.axis("off")
+                    panel.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linewidth=0.8, color=colour))
+            panel.set(xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+            panel.set_title(f"{network}, {what}: {split.frames.table['frame_id'][index]}", fontsize=9)
+            panel.axis("off")
     save_figure(path, figure)

@@ -30,7 +30,8 @@ _CORRELATIONS = {
 
 
 def gate_verdicts(explained: Metrics) -> list[Verdict]:
-    """Claims on gates: each holds if it is true of all of its gates, does not hold if of none, and is open otherwise.
+    """Claims on gates: a claim holds if it is true of all of its gates, does not hold if of none, and is open
+    otherwise.
 
     A gate's figure has no interval, so over fewer than `MIN_UNITS` scenes every claim is open.
     """
@@ -39,7 +40,7 @@ def gate_verdicts(explained: Metrics) -> list[Verdict]:
     moved = f"PCC4 is above PCC3 for {', '.join(MOTION_GATES)}"
     still = "PCC3 is above PCC4 from B_37 on"
     craters, alike = _of(explained, "pcc1_background", SHALLOW_CRATER_GATES), _of(explained, "pcc2", DEEP_ALIKE_GATES)
-    found = [
+    verdicts = [
         _judged(explained, (shallow, "figure only"), craters, lambda value: abs(value) >= MODERATE, "pcc1_background"),
         _judged(explained, (deep, f"> {DEEP_ALIKE}"), alike, lambda value: value > DEEP_ALIKE, "pcc2"),
     ]
@@ -48,12 +49,12 @@ def gate_verdicts(explained: Metrics) -> list[Verdict]:
         (still, "< 0", _is_negative, STILL_GATES),
     ):
         for pixels, words in _PIXELS.items():
-            one, other = (_of(explained, f"{measure}{pixels}", gates) for measure in ("pcc4", "pcc3"))
-            difference = {gate: one[gate] - other[gate] for gate in one if gate in other}
+            pcc4, pcc3 = (_of(explained, f"{measure}{pixels}", gates) for measure in ("pcc4", "pcc3"))
+            difference = {gate: pcc4[gate] - pcc3[gate] for gate in pcc4 if gate in pcc3}
             text = f"{claim} (PCC4 - PCC3, {words})", figure
             null = "" if pixels else "pcc4_minus_pcc3"
-            found.append(_judged(explained, text, difference, ok, null))
-    return found
+            verdicts.append(_judged(explained, text, difference, ok, null))
+    return verdicts
 
 
 def _is_positive(value: float) -> bool:
@@ -65,8 +66,8 @@ def _is_negative(value: float) -> bool:
 
 
 def _of(explained: Metrics, measure: str, gates: Sequence[str]) -> dict[str, float]:
-    found = {gate: explained.get(f"{measure}/{gate}") for gate in gates}
-    return {gate: float(value) for gate, value in found.items() if isinstance(value, int | float)}
+    values = {gate: explained.get(f"{measure}/{gate}") for gate in gates}
+    return {gate: float(value) for gate, value in values.items() if isinstance(value, int | float)}
 
 
 def _judged(
@@ -88,29 +89,29 @@ def _judged(
 
 
 def gate_table(explained: Metrics) -> list[str]:
-    """Ranges of PCC1 to PCC4 over all gates, with those of each null, as lines of Markdown."""
+    """Ranges of PCC1 to PCC4 over all gates, with the ranges of each null, as lines of Markdown."""
     rows = []
     for measure, title in _CORRELATIONS.items():
         names = [key.removeprefix(f"{measure}/") for key in explained if key.startswith(f"{measure}/B_")]
-        own = _of(explained, measure, [name for name in names if not name.endswith(("_low", "_high"))])
-        if not own:
+        gates = _of(explained, measure, [name for name in names if not name.endswith(("_low", "_high"))])
+        if not gates:
             continue
         # A gate without nulls has no such key.
-        beats = [bool(one) for gate in own if (one := explained.get(f"{measure}_beats_nulls/{gate}")) is not None]
+        beats = [bool(value) for gate in gates if (value := explained.get(f"{measure}_beats_nulls/{gate}")) is not None]
         beating = f"{sum(beats)} of {len(beats)}" if beats else "-"
-        rows.append([title, _range(list(own.values())), _nulls(explained, measure, own) or "-", beating])
+        rows.append([title, _range(list(gates.values())), _nulls(explained, measure, gates) or "-", beating])
     return table(["correlation", "gates", "nulls", "gates that beat every null"], rows)
 
 
 def _nulls(explained: Metrics, measure: str, gates: dict[str, float]) -> str:
     """Range of each null over the gates; empty without nulls."""
-    found: dict[str, list[float]] = {}
+    nulls: dict[str, list[float]] = {}
     for gate in gates:
         prefix = f"{measure}_null/{gate}/"
         for key, value in explained.items():
             if key.startswith(prefix) and isinstance(value, float):
-                found.setdefault(key.removeprefix(prefix), []).append(value)
-    return ", ".join(f"{null} {_range(values)}" for null, values in found.items())
+                nulls.setdefault(key.removeprefix(prefix), []).append(value)
+    return ", ".join(f"{null} {_range(values)}" for null, values in nulls.items())
 
 
 def _range(values: Sequence[float]) -> str:

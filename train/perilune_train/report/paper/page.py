@@ -50,10 +50,9 @@ _READINGS = {
 def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline_share: str | None = None) -> Path:
     """Write paper.md, paper.json and pictures into the folder of the experiment's runs; returns the page.
 
-    `dataset` is the detection dataset of the headline ground. `about` are lines that say how the experiment was made
-    and what was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the
-    curve with the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is
-    finished.
+    `dataset` is the detection dataset of the headline ground. `about` are lines on how the experiment was run and what
+    was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the curve with
+    the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is finished.
     """
     runs = PaperRuns(root)
     if not root.is_dir():
@@ -64,9 +63,9 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
     share = headline_share or nearest_share(runs.curve())
     detected = _detected(runs, dataset)
     attended = detected.get("attention-yolov3")
-    found = verdicts(runs, None if attended is None else width_ratio(attended))
+    answers = verdicts(runs, None if attended is None else width_ratio(attended))
     sections = {
-        "Claims": _claims(found),
+        "Claims": _claims(answers),
         "Table II: crater detection": _table_2(runs),
         "Density of craters": _curve(runs, share),
         "Detections": _detections(root, detected),
@@ -79,16 +78,18 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
     lines = ["# The paper's experiment", "", lead(runs, share, given=headline_share is not None)]
     if settings := [f"- {line}" for line in (*about, *_settings(runs))]:
         lines += ["", *settings]
-    for title, own in sections.items():
-        lines += ["", f"## {title}", "", *own]
+    for title, content in sections.items():
+        lines += ["", f"## {title}", "", *content]
     write_markdown(root / PAGE, "\n".join([*lines, ""]))
-    write_metrics(root, _figures(read, found), FIGURES)
+    write_metrics(root, _figures(read, answers), FIGURES)
     return root / PAGE
 
 
 def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
     """Detections of the finished trainings on the headline ground, by network."""
-    folders = {network: runs.detector(detect_name(network)) for network, own in runs.detections().items() if own}
+    folders = {
+        network: runs.detector(detect_name(network)) for network, trainings in runs.detections().items() if trainings
+    }
     return {
         network: read_detections(folder, dataset)
         for network, folder in folders.items()
@@ -98,7 +99,7 @@ def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
 
 def _settings(runs: PaperRuns) -> list[str]:
     """Settings of the detectors on the headline ground, from the first finished one."""
-    folders = [runs.detector(detect_name(network)) for network, own in runs.detections().items() if own]
+    folders = [runs.detector(detect_name(network)) for network, trainings in runs.detections().items() if trainings]
     known = [folder for folder in folders if (folder / "config.yaml").is_file()]
     if not known:
         return []
@@ -113,16 +114,21 @@ def _settings(runs: PaperRuns) -> list[str]:
     ]
 
 
-def _claims(found: list[Verdict]) -> list[str]:
-    answers = [one.answer for one in found]
+def _claims(answered: list[Verdict]) -> list[str]:
+    answers = [verdict.answer for verdict in answered]
     counted = ", ".join(f"{answer}: {answers.count(answer)}" for answer in dict.fromkeys(answers))
-    rows = [[one.claim, one.claimed, one.measured, one.trainings, f"**{one.answer}**"] for one in found]
+    rows = [
+        [verdict.claim, verdict.claimed, verdict.measured, verdict.trainings, f"**{verdict.answer}**"]
+        for verdict in answered
+    ]
     head = ["claim", "the paper", "measured here, with against without attention", "trainings", "verdict"]
-    return [f"{len(found)} claims of the paper: {counted}.", "", *table(head, rows), "", verdict_note()]
+    return [f"{len(answered)} claims of the paper: {counted}.", "", *table(head, rows), "", verdict_note()]
 
 
 def _table_2(runs: PaperRuns) -> list[str]:
-    if not any(own for own in (*runs.detections().values(), *runs.halves().values())) and not _elsewhere(runs):
+    if not any(trainings for trainings in (*runs.detections().values(), *runs.halves().values())) and not _elsewhere(
+        runs
+    ):
         return [NOT_RUN]
     note = (
         "*In brackets: 95 % intervals over trajectories for one training, the range of the trainings for several. Test "
@@ -134,16 +140,21 @@ def _table_2(runs: PaperRuns) -> list[str]:
 
 def _elsewhere(runs: PaperRuns) -> bool:
     """Whether any detector on another ground than the headline, or on the benchmark, is finished."""
-    found = [own for ground in (SPARSE, USUAL, TRANSFER) for own in runs.detections(ground).values()]
-    return any(found) or any(runs.scored(network) for network in ATTENTION)
+    trainings = [
+        some_trainings for ground in (SPARSE, USUAL, TRANSFER) for some_trainings in runs.detections(ground).values()
+    ]
+    return any(trainings) or any(runs.scored(network) for network in ATTENTION)
 
 
 def _starts(runs: PaperRuns) -> str:
-    """A sentence on the weights that the headline rows, and rows after transfer, start from; empty if unknown."""
+    """A sentence on the initial weights of the headline rows and of the rows after transfer; empty if unknown."""
     found = []
     for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "rows after transfer")):
         starts = {
-            str(one["train/start"]) for own in runs.detections(ground).values() for one in own if "train/start" in one
+            str(metrics["train/start"])
+            for trainings in runs.detections(ground).values()
+            for metrics in trainings
+            if "train/start" in metrics
         }
         found += [f"{title} from {' or '.join(map(_start, sorted(starts)))}"] if starts else []
     return f" Weights: {', '.join(found)}." if found else ""
@@ -169,7 +180,7 @@ def _curve(runs: PaperRuns, share: str | None) -> list[str]:
 def _detections(root: Path, detected: dict[str, Detected]) -> list[str]:
     if not detected:
         return [NOT_RUN]
-    draw_detections(root / "detections.png", {NAMES[network]: own for network, own in detected.items()})
+    draw_detections(root / "detections.png", {NAMES[network]: detections for network, detections in detected.items()})
     return ["![Detections on the headline ground](detections.png)", "", "*Truth red, detections cyan.*"]
 
 
@@ -179,7 +190,8 @@ def _table_3(runs: PaperRuns) -> list[str]:
         lines += [f"**{title}**", "", *(table_3(runs, reading) if runs.navigation(reading) else [NOT_RUN]), ""]
     files = {
         reading: {
-            name: runs.navigator(navigate_name(own, reading)) / "errors.parquet" for name, own in NAVIGATORS.items()
+            name: runs.navigator(navigate_name(network, reading)) / "errors.parquet"
+            for name, network in NAVIGATORS.items()
         }
         for reading in READINGS
     }
@@ -195,17 +207,17 @@ def _table_3(runs: PaperRuns) -> list[str]:
 
 
 def _causes(runs: PaperRuns) -> list[str]:
-    found = read_causes(runs)
+    causes = read_causes(runs)
     lines = []
-    for cause in dict.fromkeys([*CAUSES, *found]):
-        measured = found.get(cause, ["Ablation: not run."])
+    for cause in dict.fromkeys([*CAUSES, *causes]):
+        measured = causes.get(cause, ["Ablation: not run."])
         lines += [CAUSES.get(cause, f"**{cause}**"), "", *measured, ""]
     return lines[:-1]
 
 
 def _learning(runs: PaperRuns) -> list[str]:
     navigators = {
-        reading: {name: runs.navigator(navigate_name(own, reading)) for name, own in NAVIGATORS.items()}
+        reading: {name: runs.navigator(navigate_name(network, reading)) for name, network in NAVIGATORS.items()}
         for reading in READINGS
     }
     panels = {
@@ -213,7 +225,9 @@ def _learning(runs: PaperRuns) -> list[str]:
             AP_KEY,
             {NAMES[network]: runs.detector(detect_name(network)) for network in ATTENTION},
         ),
-        **{f"navigators, {reading}": (POSITION_KEY, own) for reading, own in navigators.items()},
+        **{
+            f"navigators, {reading}": (POSITION_KEY, runs_of_network) for reading, runs_of_network in navigators.items()
+        },
     }
     drawn = draw_learning(runs.root / "learning.png", panels)
     return ["![Learning curves](learning.png)"] if drawn else [NOT_RUN]
@@ -236,12 +250,12 @@ def _attention(runs: PaperRuns) -> list[str]:
     return lines
 
 
-def _figures(read: dict[str, Metrics], found: list[Verdict]) -> Metrics:
+def _figures(read: dict[str, Metrics], answered: list[Verdict]) -> Metrics:
     """Flat keys: <folder of a run>/<metric>, verdict/<number>/<part>."""
     figures: Metrics = {}
     for folder, metrics in read.items():
         figures |= {f"{folder}/{key}": value for key, value in metrics.items() if not key.startswith("run/")}
     parts = ("claim", "measured", "trainings", "answer")
-    for place, one in enumerate(found, 1):
-        figures |= {f"verdict/{place}/{part}": getattr(one, part) for part in parts}
+    for number, verdict in enumerate(answered, 1):
+        figures |= {f"verdict/{number}/{part}": getattr(verdict, part) for part in parts}
     return figures

@@ -1,11 +1,11 @@
-"""Seconds that training takes on this machine, from a few steps on random frames."""
+"""Training time on this machine, from a few steps on random frames."""
 
 import time
 
 import torch
 
 from perilune_train.detect.config import DetectConfig
-from perilune_train.models.navigator import StackNavigator
+from perilune_train.models.navigator import StackNavigator, StackOptions
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.training.runs import choose_bf16, choose_device
@@ -32,12 +32,12 @@ def detect_seconds(config: DetectConfig, size_px: int) -> float:
 
 def navigate_seconds(config: NavigateConfig) -> float:
     """Seconds of a training pair of the paper's navigator, forward and backward, for square frames."""
-    own = config.stack
-    form = config.in_channels, own.width, own.attention, own.hidden
-    network = StackNavigator(*form, pool=own.pool, stages=own.stages)
+    stack = config.stack
+    form = config.in_channels, stack.width, stack.attention, stack.hidden
+    network = StackNavigator(*form, StackOptions(stack.pool, stack.stages))
     device = choose_device(config.device)
     trained = network.to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
-    pairs = [torch.randn(1, _IMAGES, own.size_px, own.size_px, device=device) for _ in range(2)]
+    pairs = [torch.randn(1, _IMAGES, stack.size_px, stack.size_px, device=device) for _ in range(2)]
 
     def step() -> None:
         with torch.autocast(device, torch.bfloat16, enabled=choose_bf16(config.precision, device)):
@@ -48,7 +48,7 @@ def navigate_seconds(config: NavigateConfig) -> float:
 
 
 def _timed(step, device: str) -> float:
-    """Seconds of a step, after a first one; the fastest of a few."""
+    """Seconds of a step: the fastest of a few, after a first one."""
     step()
     seconds = []
     for _ in range(_STEPS):

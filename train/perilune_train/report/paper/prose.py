@@ -95,8 +95,8 @@ def _scoring(runs: PaperRuns) -> str:
         "rule, which ignores detections that the labels cannot decide. The strict rule counts a detected crater just "
         "below 2 px as a false positive. The paper must have used the strict rule, since it names no ignored detections"
     )
-    own = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
-    usual, strict, recall = (numbers(own, f"test/{key}") for key in ("precision", "strict/precision", "recall"))
+    trainings = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
+    usual, strict, recall = (numbers(trainings, f"test/{key}") for key in ("precision", "strict/precision", "recall"))
     if usual and strict and recall:
         text += (
             f" (precision {paper['precision']:.3f} at recall {paper['recall']:.3f}; here {usual[0]:.3f} usual and "
@@ -106,7 +106,7 @@ def _scoring(runs: PaperRuns) -> str:
 
 
 def _trainings(runs: PaperRuns) -> str:
-    halves = [len(own) for own in runs.halves().values() if own]
+    halves = [len(trainings) for trainings in runs.halves().values() if trainings]
     if max(halves, default=0) < 2:
         return "**Trainings.** Every figure rests on one training of each network."
     counted = f"{min(halves)}" if len(set(halves)) == 1 else f"{min(halves)} to {max(halves)}"

@@ -1,9 +1,8 @@
 """The rule by which a claim holds, does not hold or is open.
 
-It is symmetric: what one sign needs to hold, the other needs to fail. With `MIN_TRAININGS` trainings or more of each
-network a claim holds if every training with attention is better than every one without, and does not hold if every one
-is worse. With one training of each, it holds or does not hold only if the intervals are separated. Otherwise it is
-open.
+The rule is symmetric in the sign. With `MIN_TRAININGS` trainings or more of each network, a claim holds if every
+training with attention is better than every training without, and does not hold if every one is worse. With one
+training of each, it holds or does not hold only if the intervals are separated. Otherwise it is open.
 """
 
 from collections.abc import Sequence
@@ -16,10 +15,10 @@ from perilune_train.report.paper.tables import numbers
 
 Answer = Literal["holds", "does not hold", "open", "not measured"]
 AS_FAST = 1.05
-"""Largest ratio of two times, in either direction, that is called equal."""
+"""Largest ratio of two times, in either direction, that counts as equal."""
 MIN_TRAININGS = 3
-"""Trainings of each network from which their order decides. With three each, one of the two orders in which all of one
-network are above all of the other comes by chance once in ten times."""
+"""Number of trainings of each network from which their order decides. With three of each, chance puts all trainings of
+one network above all of the other once in ten times."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +30,11 @@ class Verdict:
     claimed: str
     """The paper's figures."""
     measured: str
-    """Ours: with attention against without."""
+    """Our figures: with attention against without."""
     trainings: str
-    """Number of trainings that the answer rests on."""
+    """Number of trainings on which the answer rests."""
     answer: Answer
-    """By the rule at the top of this file. not measured: a run or a figure is missing."""
+    """Answer by the rule at the top of this file. not measured: a run or a figure is missing."""
 
 
 def compared(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics], *, higher: bool) -> Answer:
@@ -44,7 +43,7 @@ def compared(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics], *,
     if not ours or not others:
         return "not measured"
     if len(ours) == len(others) == 1:
-        intervals = [read_spread(one[0], key).interval for one in (attended, plain)]
+        intervals = [read_spread(runs[0], key).interval for runs in (attended, plain)]
         return by_order(intervals[0], intervals[1], higher)
     if min(len(ours), len(others)) < MIN_TRAININGS:
         return "open"

@@ -42,7 +42,8 @@ NAMES = {
 SEEDS = (0, 1, 2)
 """Random seeds of the trainings at half width."""
 HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
-"""Grounds, and the headline ground after transfer and with more epochs: the first part of a run's name."""
+"""Grounds, and two variants of the headline ground (after transfer, with more epochs): the first part of a run's
+name."""
 SPARSE_SHARE = "0.1"
 """equilibrium_share of the sparse ground."""
 CURVE = "curve"
@@ -50,7 +51,7 @@ CURVE = "curve"
 NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
 """First part of the names of the navigate runs, by the paper's names; their folders end in -stack."""
 READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
-"""End of the names of the navigate runs: pose in O_L, with attitude noise, motion between frames."""
+"""Endings of the names of the navigate runs: pose in O_L, pose with attitude noise, motion between frames."""
 EXPLAINED = "attention"
 """Name of the explain run."""
 CAUSES = "paper-causes.json"
@@ -64,29 +65,24 @@ def detect_name(network: str, ground: str = HEADLINE, seed: int | None = None) -
     return "-".join([*([ground] if ground else []), network, *half])
 
 
-def curve_name(share: str) -> str:
-    """Name of the training on the ground of this equilibrium_share, or on our usual one (`lunar`)."""
-    return f"{CURVE}-{share}"
-
-
 def navigate_name(navigator: str, reading: str = "pose") -> str:
     """Name of the training of a navigator, a value of `NAVIGATORS`, in one of the `READINGS`."""
     return navigator + READINGS[reading]
 
 
-def nearest_share(curve: Mapping[str, Metrics], account: str = "") -> str | None:
+def nearest_share(curve: Mapping[str, Metrics], prefix: str = "") -> str | None:
     """Share of the curve, except `lunar`, at which the AP on validation is nearest to the AP of the paper's YOLOv3.
 
-    `account` is "" (usual) or "strict/". None if the curve has no AP.
+    `prefix` is that of the scoring rule: "" (usual) or "strict/". None if the curve has no AP.
     """
-    found = {share: metrics.get(f"val/{account}ap50_paper") for share, metrics in curve.items() if share != USUAL}
-    known = {share: abs(ap - TARGET_AP) for share, ap in found.items() if isinstance(ap, int | float)}
+    ap_of_share = {share: metrics.get(f"val/{prefix}ap50_paper") for share, metrics in curve.items() if share != USUAL}
+    known = {share: abs(ap - TARGET_AP) for share, ap in ap_of_share.items() if isinstance(ap, int | float)}
     return min(known, key=lambda share: known[share], default=None)
 
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """Folders and metrics of the experiment's runs. Methods raise UserError on damaged metrics only."""
+    """Folders and metrics of the experiment's runs. Methods raise UserError only on damaged metrics."""
 
     root: Path
     """The folder that holds all of them, such as runs/paper."""
@@ -115,16 +111,16 @@ class PaperRuns:
     def halves(self) -> dict[str, list[Metrics]]:
         """Metrics of the finished trainings at half width on the headline ground, for each network."""
         names = {network: [detect_name(network, seed=seed) for seed in SEEDS] for network in ATTENTION}
-        return {network: self._detect(*own) for network, own in names.items()}
+        return {network: self._detect(*run_names) for network, run_names in names.items()}
 
     def curve(self, headline: str | None = None) -> dict[str, Metrics]:
         """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
 
-        Runs on the sparse, the headline and our usual ground are points too if their networks are as large, and train
-        for as many epochs, as in the runs of the curve. `headline` is the share of the headline ground.
+        Runs on the sparse, the headline and our usual ground also count as points if network size and epochs equal
+        those of the curve's runs. `headline` is the share of the headline ground.
         """
-        found = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
-        read = {share: finished(self.detector(name)) for share, name in found.items()}
+        name_of_share = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
+        read = {share: finished(self.detector(name)) for share, name in name_of_share.items()}
         plain = next(iter(ATTENTION))
         sizes = {_size(metrics) for metrics in read.values() if metrics is not None}
         others = [(SPARSE_SHARE, detect_name(plain, SPARSE)), (USUAL, detect_name(plain, USUAL))]
@@ -139,7 +135,7 @@ class PaperRuns:
 
     def navigation(self, reading: str) -> dict[str, Metrics]:
         """Metrics of the finished navigators of a reading, by the paper's names."""
-        folders = {name: self.navigator(navigate_name(own, reading)) for name, own in NAVIGATORS.items()}
+        folders = {name: self.navigator(navigate_name(network, reading)) for name, network in NAVIGATORS.items()}
         read = {name: finished(folder) for name, folder in folders.items()}
         return {name: metrics for name, metrics in read.items() if metrics is not None}
 

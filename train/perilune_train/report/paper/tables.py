@@ -40,13 +40,13 @@ _GROUNDS = {
 }
 _HALF = "headline at half width"
 _PLAIN_ONLY = (_GROUNDS[LONG], _GROUNDS[TRANSFER])
-"""Where gates from identity are not planned."""
+"""Grounds for which no training with identity gates is planned."""
 _IDENTITY_ONLY = (_GROUNDS[USUAL],)
-"""Where plain CBAM is not planned."""
+"""Grounds for which no training with plain CBAM is planned."""
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 _NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
-"""Columns of Table III, with decimals."""
+"""Columns of Table III, with their number of decimals."""
 FLOORS = {
     "mean_pose": "mean pose of the training",
     "mean_pose_at_frame": "mean pose of the training at that frame",
@@ -55,7 +55,7 @@ FLOORS = {
     "mean_at_step": "mean motion of the training at that step",
     "nominal": "nominal motion",
 }
-"""What a navigator must beat: methods without images, and linear regression on the features that it starts from."""
+"""Baselines of a navigator: methods without images, and linear regression on its initial features."""
 _METHODS = {"klt": "KLT tracks, without training", "alignment": "direct alignment, without training"}
 
 
@@ -77,10 +77,19 @@ def table_2(runs: PaperRuns) -> list[str]:
         ]
         absent = [NAMES[network] for network in planned if not trainings[network]]
         missing += [title if len(absent) == len(planned) else f"{title} ({'; '.join(absent)})"] if absent else []
-        for network, own in trainings.items():
-            if own:
-                cells = [values(own, f"test/{key}") for key in _DETECTION]
-                rows.append([title, NAMES[network], str(len(own)), epochs(own), *cells, labels_a_frame(own[0])])
+        for network, network_trainings in trainings.items():
+            if network_trainings:
+                cells = [values(network_trainings, f"test/{key}") for key in _DETECTION]
+                rows.append(
+                    [
+                        title,
+                        NAMES[network],
+                        str(len(network_trainings)),
+                        epochs(network_trainings),
+                        *cells,
+                        labels_a_frame(network_trainings[0]),
+                    ]
+                )
     for network, metrics in scored.items():
         if metrics is not None:
             cells = [values([metrics], f"paper/{key}") for key in _DETECTION]
@@ -102,14 +111,14 @@ def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]
 
 
 def table_3(runs: PaperRuns, reading: str) -> list[str]:
-    """Table III in one reading as lines of Markdown, with the RMSE of the vector's length beside the components'."""
+    """Table III in one reading as lines of Markdown, with the RMSE of the vector's length next to the components'."""
     rows = []
-    found = runs.navigation(reading)
+    navigation = runs.navigation(reading)
     for network, claimed in NAVIGATION.items():
-        given = [f"{claimed['position_m']:g}", "-", f"{claimed['orientation_deg']:g}", f"{claimed['seconds']:g}"]
-        rows.append([network, "the paper", *given])
-        if network in found:
-            metrics = found[network]
+        cells = [f"{claimed['position_m']:g}", "-", f"{claimed['orientation_deg']:g}", f"{claimed['seconds']:g}"]
+        rows.append([network, "the paper", *cells])
+        if network in navigation:
+            metrics = navigation[network]
             floor = lost_to(metrics)
             here = f"here; **does not beat the {FLOORS[floor]}**" if floor else "here"
             rows.append([network, here, *_errors(metrics, "test"), seconds(metrics)])
@@ -117,7 +126,7 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
         if scored is not None:
             rows.append([network, "here, locked benchmark", *_errors(scored, "stack"), seconds(scored)])
     others: dict[str, list[str]] = {}
-    for network, metrics in found.items():
+    for network, metrics in navigation.items():
         for method, name in (FLOORS | _METHODS).items():
             # The features come from the network's own backbone.
             title = f"{name} of {network}" if method == "ridge" else name
@@ -128,19 +137,19 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
 
 
 def floor(metrics: Metrics) -> str | None:
-    """The best of the `FLOORS` of a navigate run by the RMSE of position; None if it has none."""
-    found = {name: metrics.get(f"baseline/{name}/{_POSITION}") for name in FLOORS}
-    known = {name: value for name, value in found.items() if isinstance(value, int | float)}
+    """The best of the `FLOORS` of a navigate run by the RMSE of position; None if there is none."""
+    errors = {name: metrics.get(f"baseline/{name}/{_POSITION}") for name in FLOORS}
+    known = {name: value for name, value in errors.items() if isinstance(value, int | float)}
     return min(known, key=lambda name: known[name], default=None)
 
 
 def lost_to(metrics: Metrics) -> str | None:
     """The best floor, if the network of a navigate run is not better; otherwise None."""
-    best, own = floor(metrics), metrics.get(f"test/{_POSITION}")
-    if best is None or not isinstance(own, int | float):
+    best, error = floor(metrics), metrics.get(f"test/{_POSITION}")
+    if best is None or not isinstance(error, int | float):
         return None
     value = metrics[f"baseline/{best}/{_POSITION}"]
-    return best if isinstance(value, int | float) and own >= value else None
+    return best if isinstance(value, int | float) and error >= value else None
 
 
 def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
@@ -167,16 +176,16 @@ def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
         if row and cause != "run":
             shown = value if isinstance(value, str) else number(value)
             causes.setdefault(cause, {}).setdefault(row, {})[column] = shown
-    found = {}
+    table_of_cause = {}
     for cause, rows in causes.items():
         columns = list(dict.fromkeys(column for cells in rows.values() for column in cells))
         lines = [[row, *[cells.get(column, "-") for column in columns]] for row, cells in rows.items()]
-        found[cause] = table(["changed", *columns], lines)
-    return found
+        table_of_cause[cause] = table(["changed", *columns], lines)
+    return table_of_cause
 
 
 def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
-    """A figure with its interval; of several trainings, the mean with the range; a dash if undefined."""
+    """A figure with its interval; for several trainings, mean and range; a dash if undefined."""
     known = numbers(trainings, key)
     if not known:
         return "-"
@@ -188,14 +197,14 @@ def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
 
 def numbers(trainings: Sequence[Metrics], key: str) -> list[float]:
     """The finite values of a figure."""
-    found = [metrics.get(key) for metrics in trainings]
-    return [float(value) for value in found if isinstance(value, int | float) and math.isfinite(value)]
+    values = [metrics.get(key) for metrics in trainings]
+    return [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
 
 
 def epochs(trainings: Sequence[Metrics]) -> str:
     """Epochs of the trainings; a dash if unknown."""
-    found = {str(metrics["train/epochs"]) for metrics in trainings if "train/epochs" in metrics}
-    return " or ".join(sorted(found, key=int)) or "-"
+    counts = {str(metrics["train/epochs"]) for metrics in trainings if "train/epochs" in metrics}
+    return " or ".join(sorted(counts, key=int)) or "-"
 
 
 def labels_a_frame(metrics: Metrics, prefix: str = "test") -> str:
@@ -206,8 +215,8 @@ def labels_a_frame(metrics: Metrics, prefix: str = "test") -> str:
 
 def seconds(metrics: Metrics) -> str:
     """Seconds of a pair; a dash if unknown."""
-    found = metrics.get("test/ms_per_single_pair")
-    return f"{found / 1e3:.3f}" if isinstance(found, int | float) else "-"
+    milliseconds = metrics.get("test/ms_per_single_pair")
+    return f"{milliseconds / 1e3:.3f}" if isinstance(milliseconds, int | float) else "-"
 
 
 def _errors(metrics: Metrics, prefix: str) -> list[str]:

@@ -13,37 +13,39 @@ from perilune_train.report.paper.tables import FLOORS, lost_to, numbers, values
 
 ONE = "one training each"
 _CONSTANT_DEG = 1e-4
-"""Without attitude noise the orientation is constant, and a mean has an error below this."""
+"""Without attitude noise the orientation is constant, and its mean has an error below this limit, degrees."""
 GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from identity"}
 """Detectors with attention."""
 
 
 def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
     """All claims in the order of the paper; `large` is the width of the large craters that attention-YOLOv3 finds."""
-    found = []
+    answers = []
     for key, (name, claimed) in _detection_claims().items():
-        found += [_detection(runs, f"attention raises {name} ({GATES[gates]})", claimed, key, gates) for gates in GATES]
-    found.append(_large_craters(large))
+        answers += [
+            _detection(runs, f"attention raises {name} ({GATES[gates]})", claimed, key, gates) for gates in GATES
+        ]
+    answers.append(_large_craters(large))
     for reading in READINGS:
-        found += _navigation(runs, reading)
-    return [*found, _as_fast(runs), *gate_verdicts(runs.explanation() or {})]
+        answers += _navigation(runs, reading)
+    return [*answers, _as_fast(runs), *gate_verdicts(runs.explanation() or {})]
 
 
 def _detection_claims() -> dict[str, tuple[str, str]]:
-    """Name and the paper's figures of each claim, by the key of metrics.json."""
+    """Name of each claim and the paper's figures, by the key of metrics.json."""
     names = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
     plain, attended = DETECTION.values()
-    found = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
-    found |= {
-        f"test/strict/{key}": (f"{names[key]}, strict scoring", found[f"test/{key}"][1])
+    compared = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
+    compared |= {
+        f"test/strict/{key}": (f"{names[key]}, strict scoring", compared[f"test/{key}"][1])
         for key in ("precision", "ap50_paper")
     }
     small = {"2_3": "AP of small craters, 2 to 3 px", "3_5": "AP of small craters, 3 to 5 px"}
-    return found | {f"test/radius_{bin_}_px/ap50_paper": (name, "no figure") for bin_, name in small.items()}
+    return compared | {f"test/radius_{bin_}_px/ap50_paper": (name, "no figure") for bin_, name in small.items()}
 
 
 def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) -> Verdict:
-    """Compare at half width if there are several trainings, and name the one training at full width beside them."""
+    """Compare at half width if there are several trainings, and add the single training at full width."""
     full, half = runs.detections(), runs.halves()
     counts = [len(numbers(half[network], key)) for network in (gates, "yolov3")]
     pair = full[gates], full["yolov3"]
@@ -66,8 +68,8 @@ def _measured(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics]) -
         return "-"
     size = max(map(abs, known), default=0.0)
     # Four digits, so that small differences show.
-    places = max(0, 3 - math.floor(math.log10(size))) if size else 3
-    return f"{values(attended, key, places)} against {values(plain, key, places)}"
+    digits = max(0, 3 - math.floor(math.log10(size))) if size else 3
+    return f"{values(attended, key, digits)} against {values(plain, key, digits)}"
 
 
 def _of(answer: Answer, trainings: str) -> str:
@@ -84,8 +86,8 @@ def _large_craters(ratio: WidthRatio | None) -> Verdict:
 
 
 def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
-    found = runs.navigation(reading)
-    plain, attended = ([found[name]] if name in found else [] for name in NAVIGATORS)
+    navigation = runs.navigation(reading)
+    plain, attended = ([navigation[name]] if name in navigation else [] for name in NAVIGATORS)
     where = {"pose": "pose in O_L", "attitude": "pose in O_L, attitude noise", "motion": "motion between frames"}[
         reading
     ]
@@ -94,14 +96,14 @@ def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
         unit = field.rpartition("_")[2]
         key = f"test/{what}_rmse_per_component_{unit}"
         claim = f"attention lowers the {what} RMSE, per component ({where})"
-        claimed = " against ".join(f"{one[field]:g} {unit}" for one in reversed(NAVIGATION.values()))
+        claimed = " against ".join(f"{figures[field]:g} {unit}" for figures in reversed(NAVIGATION.values()))
         answer = compared(key, attended, plain, higher=False)
         measured = _measured(key, attended, plain)
         if what == "orientation" and answer != "not measured" and _is_constant([*plain, *attended], key):
             measured, answer = "the true orientation is constant; ATTITUDE=1 measures it", "not measured"
         elif what == "position":
             names = (("with", attended), ("without", plain))
-            lost = {name: lost_to(own[0]) for name, own in names if own}
+            lost = {name: lost_to(trainings[0]) for name, trainings in names if trainings}
             measured += "".join(
                 f"; {name} attention, not better than the {FLOORS[by]}" for name, by in lost.items() if by
             )
@@ -110,7 +112,7 @@ def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
 
 
 def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
-    """Whether the mean pose or motion already knows the orientation; without a mean, whether all networks do."""
+    """Whether the mean pose or motion already predicts the orientation; without a mean, whether all networks do."""
     means = [f"baseline/{name}/{key.removeprefix('test/')}" for name in ("mean", "mean_pose")]
     known = [value for mean in means for value in numbers(trained, mean)] or numbers(trained, key)
     return max(known) < _CONSTANT_DEG
@@ -123,17 +125,17 @@ def _as_fast(runs: PaperRuns) -> Verdict:
     scored = [runs.scored(name) for name in NAVIGATORS.values()]
     pairs["locked benchmark"] = [metrics for metrics in scored if metrics is not None]
     key, ratios, listed = "test/ms_per_single_pair", [], []
-    for where, both in pairs.items():
-        times = numbers(both, key)
+    for setting, metrics_of_networks in pairs.items():
+        times = numbers(metrics_of_networks, key)
         if len(times) < 2:
             continue
         without, with_ = times
-        alike = len({(metrics.get("run/hardware"), _program(metrics)) for metrics in both}) == 1
+        alike = len({(metrics.get("run/hardware"), _program(metrics)) for metrics in metrics_of_networks}) == 1
         ratios += [with_ / without] if alike else []
         note = "" if alike else ", different machines or commands, not compared"
-        loads = " and ".join(f"{value:g}" for value in reversed(numbers(both, "run/load")))
+        loads = " and ".join(f"{value:g}" for value in reversed(numbers(metrics_of_networks, "run/load")))
         load = f" at load {loads}" if loads else ""
-        listed.append(f"{where}: {with_ / 1e3:.3f} s against {without / 1e3:.3f} s{load}{note}")
+        listed.append(f"{setting}: {with_ / 1e3:.3f} s against {without / 1e3:.3f} s{load}{note}")
     if not ratios:
         return Verdict(claim, claimed, "; ".join(listed) or "-", "-", "not measured")
     # Above, below or within the tolerance.

@@ -10,7 +10,7 @@ from perilune_shared.errors import UserError
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1 in pixels."""
 StatedSize = tuple[int | None, int | None]
-"""Width and height in pixels; None for what is not stated."""
+"""Width and height in pixels; None if not stated."""
 LARGEST_PX = 1e6
 
 
@@ -41,14 +41,14 @@ def around(points: Iterable[Any], path: Path, field: str) -> Box:
 
 
 def around_ellipse(centre: tuple[float, float], half: tuple[float, float], turn_deg: float = 0.0) -> Box:
-    """The box around an ellipse of these half axes, the first turned from the x axis by an angle."""
+    """The box around an ellipse with these semi-axes, the first at this angle from the x axis."""
     cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     x, y = math.hypot(half[0] * cos, half[1] * sin), math.hypot(half[0] * sin, half[1] * cos)
     return centre[0] - x, centre[1] - y, centre[0] + x, centre[1] + y
 
 
 def around_turned(box: Box, turn_deg: float) -> Box:
-    """The box around a box that is turned about its centre."""
+    """The box around a box that is rotated about its centre."""
     cos, sin = abs(math.cos(math.radians(turn_deg))), abs(math.sin(math.radians(turn_deg)))
     x, y, w, h = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2, box[2] - box[0], box[3] - box[1]
     across, down = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
@@ -56,7 +56,7 @@ def around_turned(box: Box, turn_deg: float) -> Box:
 
 
 def size_of(width: Any, height: Any, path: Path, field: str) -> StatedSize:
-    """A stated width and height, also as text; None for what a file does not state: null, 0 or nothing."""
+    """A stated width and height, as numbers or text; None if the file states null, 0 or nothing."""
     return _whole(width, path, field), _whole(height, path, field)
 
 

@@ -27,8 +27,8 @@ def read_content(path: Path) -> dict[str, Any]:
 def read_coco(path: Path, content: dict[str, Any], image_folder: Path | None = None) -> LabelFile:
     """Read a COCO file. Raises UserError, naming file and field, on invalid content."""
     categories = {
-        _identity(one, "id", "categories", path): str(one.get("name", ""))
-        for one in _records(content, "categories", path)
+        _identity(category_record, "id", "categories", path): str(category_record.get("name", ""))
+        for category_record in _records(content, "categories", path)
     }
     images = _records(content, "images", path)
     row_of = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
@@ -82,17 +82,17 @@ def _flag(value: Any) -> bool:
 
 def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
     """A list of objects; a missing list of categories counts as an empty one."""
-    found = content.get(name, [] if name == "categories" else None)
-    if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
-        raise UserError(path, name, type(found).__name__, "a list of objects, as in COCO")
-    return found
+    records = content.get(name, [] if name == "categories" else None)
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise UserError(path, name, type(records).__name__, "a list of objects, as in COCO")
+    return records
 
 
 def _identity(record: dict[str, Any], name: str, field: str, path: Path) -> str:
-    found = _as_identity(record.get(name))
-    if found is None:
+    identity = _as_identity(record.get(name))
+    if identity is None:
         raise UserError(path, f"{field}.{name}", record.get(name), "a number or a name")
-    return found
+    return identity
 
 
 def _as_identity(value: Any) -> str | None:

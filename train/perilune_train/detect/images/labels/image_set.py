@@ -1,4 +1,4 @@
-"""Labelled images, and how the objects of a label file become them."""
+"""Labelled images, and how the objects of a label file become such images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ class LabelledImage:
     not_ignored: NDArray[np.bool_]
     """False for a box that its source marks as ignored (M,)."""
     crowd: NDArray[np.bool_] | None = None
-    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if none is."""
+    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if there is no such box."""
 
     @property
     def sizes_px(self) -> Array:
@@ -69,9 +69,9 @@ class LabelledObject:
     box: Box
     """x0, y0, x1, y1, pixels."""
     category: str = ""
-    """Identity of its category, a key of `LabelFile.categories`."""
+    """Id of its category, a key of `LabelFile.categories`."""
     ignored: bool = False
-    """Whether its source marks it as one that does not count (`ignore`, `difficult`)."""
+    """Whether its source marks it as not counting (`ignore`, `difficult`)."""
     crowd: bool = False
     """Whether it is a region of many objects (`iscrowd`)."""
 
@@ -97,57 +97,60 @@ class LabelFile:
     """What the readers of all formats return."""
 
     source: Path
-    """Named in messages about categories."""
+    """Path in messages about categories."""
     entries: list[Entry]
     """Pictures."""
     categories: Mapping[str, str] = field(default_factory=dict)
-    """Name of each category, by its identity in the file."""
+    """Name of each category, by its id in the file."""
     clip: bool = True
     """Whether boxes end at the edges of the picture."""
     notes: tuple[str, ...] = ()
     """Lines for the user."""
 
 
-def image_set(given: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
+def image_set(label_file: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
     """Check the pictures, choose the craters among the objects, clip their boxes. Raises UserError."""
-    chosen, text = choose_categories(given.categories, wanted, given.source)
-    check_names([entry.path for entry in given.entries], [entry.name for entry in given.entries])
-    check_names([entry.path for entry in given.entries], [str(entry.path.resolve()) for entry in given.entries])
+    chosen, text = choose_categories(label_file.categories, wanted, label_file.source)
+    check_names([entry.path for entry in label_file.entries], [entry.name for entry in label_file.entries])
+    check_names(
+        [entry.path for entry in label_file.entries], [str(entry.path.resolve()) for entry in label_file.entries]
+    )
     images, n_empty = [], 0
-    for entry in given.entries:
+    for entry in label_file.entries:
         size = picture_size(entry.path)
         if any(stated not in (None, side) for stated, side in zip(entry.size_px, size, strict=True)):
             raise _other_size(entry, size)
-        own = [one for one in entry.objects if chosen is None or one.category in chosen]
-        boxes = np.array([one.box for one in own], np.float64).reshape(-1, 4)
-        if given.clip:
+        craters = [item for item in entry.objects if chosen is None or item.category in chosen]
+        boxes = np.array([item.box for item in craters], np.float64).reshape(-1, 4)
+        if label_file.clip:
             boxes = np.clip(boxes, 0, np.tile(size, 2))
         kept = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         n_empty += int((~kept).sum())
-        crowd = np.array([one.crowd for one in own], bool)[kept]
-        not_ignored = ~np.array([one.ignored or one.crowd for one in own], bool)[kept]
+        crowd = np.array([item.crowd for item in craters], bool)[kept]
+        not_ignored = ~np.array([item.ignored or item.crowd for item in craters], bool)[kept]
         images.append(LabelledImage(entry.name, entry.path, *size, boxes[kept], not_ignored, crowd))
     left_out = f"{n_empty} boxes without width or height in the picture are left out"
-    for note in (*given.notes, *[left_out] * bool(n_empty), *[text] * bool(text)):
-        say(f"{given.source.name}: {note}")
-    return ImageSet(images, given.clip, text)
+    for note in (*label_file.notes, *[left_out] * bool(n_empty), *[text] * bool(text)):
+        say(f"{label_file.source.name}: {note}")
+    return ImageSet(images, label_file.clip, text)
 
 
 def choose_categories(
     categories: Mapping[str, str], wanted: Sequence[str], source: Path
 ) -> tuple[set[str] | None, str]:
-    """The identities of the categories that are craters, and a text that names them.
+    """The ids of the categories that are craters, and a text that names them.
 
-    Without `wanted` these are all named crater or craters, in upper or lower case: there may be several, since exports
-    of Roboflow also have a placeholder category. With fewer than two categories every object is a crater: None.
+    Without `wanted`, these are all categories named crater or craters, in upper or lower case; there may be several,
+    since exports of Roboflow also have a placeholder category. With fewer than two categories every object is a crater:
+    None.
     """
     names = {key: " ".join(name.split()) for key, name in categories.items()}
     asked = [name.strip().lower() for name in wanted]
     if not asked and len(names) < 2:
         odd = [name for name in names.values() if name.lower() not in (*_CRATER_NAMES, "")]
         return None, "".join(f"every object is taken as a crater; their category is {name}" for name in odd)
-    # With names only, as in Pascal VOC, a name is its own identity.
-    told = {key: name if name == key else f"{name} ({key})" for key, name in names.items()}
+    # With names only, as in Pascal VOC, a name is its own id.
+    described = {key: name if name == key else f"{name} ({key})" for key, name in names.items()}
     known = ", ".join(names.values())
     for name, original in zip(asked, wanted, strict=True):
         if name not in {key.lower() for key in names} | {other.lower() for other in names.values()}:
@@ -156,8 +159,8 @@ def choose_categories(
     chosen = {key for key, name in names.items() if name.lower() in among or key.lower() in asked}
     if not chosen:
         raise UserError(source, "categories", known, "one named crater or craters, or --category NAME")
-    others = ", ".join(told[key] if asked else names[key] for key in names if key not in chosen)
-    taken = ", ".join(told[key] for key in names if key in chosen)
+    others = ", ".join(described[key] if asked else names[key] for key in names if key not in chosen)
+    taken = ", ".join(described[key] for key in names if key in chosen)
     return chosen, f"categories taken as craters: {taken}" + (f"; left out: {others}" if others else "")
 
 

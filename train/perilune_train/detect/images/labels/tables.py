@@ -22,11 +22,11 @@ def read_table(path: Path) -> NDArray[np.float64]:
     for column in _COLUMNS:
         if column not in names:
             raise UserError(path, "line 1", header or "no header", f"a column {column}, as in ID,X,Y,W,H,C_X,CY")
-    places = [names.index(column) for column in _COLUMNS]
+    columns = [names.index(column) for column in _COLUMNS]
     boxes: list[Box] = []
     for number, line in rows:
         cells = line.split(separator)
         if len(cells) != len(names):
             raise UserError(path, f"line {number}", f"{len(cells)} values", f"{len(names)}, as in the header")
-        boxes.append(box_of([cells[place] for place in places], path, f"line {number}", may_be_empty=False))
+        boxes.append(box_of([cells[column] for column in columns], path, f"line {number}", may_be_empty=False))
     return np.array(boxes, np.float64).reshape(-1, 4)

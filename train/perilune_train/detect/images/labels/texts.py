@@ -11,7 +11,7 @@ from perilune_shared.errors import UserError
 
 _LARGEST_TEXT, _LARGEST_XML, _LARGEST_JSON = 2**26, 2**26, 2**29
 _MOST_BRACKETS = 2**22
-"""Objects, lists and elements each take 50 to 250 bytes of memory, and as few as 3 in a file."""
+"""Objects, lists and elements take 50 to 250 bytes of memory each, and as few as 3 bytes in a file."""
 _DOCUMENT_TYPES = ("<!DOCTYPE", "<!ENTITY")
 
 
@@ -29,7 +29,7 @@ def read_text(path: Path, field: str, largest: int = _LARGEST_TEXT) -> str:
 
 
 def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = None) -> Any:
-    """The content of a JSON file; `hook` replaces each object, to keep less of it."""
+    """The content of a JSON file; `hook` replaces each object, so that less of it is kept."""
     text = read_text(path, "JSON", _LARGEST_JSON)
     if text.count("[") + text.count("{") > _MOST_BRACKETS:
         raise UserError(path, "JSON", f"more than {_MOST_BRACKETS} lists and objects", "fewer, in several files")
@@ -40,7 +40,7 @@ def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = No
 
 
 def read_xml(path: Path, expected: str) -> ET.Element:
-    """The root of an XML file. Document types are refused: entities can fill the memory or name other files."""
+    """The root of an XML file. Document types are refused: entities can fill the memory or refer to other files."""
     text = read_text(path, "XML", _LARGEST_XML)
     if any(word in text for word in _DOCUMENT_TYPES):
         raise UserError(path, "XML", "a document type or an entity", expected)
@@ -53,16 +53,16 @@ def read_xml(path: Path, expected: str) -> ET.Element:
 
 
 def below(folder: Path, name: Any, path: Path, field: str) -> Path:
-    """A path in a folder or below it. Raises UserError on a path that leads outside, also by a link."""
+    """A path in a folder or below it. Raises UserError on a path that leads outside, including by a link."""
     if isinstance(name, str) and name and "\0" not in name:
-        # Labels made on Windows have its separators.
+        # Labels made on Windows have backslashes.
         parts = name if "\\" not in name or folder.joinpath(name).exists() else name.replace("\\", "/")
         try:
-            found = folder.joinpath(parts).resolve()
+            resolved = folder.joinpath(parts).resolve()
         except (OSError, RuntimeError):  # circular links
-            found = folder
-        if found != folder and found.is_relative_to(folder):
-            return found
+            resolved = folder
+        if resolved != folder and resolved.is_relative_to(folder):
+            return resolved
     raise UserError(path, field, name, "a path of an image below the labels' folder, or below images next to it")
 
 

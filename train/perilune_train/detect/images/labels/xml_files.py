@@ -21,15 +21,15 @@ def read_voc(path: Path, picture: Path, name: str) -> Entry:
     if root.tag != "annotation":
         raise UserError(path, "XML", f"<{root.tag}>", "<annotation>, as in Pascal VOC")
     objects = []
-    for k, one in enumerate(root.findall("object")):
+    for k, element in enumerate(root.findall("object")):
         field = f"object {k + 1}"
-        box = one.find("bndbox")
+        box = element.find("bndbox")
         if box is None:
             raise UserError(path, field, "no <bndbox>", "xmin, ymin, xmax and ymax")
         x0, y0, x1, y1 = (_number(box.findtext(corner), path, f"{field}: {corner}") for corner in _CORNERS)
         shape = box_of((x0, y0, x1 - x0, y1 - y0), path, field)
-        difficult = (one.findtext("difficult") or "0").strip() not in ("", "0", "false", "False")
-        objects.append(LabelledObject(shape, " ".join((one.findtext("name") or "").split()), difficult))
+        difficult = (element.findtext("difficult") or "0").strip() not in ("", "0", "false", "False")
+        objects.append(LabelledObject(shape, " ".join((element.findtext("name") or "").split()), difficult))
     size = size_of(root.findtext("size/width"), root.findtext("size/height"), path, "size")
     return Entry(name, picture, objects, path, size)
 
@@ -56,7 +56,7 @@ def read_cvat(path: Path, image_folder: Path | None = None) -> LabelFile:
     if not entries:
         raise UserError(path, "images", "none", "<image> elements, as in CVAT for images")
     declared = {name: name for label in root.iter("label") if (name := (label.findtext("name") or "").strip())}
-    used = {one.category: one.category for entry in entries for one in entry.objects}
+    used = {item.category: item.category for entry in entries for item in entry.objects}
     notes = (f"{n_left_out} points, lines and other shapes without an area are left out",) if n_left_out else ()
     return LabelFile(path, entries, declared | used, notes=notes)
 

@@ -62,9 +62,9 @@ def read_yolo_text(path: Path, picture: Path) -> list[LabelledObject]:
 def label_of(picture: Path) -> Path:
     """The text file of a picture: labels/a/b.txt for images/a/b.png, else beside it."""
     parts = list(picture.parts)
-    for place in range(len(parts) - 2, -1, -1):
-        if parts[place].lower() == "images":
-            parts[place] = "labels"
+    for level in range(len(parts) - 2, -1, -1):
+        if parts[level].lower() == "images":
+            parts[level] = "labels"
             return Path(*parts).with_suffix(_LISTED_SUFFIX)
     return picture.with_suffix(_LISTED_SUFFIX)
 
@@ -87,28 +87,28 @@ def class_names(content: Mapping[str, Any]) -> dict[str, str]:
 def pictures_of_split(path: Path, value: Any) -> list[Path]:
     """The pictures to which a split of a data.yaml points: folders, or lists of paths. All below its folder."""
     root = path.resolve().parent
-    found = []
+    images = []
     for name in value if isinstance(value, list) else [value]:
         # Roboflow writes ../test/images for a folder beside the file.
-        place = below(root, name.removeprefix("../") if isinstance(name, str) else name, path, "split")
-        if place.is_dir():
-            found += pictures_of(place, recursive=True)
-        elif place.suffix == _LISTED_SUFFIX:
-            found += listed_pictures(place)
+        pictures = below(root, name.removeprefix("../") if isinstance(name, str) else name, path, "split")
+        if pictures.is_dir():
+            images += pictures_of(pictures, recursive=True)
+        elif pictures.suffix == _LISTED_SUFFIX:
+            images += listed_pictures(pictures)
         else:
             raise UserError(path, "split", name, "a folder of images, or a list of their paths (.txt)")
-    return found
+    return images
 
 
 def listed_pictures(path: Path) -> list[Path]:
     """The pictures that a list names, one path in each line, relative to its folder."""
     root = path.resolve().parent
     lines = enumerate(read_text(path, "list").splitlines(), 1)
-    found = [below(root, line.strip(), path, f"line {n}") for n, line in lines if line.strip()]
-    for picture in found:
+    images = [below(root, line.strip(), path, f"line {n}") for n, line in lines if line.strip()]
+    for picture in images:
         if not is_picture(picture):
             raise UserError(path, "list", picture.name, "paths of images")
-    return found
+    return images
 
 
 def _cells(line: str) -> list[str]:

@@ -40,14 +40,14 @@ def draw_trajectory(
     drift.axhline(0, color="black", linewidth=1)
     steps = np.arange(1, len(true))
     for method, (translation, rotation) in motions.items():
-        found, _ = dead_reckoning(true[0], trajectory.rotation_camera_from_site[0], translation, rotation)
+        estimated, _ = dead_reckoning(true[0], trajectory.rotation_camera_from_site[0], translation, rotation)
         style = {"color": COLOURS[method], "label": method}
-        side.plot(_along(found), found[:, 2], **style)
-        top.plot(found[:, 0], found[:, 1], **style)
-        drift.plot(steps, np.linalg.norm(found - true, axis=1)[1:], **style)
-        own = errors[method].query("scene_id == @trajectory.ids[0] and trajectory_id == @trajectory.ids[1]")
-        axes[1, 0].plot(own["altitude_m"], own["position_error_m"], **style)
-        axes[1, 1].plot(own["altitude_m"], own["orientation_error_deg"], **style)
+        side.plot(_along(estimated), estimated[:, 2], **style)
+        top.plot(estimated[:, 0], estimated[:, 1], **style)
+        drift.plot(steps, np.linalg.norm(estimated - true, axis=1)[1:], **style)
+        rows = errors[method].query("scene_id == @trajectory.ids[0] and trajectory_id == @trajectory.ids[1]")
+        axes[1, 0].plot(rows["altitude_m"], rows["position_error_m"], **style)
+        axes[1, 1].plot(rows["altitude_m"], rows["orientation_error_deg"], **style)
     _label(side, "path from the side", "distance from the site (m)", "altitude (m)")
     _label(top, "path from above", "x, west (m)", "y, south (m)")
     top.axis("equal")
@@ -64,18 +64,17 @@ def draw_trajectory(
     save_figure(path, figure)
 
 
-def draw_pose_errors(path: Path, errors: dict[str, pd.DataFrame], own: str) -> None:
+def draw_pose_errors(path: Path, errors: dict[str, pd.DataFrame], network: str) -> None:
     """Draw errors of the position in O_L along the test trajectories, by component, and their distribution.
 
-    Lines are root mean squares over the trajectories at each step; thin ones are single trajectories of the method
-    `own`.
+    Thick lines are root mean squares over the trajectories at each step, thin lines single trajectories of `network`.
     """
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 2).ravel()
     for axis, name in zip(axes, "xyz", strict=False):
         column = f"error_{name}_m"
-        for _, single in errors[own].groupby(["scene_id", "trajectory_id"]):
-            axis.plot(single["step"], single[column].abs(), color=COLOURS[own], linewidth=0.5, alpha=0.5)
+        for _, single in errors[network].groupby(["scene_id", "trajectory_id"]):
+            axis.plot(single["step"], single[column].abs(), color=COLOURS[network], linewidth=0.5, alpha=0.5)
         for method, table in errors.items():
             of_step = np.sqrt(table.assign(squared=table[column] ** 2).groupby("step")["squared"].mean())
             axis.plot(of_step.index, of_step, color=COLOURS[method], label=method)
@@ -100,11 +99,11 @@ def draw_errors(path: Path, errors: dict[str, pd.DataFrame]) -> None:
             axis.plot(values, np.arange(1, len(values) + 1) / len(values), color=COLOURS.get(method), label=method)
     _label(axes[0], "position error of a step", "length of the error vector (m)", "fraction of pairs below")
     _label(axes[1], "orientation error of a step", "residual rotation angle (deg)", "fraction of pairs below")
-    place, width = np.arange(3), 0.8 / len(errors)
+    bar_position, width = np.arange(3), 0.8 / len(errors)
     for i, (method, table) in enumerate(errors.items()):
         heights = [float(np.sqrt(np.mean(table[f"error_{axis}_m"] ** 2))) for axis in "xyz"]
-        axes[2].bar(place + i * width, heights, width, color=COLOURS.get(method), label=method)
-    axes[2].set_xticks(place + 0.4 - width / 2, ["x", "y", "z (view)"])
+        axes[2].bar(bar_position + i * width, heights, width, color=COLOURS.get(method), label=method)
+    axes[2].set_xticks(bar_position + 0.4 - width / 2, ["x", "y", "z (view)"])
     _label(axes[2], "position RMSE of each component, by axis of O_C", "", "RMSE (m)")
     axes[0].legend()
     save_figure(path, figure)

@@ -18,11 +18,11 @@ from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.covariance import calibrate, stated_covariances
 from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import Trajectory, load_trajectories
-from perilune_train.motion.metrics.baselines import baselines
+from perilune_train.motion.metrics.baselines import MethodMotions, baselines
 from perilune_train.motion.metrics.report import write_evaluation
 from perilune_train.motion.network import Fusion, Scales, load_navigator, predict, predict_by_pairs
 from perilune_train.motion.train.pose_results import check_one_area, evaluate_pose_run
-from perilune_train.motion.train.task import NavigationTask
+from perilune_train.motion.train.task import Initial, NavigationTask
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import (
     Provenance,
@@ -33,8 +33,9 @@ from perilune_train.records.provenance import (
 )
 from perilune_train.shipped.models import weights_file
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
-from perilune_train.training.fit import fit, own_share
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit, own_share
 from perilune_train.training.runs import (
+    NamedRun,
     RunFolder,
     check_architecture,
     choose_device,
@@ -49,18 +50,15 @@ _PREFIX = "backbone."
 def navigate_run(
     settings: NavigateConfig,
     dataset_address: Address,
-    runs: Path,
-    name: str,
+    named: NamedRun,
     detector: Path | None,
-    overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> list[RunFolder]:
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
 
-    Resumes interrupted runs of the same settings, dataset and detector, and leaves finished ones unchanged; `overwrite`
-    replaces both.
+    Resumes interrupted runs with equal settings, dataset and detector, and leaves finished ones unchanged.
 
-    `detector` is the default checkpoint for the stack network's backbone, used if it exists and has the same
+    `detector` is the default checkpoint for the stack network's backbone: it is used if it exists and has the same
     architecture; `settings.detector` must have it. Raises UserError on bad data, a checkpoint of another architecture,
     or a detector that was fitted to terrain of the test split (unless `allow_overlap`).
 
@@ -68,10 +66,10 @@ def navigate_run(
     """
     console.quiet = not is_first_process()
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
-    names = {"warp": name, "stack": f"{name}-stack"}
-    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in fusions}
+    endings = {"warp": "", "stack": "-stack"}
+    folders = {fusion: named.folder("navigate", endings[fusion]) for fusion in fusions}
     with held(*folders.values()):
-        return _run(folders, settings, dataset_address, detector, overwrite, allow_overlap)
+        return _run(folders, settings, dataset_address, detector, named.overwrite, allow_overlap)
 
 
 def _run(
@@ -93,25 +91,25 @@ def _run(
     opened = open_single(dataset_address)
     if "stack" in fusions and settings.stack.target == "pose":
         check_one_area(opened)
-    own = training_provenance(opened)
+    provenance = training_provenance(opened)
     start = _start_of_warp(settings) if "warp" in fusions else None
     of_start = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
-    terrain = {"warp": own.joined(of_start), "stack": own.joined(inherited)}
-    # One check for both, because the table of the warp run includes the metrics of stack.
+    terrain = {"warp": provenance.joined(of_start), "stack": provenance.joined(inherited)}
+    # Both runs share one check, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"].joined(of_start), opened, "test", allow_overlap)
     share = own_share(1, 1)
     stream = Stream(settings.stream, opened) if settings.stream is not None else None
     trajectories = load_trajectories(opened, share)
     seconds: dict[Fusion, float] = {}
     tasks: dict[Fusion, NavigationTask] = {}
-    # Train all before any is evaluated, so that the other processes do not wait for the first.
+    # Train all networks before evaluating any, so that the other processes do not wait for the first.
     for fusion, run in folders.items():
         if states[fusion] != "finished":
             start_run(run, "navigate", settings, inputs[fusion], states[fusion])
             resume = states[fusion] == "resume"
             if fusion == "stack":
                 lightning.seed_everything(settings.seed, verbose=False)
-                task = NavigationTask(settings, fusion, trajectories, backbone, share)
+                task = NavigationTask(settings, fusion, trajectories, share, initial=Initial(backbone))
             else:
                 task = _warp_task(settings, trajectories, share, stream, start)
             task.provenance = terrain[fusion]
@@ -141,14 +139,14 @@ def _run(
 def _evaluate_motions(
     folders: dict[Fusion, RunFolder], trajectories: list[Trajectory], common: dict[Fusion, Metrics]
 ) -> None:
-    """Evaluate networks for motion beside the methods without training; write the tables of the trained ones.
+    """Evaluate networks for motion together with the methods without training; write tables for the trained networks.
 
-    `common` has the entries of each trained run's metrics that need no evaluation.
+    `common` has the metrics of each trained run that need no evaluation.
     """
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     motions, covariances = classical.motions, classical.covariances
-    # stack comes first, so that the table of the warp run, which finishes last, has both.
+    # The network stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
@@ -169,16 +167,16 @@ def _evaluate_motions(
             "network/parameters": sum(p.numel() for p in network.parameters()),
             **common[fusion],
         }
-        write_evaluation(run.root, fusion, "test", test, motions, covariances, details)
+        write_evaluation(run.root, fusion, "test", test, MethodMotions(motions, covariances), details)
 
 
 def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
     """Content of the checkpoint `navigate.init_from`. Raises UserError if its network has another architecture."""
     if settings.init_from is None:
         return None
-    path, own = weights_file(settings.init_from), settings.warp
+    path, warp = weights_file(settings.init_from), settings.warp
     content = load_weights(path)
-    expected = {"fusion": "warp", **{key: getattr(own, key) for key in ("size_px", "width", "attention", "hidden")}}
+    expected = {"fusion": "warp", **{key: getattr(warp, key) for key in ("size_px", "width", "attention", "hidden")}}
     check_architecture(path, content["architecture"], expected)
     check_architecture_of(NavigatorArchitecture, content["architecture"], path)
     return content
@@ -191,42 +189,41 @@ def _warp_task(
     stream: Stream | None,
     start: dict[str, Any] | None,
 ) -> NavigationTask:
-    """Training of warp from random weights, or from the content of a checkpoint."""
+    """Training of warp, from random weights or from a checkpoint."""
     lightning.seed_everything(settings.seed, verbose=False)
     if start is None:
-        return NavigationTask(settings, "warp", trajectories, None, share, stream)
+        return NavigationTask(settings, "warp", trajectories, share, stream)
     scales = Scales(**start["architecture"]["scales"])
-    task = NavigationTask(settings, "warp", trajectories, None, share, stream, scales)
+    task = NavigationTask(settings, "warp", trajectories, share, stream, Initial(scales=scales))
     load_state(task.network, start["state_dict"], weights_file(str(settings.init_from)))
     return task
 
 
 def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
     """Train one network; returns the training time in seconds."""
-    settings, own = task.settings, task.own
+    settings, network_settings = task.settings, task.own
+    schedule = Schedule(
+        epochs=network_settings.coarse_epochs + network_settings.fine_epochs,
+        monitor="val/position_rmse_vector_m",
+        mode="min",
+        checkpoint_minutes=settings.checkpoint_minutes,
+        accumulate=network_settings.accumulate,
+    )
+    hardware = Hardware(
+        device=choose_device(settings.device),
+        # In coarse epochs some weights have no gradient.
+        strategy="ddp_find_unused_parameters_true" if network_settings.coarse_epochs else "auto",
+        precision=settings.precision,
+    )
+    rate = f"navigate.{task.fusion}.learning_rate, which is {network_settings.learning_rate:g}"
     with closing(task):
-        return fit(
-            run,
-            task,
-            label=f"train {task.fusion}",
-            epochs=own.coarse_epochs + own.fine_epochs,
-            monitor="val/position_rmse_vector_m",
-            mode="min",
-            resume=resume,
-            precision=settings.precision,
-            device=choose_device(settings.device),
-            # In coarse epochs some weights have no gradient.
-            strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
-            checkpoint_minutes=settings.checkpoint_minutes,
-            accumulate=own.accumulate,
-            learning_rate=f"navigate.{task.fusion}.learning_rate, which is {own.learning_rate:g}",
-        )
+        return fit(run, task, schedule, hardware, Wording(f"train {task.fusion}", rate), resume)
 
 
 def _detector_backbone(
     settings: NavigateConfig, default: Path | None
 ) -> tuple[dict[str, Tensor] | None, str, list[Provenance]]:
-    """A detector's backbone weights, their source and the records of its terrain.
+    """A detector's backbone weights, their source, and the records of its terrain.
 
     If no detector has the same architecture: None, the reason, and no record.
     """
@@ -251,7 +248,7 @@ def _detector_backbone(
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
-    own = settings.stack.stages
-    source = f"stages 1 to {min(stages, own)} of {own} from {path}"
+    wanted = settings.stack.stages
+    source = f"stages 1 to {min(stages, wanted)} of {wanted} from {path}"
     say(f"stack: backbone {source}")
     return state, source, [read_provenance(content, path)]

@@ -10,25 +10,24 @@ from perilune_shared.dataset.manifest import open_single
 from perilune_shared.geometry.frames import Array
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import new_folder, write_text
-from perilune_shared.storage.store import Address
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import PosePrior
 from perilune_train.landing.craters.locate import locate
 from perilune_train.landing.map.files import read_maps
 from perilune_train.landing.methods.absolute import absolute_errors, absolute_summary, catalogues_of
-from perilune_train.landing.methods.figures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.page import page_of
+from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.finished_run import fusion_of
+from perilune_train.motion.evaluate_runs import fusion_of
 from perilune_train.motion.metrics.baselines import baselines
-from perilune_train.motion.metrics.metrics import motion_errors, summary
+from perilune_train.motion.metrics.errors import motion_errors, summary
 from perilune_train.motion.network import check_motion, load_navigator, predict
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import write_metrics
-from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.records.provenance import EvaluatedSplit, check_terrain, read_provenance
 from perilune_train.training.begin import hashes_of
 from perilune_train.training.runs import RunFolder, load_weights
 
@@ -37,22 +36,18 @@ PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png"
 
 
 def fly_methods(
-    address: Address,
-    split: str,
-    navigator: Path,
-    detector: Path,
-    out: Path,
-    allow_overlap: bool = False,
-    maps: Path | None = None,
+    evaluated: EvaluatedSplit, navigator: Path, detector: Path, out: Path, maps: Path | None = None
 ) -> pd.DataFrame:
-    """Fly all methods over a split; returns one row per method. `maps` is the folder of a map by our own detector.
+    """Fly all methods over a split, with two networks; returns one row per method.
 
-    Writes methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
+    `navigator` and `detector` are folders of runs, `maps` is the folder of a map from `navigate map`. Writes
+    methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
     pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`, or nothing. Raises
-    UserError if a network was fitted to the terrain of the split, unless `allow_overlap`, or if the dataset lacks
+    UserError if a network was fitted to the terrain of the split and that is not accepted, or if the dataset lacks
     frames.
     """
-    # Record the commit at the start: the checkout may change meanwhile.
+    address, split = evaluated.dataset, evaluated.split
+    # Record the commit at the start: the checkout may change during the run.
     run_record()
     dataset = open_single(address)
     best = {name: RunFolder(run).best for name, run in (("navigator", navigator), ("detector", detector))}
@@ -60,23 +55,25 @@ def fly_methods(
     fusion = fusion_of(best["navigator"], contents["navigator"]["architecture"])
     check_motion(best["navigator"], contents["navigator"]["architecture"])
     checks = [
-        check_terrain(read_provenance(contents[name], path), dataset, split, allow_overlap)
+        check_terrain(read_provenance(contents[name], path), dataset, split, evaluated.allow_overlap)
         for name, path in best.items()
     ]
     mapped = {} if maps is None else read_maps(maps, dataset)
     with new_folder(out) as folder:
         trajectories = load_split(dataset, split)
-        catalogues = catalogues_of(dataset, sorted({one.ids[0] for one in trajectories}), mapped)
+        catalogues = catalogues_of(dataset, sorted({trajectory.ids[0] for trajectory in trajectories}), mapped)
         descents, detection_s = seen_descents(dataset, trajectories, detector)
         network, architecture = load_navigator(best["navigator"], fusion)
-        learned: dict[str, list[Motion]] = {fusion: [predict(network, architecture, one) for one in trajectories]}
+        learned: dict[str, list[Motion]] = {
+            fusion: [predict(network, architecture, trajectory) for trajectory in trajectories]
+        }
         stated = stated_covariances(navigator, network, architecture, trajectories)
         relative = _relative(trajectories, learned, {} if stated is None else {fusion: stated})
         errors = absolute_errors(dataset, descents, catalogues)
-        absolute = pd.DataFrame([{"method": name, **absolute_summary(name, own)} for name, own in errors.items()])
+        absolute = pd.DataFrame([{"method": name, **absolute_summary(name, table)} for name, table in errors.items()])
         rows = pd.concat([relative, absolute.assign(kind="absolute")], ignore_index=True)
         rows.to_parquet(folder / TABLE, index=False)
-        frames = pd.concat([own.assign(method=name) for name, own in errors.items()], ignore_index=True)
+        frames = pd.concat([table.assign(method=name) for name, table in errors.items()], ignore_index=True)
         frames.to_parquet(folder / FRAMES, index=False)
         draw_by_altitude(folder / PICTURES[0], {name: errors[name] for name in errors if not name.startswith("lost")})
         if "filter" in errors:
@@ -103,7 +100,7 @@ def _relative(
             {
                 "method": method,
                 "kind": "relative",
-                "n_frames": float(sum(one.n_pairs for one in trajectories)),
+                "n_frames": float(sum(trajectory.n_pairs for trajectory in trajectories)),
                 "position_rmse_m": figures["position_rmse_vector_m"],
                 "attitude_rmse_deg": figures["orientation_rmse_angle_deg"],
                 "stated_rmse_m": figures.get("stated_position_rmse_vector_m", np.nan),

@@ -25,10 +25,12 @@ def by_gate(effects: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """
     rows = []
     for (block, version), every in effects.groupby(["map", "version"], sort=False):
-        own = every.dropna(subset="change")
-        low, high = scene_interval(own["change"].to_numpy(), own["scene_id"].tolist(), own["frame_id"].tolist(), rng)
-        change = own["change"].mean()
-        rows.append({"map": block, "version": version, "change": change, "low": low, "high": high, "n": len(own)})
+        defined = every.dropna(subset="change")
+        low, high = scene_interval(
+            defined["change"].to_numpy(), defined["scene_id"].tolist(), defined["frame_id"].tolist(), rng
+        )
+        change = defined["change"].mean()
+        rows.append({"map": block, "version": version, "change": change, "low": low, "high": high, "n": len(defined)})
     return pd.DataFrame(rows)
 
 
@@ -47,17 +49,17 @@ def scene_interval(
 
 
 def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
-    """Draw the mean change of every gate in each version, with intervals where there are any."""
+    """Draw the mean change of every gate in each version, with intervals if they exist."""
     blocks = list(dict.fromkeys(gates["map"]))
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     axis = figure.subplots()
     for k, (version, (label, colour)) in enumerate(VERSIONS.items()):
-        own = gates[gates["version"] == version].set_index("map").reindex(blocks)
-        place = np.arange(len(blocks)) + 0.27 * k
-        axis.bar(place, own["change"], 0.26, color=colour, label=label)
-        errors = np.abs(np.vstack([own["change"] - own["low"], own["high"] - own["change"]]))
+        rows = gates[gates["version"] == version].set_index("map").reindex(blocks)
+        position = np.arange(len(blocks)) + 0.27 * k
+        axis.bar(position, rows["change"], 0.26, color=colour, label=label)
+        errors = np.abs(np.vstack([rows["change"] - rows["low"], rows["high"] - rows["change"]]))
         if np.isfinite(errors).any():
-            axis.errorbar(place, own["change"], errors, fmt="none", ecolor="black", capsize=1.5, linewidth=0.8)
+            axis.errorbar(position, rows["change"], errors, fmt="none", ecolor="black", capsize=1.5, linewidth=0.8)
     axis.set_xticks(np.arange(len(blocks)) + 0.27, blocks, rotation=60)
     axis.axhline(0, color="black", linewidth=0.8)
     axis.set_ylabel("mask with crater - without,\nstandard deviations of the gate", fontsize=9)
@@ -71,8 +73,8 @@ def draw_pair(path: Path, pairs: CraterPairs, masks: dict[str, NDArray[np.floati
 
     `masks` are one gate's masks (N, height, width) of the versions "factual" and "rendered".
     """
-    own = pairs.craters[pairs.craters["image"] == image]
-    frames = [cv2.cvtColor(one[image], cv2.COLOR_GRAY2BGR) for one in (pairs.factual, pairs.counterfactual)]
+    removed_craters = pairs.craters[pairs.craters["image"] == image]
+    frames = [cv2.cvtColor(images[image], cv2.COLOR_GRAY2BGR) for images in (pairs.factual, pairs.counterfactual)]
     low, high = (float(getattr(masks["factual"][image], end)()) for end in ("min", "max"))
     for version in ("factual", "rendered"):
         level = np.clip(255 * (masks[version][image] - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
@@ -82,7 +84,7 @@ def draw_pair(path: Path, pairs: CraterPairs, masks: dict[str, NDArray[np.floati
         frames, ("before", "without outlined craters", f"{gate} before", f"{gate} without"), strict=True
     ):
         picture = np.asarray(cell, np.uint8).copy()
-        for _, crater in own.iterrows():
+        for _, crater in removed_craters.iterrows():
             outline, _ = cv2.findContours(
                 region(picture.shape[:2], crater).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
             )

@@ -1,6 +1,7 @@
-"""One causal run: what single craters do to masks, detections and poses, from frames rendered without them."""
+"""One causal run: the effect of single craters on masks, detections and poses, from frames rendered without them."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,17 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
-from perilune_train.explain.causal import bins, figures
+from perilune_train.explain.causal import bins, pictures
 from perilune_train.explain.causal.claims import Tested, detection_claim, pose_claim, reaction_claim
-from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects, with_found
+from perilune_train.explain.causal.effects import (
+    check_descents,
+    detection_effects,
+    filled_frames,
+    mask_effects,
+    pose_effects,
+    with_found,
+)
 from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed, same_frames
-from perilune_train.explain.causal.pose import check_descents, pose_effects
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.stability import between
 from perilune_train.explain.inputs import frames_of
@@ -32,7 +39,7 @@ from perilune_train.motion.network import load_navigator
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.runs import RunFolder, choose_device
+from perilune_train.training.runs import NamedRun, RunFolder, choose_device
 
 CAPTIONS = {
     "gates_causal.png": "Change of each gate's mask around single craters: crater removed from the ground and rendered"
@@ -45,81 +52,107 @@ CAPTIONS = {
 _BATCH = 8
 
 
-def causal_folder(runs: Path, name: str) -> RunFolder:
-    """The folder that `causal_run` writes; a command holds it (`training.begin.held`)."""
-    return RunFolder(runs / "explain" / f"{name}-causal")
+@dataclass(frozen=True, slots=True)
+class PoseInputs:
+    """Descents with and without some craters, and the network that estimates their poses."""
+
+    dataset: Address
+    """Navigation dataset with all craters."""
+    counterfactual: Address
+    """The same descents without some craters."""
+    checkpoint: Path
+    """best.ckpt of a stack navigator."""
+
+
+@dataclass(frozen=True, slots=True)
+class CausalInputs:
+    """Frames with and without some craters."""
+
+    dataset: Address
+    """Detection dataset with all craters."""
+    counterfactual: Address
+    """The same frames without some craters, from `perilune-render counterfactual`."""
+    split: str = "test"
+    """Split of the frames."""
+    turned: Address | None = None
+    """The same frames under another Sun, with all craters."""
+    pose: PoseInputs | None = None
+    """Inputs for poses."""
+
+
+def causal_folder(named: NamedRun) -> RunFolder:
+    """The folder that `causal_run` writes; a command locks it (`training.begin.held`)."""
+    return named.folder("explain", "-causal")
 
 
 def causal_run(
     settings: ExplainConfig,
-    dataset: Address,
-    counterfactual: Address,
+    named: NamedRun,
     checkpoint: Path,
     gate: str,
-    runs: Path,
-    name: str,
-    split: str = "test",
-    turned: Address | None = None,
-    pose: tuple[Address, Address, Path] | None = None,
-    overwrite: bool = False,
+    inputs: CausalInputs,
     allow_overlap: bool = False,
 ) -> RunFolder:
     """Measure what removed craters change in masks, detections and poses; writes runs/explain/<name>-causal.
 
-    `gate` is the gate of the headline, chosen elsewhere. `counterfactual` is a dataset of
-    `perilune-render counterfactual`, rendered from `dataset`; `turned` another one, with all craters and another Sun;
-    `pose` a navigation dataset, its counterfactual and a stack navigator's best.ckpt. Leaves a finished run of the same
-    inputs unchanged; `overwrite` replaces any.
+    `checkpoint` has the weights of the detector. `gate` is the gate of the headline, chosen on other frames. A finished
+    run with equal inputs stays unchanged.
 
     Raises UserError if the existing run has other settings or inputs; if an input is missing or invalid; or if the
     network was fitted to terrain of the frames (unless `allow_overlap`).
     """
-    run = causal_folder(runs, name)
-    inputs = hashes_of(
-        {
-            "detection dataset": dataset,
-            "counterfactual": counterfactual,
-            "turned Sun": turned,
-            "detector": checkpoint,
-            **dict(zip(("navigation dataset", "navigation counterfactual", "navigator"), pose or (), strict=False)),
+    run = causal_folder(named)
+    dataset, split, turned, pose = inputs.dataset, inputs.split, inputs.turned, inputs.pose
+    read: dict[str, Address | None] = {
+        "detection dataset": dataset,
+        "counterfactual": inputs.counterfactual,
+        "turned Sun": turned,
+        "detector": checkpoint,
+    }
+    if pose is not None:
+        read |= {
+            "navigation dataset": pose.dataset,
+            "navigation counterfactual": pose.counterfactual,
+            "navigator": pose.checkpoint,
         }
-    )
-    state = state_of(run, "explain", settings, inputs, overwrite)
+    hashes = hashes_of(read)
+    state = state_of(run, "explain", settings, hashes, named.overwrite)
     if state == "finished":
         return run
     folder = folder_of(checkpoint)
     config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
-    removed, opened = read_removed(counterfactual), open_single(dataset)
-    fitted = {"detector": (checkpoint, dataset)} | ({} if pose is None else {"navigator": (pose[2], pose[0])})
+    removed, opened = read_removed(inputs.counterfactual), open_single(dataset)
+    fitted = {"detector": (checkpoint, dataset)} | (
+        {} if pose is None else {"navigator": (pose.checkpoint, pose.dataset)}
+    )
     marks, terrain = terrain_marks(fitted, allow_overlap, split)
     detector = open_single_scale(checkpoint, config, settings)
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
-    pairs = crater_pairs(opened, open_single(counterfactual), removed, split, config.labels)
+    pairs = crater_pairs(opened, open_single(inputs.counterfactual), removed, split, config.labels)
     # Report faults of the other inputs before anything is written.
     if turned is not None:
         same_frames(opened, open_single(turned), split)
     if pose is not None:
-        check_descents(open_single(pose[0]), open_single(pose[1]), split)
-        navigator, architecture = load_navigator(pose[2], "stack")
-    start_run(run, "explain", settings, inputs, state)
+        descents = open_single(pose.dataset), open_single(pose.counterfactual)
+        check_descents(*descents, split)
+        navigator, architecture = load_navigator(pose.checkpoint, "stack")
+    start_run(run, "explain", settings, hashes, state)
     rng = np.random.default_rng([settings.seed, 3])
     versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
     say(f"{len(pairs.craters)} views of {len(removed)} removed craters in {len(pairs.factual)} frames")
     masks = {version: detector_masks(detector.network, images, checkpoint) for version, images in versions.items()}
     moved = mask_effects(pairs, masks, shifts)
-    found = detection_effects(pairs, lambda images: _detect(detector, images), versions)
-    found = with_found(found, threshold, shifts)
-    gates = figures.by_gate(moved, rng)
-    tables = {"mask_effects": moved, "detection_effects": found, "gate_effects": gates}
-    tables |= {"mask_bins": bins.binned(moved, "change"), "detection_bins": bins.binned(found, "found")}
+    detected = detection_effects(pairs, lambda images: _detect(detector, images), versions)
+    detected = with_found(detected, threshold, shifts)
+    gates = pictures.by_gate(moved, rng)
+    tables = {"mask_effects": moved, "detection_effects": detected, "gate_effects": gates}
+    tables |= {"mask_bins": bins.binned(moved, "change"), "detection_bins": bins.binned(detected, "found")}
     if turned is not None:
         tables["turned_sun"] = _turned(detector, opened, open_single(turned), split, checkpoint)
     if pose is not None:
         navigator = navigator.to(choose_device(settings.device))
-        tables["pose_effects"] = pose_effects(
-            navigator, architecture, open_single(pose[0]), open_single(pose[1]), split
-        )
+        tables["pose_effects"] = pose_effects(navigator, architecture, *descents, split)
     for title, table in tables.items():
         with written_aside(run.root / f"{title}.parquet") as aside:
             table.to_parquet(aside, index=False)
@@ -127,7 +160,7 @@ def causal_run(
     mark_files(run.root, list(CAPTIONS), "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
     tested = _tested(tables, gate, rng)
     metrics = _metrics(tables, gate) | _p_values(tested) | terrain
-    claims = [one.claim for one in tested.values()]
+    claims = [claim.claim for claim in tested.values()]
     write_text(run.root / "claims.json", json.dumps(claims, indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
     for claim in claims:
@@ -141,19 +174,19 @@ def _versions(
 ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[float, float] | None]]:
     """All versions of the frames by name, and the shifts of the placebo regions."""
     whole = load_split(dataset, split, labels)
-    place = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
-    frames = frames_of(whole, [place[one] for one in pairs.frames["frame_id"]], settings.ring_factors)
+    index_of = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
+    frames = frames_of(whole, [index_of[name] for name in pairs.frames["frame_id"]], settings.ring_factors)
     inpainted, placebo, shifts = filled_frames(pairs, frames.truth < 1, rng)
     names = ("factual", "rendered", "inpainted", "placebo")
     return dict(zip(names, (pairs.factual, pairs.counterfactual, inpainted, placebo), strict=True)), shifts
 
 
 def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
-    found = []
+    detections = []
     for start in range(0, len(images), _BATCH):
         boxes, scores = detector.predict(images[start : start + _BATCH])
-        found += detections_of(boxes, scores, detector.config.evaluation)
-    return found
+        detections += detections_of(boxes, scores, detector.config.evaluation)
+    return detections
 
 
 def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, checkpoint: Path) -> pd.DataFrame:
@@ -163,17 +196,17 @@ def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, c
     """
     tables = same_frames(factual, turned, split)
     images = [load_images(dataset, rows, split) for dataset, rows in zip((factual, turned), tables, strict=True)]
-    masks = [detector_masks(detector.network, one, checkpoint) for one in images]
+    masks = [detector_masks(detector.network, image, checkpoint) for image in images]
     return between(masks[0], masks[1], "turned Sun")
 
 
 def _draw(folder: Path, pairs: CraterPairs, masks: dict, tables: dict[str, pd.DataFrame], gate: str) -> None:
-    figures.draw_gate_effects(folder / "gates_causal.png", tables["gate_effects"])
+    pictures.draw_gate_effects(folder / "gates_causal.png", tables["gate_effects"])
     bins.draw_bins(folder / "detections_causal.png", {"share of craters that are found": tables["detection_bins"]})
     bins.draw_gate_bins(folder / "bins_causal.png", tables["mask_bins"])
     image = int(np.bincount(pairs.craters["image"].to_numpy()).argmax())
-    both = {version: masks[version][gate] for version in ("factual", "rendered")}
-    figures.draw_pair(folder / "before_after_causal.png", pairs, both, image, gate)
+    masks_of_pair = {version: masks[version][gate] for version in ("factual", "rendered")}
+    pictures.draw_pair(folder / "before_after_causal.png", pairs, masks_of_pair, image, gate)
 
 
 def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:
@@ -196,7 +229,7 @@ def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:
 
 
 def _tested(tables: dict[str, pd.DataFrame], gate: str, rng: np.random.Generator) -> dict[str, Tested]:
-    """Claims with their p, by the prefix of their keys in metrics.json."""
+    """Claims with their p values, by the prefix of their keys in metrics.json."""
     tested = {
         "gate": reaction_claim(tables["mask_effects"], tables["gate_effects"], gate),
         "found": detection_claim(tables["detection_effects"], rng),
@@ -205,5 +238,5 @@ def _tested(tables: dict[str, pd.DataFrame], gate: str, rng: np.random.Generator
 
 
 def _p_values(tested: dict[str, Tested]) -> Metrics:
-    metrics: Metrics = {f"{name}_p": one.p for name, one in tested.items()}
+    metrics: Metrics = {f"{name}_p": test.p for name, test in tested.items()}
     return metrics | {f"{name}_p_placebo": tested[name].p_placebo for name in ("gate", "found")}

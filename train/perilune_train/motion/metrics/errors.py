@@ -79,21 +79,24 @@ def pose_errors(trajectories: list[Trajectory], poses: list[Pose]) -> pd.DataFra
 
 
 def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
-    """`summary` of poses, with the medians of the lengths of both errors, and the position by altitude."""
+    """`summary` for poses, with the medians of the lengths of both errors, and the errors of position by altitude."""
     figures = summary(errors)
     figures["position_error_median_m"] = float(errors["position_error_m"].median())
     figures["orientation_error_median_deg"] = float(errors["orientation_error_deg"].median())
     for low, high in itertools.pairwise(_ALTITUDES_M):
-        own = errors[(errors["altitude_m"] >= low) & (errors["altitude_m"] < high)]
-        if len(own):
-            figures[f"altitude_{low}_{high}_m/position_rmse_per_component_m"] = _rms(own["position_error_m"]) / 3**0.5
+        in_bin = errors[(errors["altitude_m"] >= low) & (errors["altitude_m"] < high)]
+        if len(in_bin):
+            figures[f"altitude_{low}_{high}_m/position_rmse_per_component_m"] = (
+                _rms(in_bin["position_error_m"]) / 3**0.5
+            )
     return figures
 
 
 def normalised_errors(trajectory: Trajectory, motion: Motion, covariance: Array) -> Array:
-    """Squared errors of rotation and shift together, divided by their covariance (n - 1, 6, 6): 6 in the mean if right.
+    """Normalised errors squared of rotation and shift together, by their covariance (n - 1, 6, 6); 6 in the mean if it
+    is right.
 
-    (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.)
+    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.
     """
     error = signed_errors(trajectory, motion)
     return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])

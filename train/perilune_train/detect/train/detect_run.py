@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import lightning
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from perilune_shared.console.terminal import console, say, say_page
 from perilune_shared.dataset.manifest import Dataset, open_single
+from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
@@ -24,25 +27,23 @@ from perilune_train.detect.evaluate.split_evaluation import (
     selection_entries,
     write_detections,
 )
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.detector import load_detector, open_detector
 from perilune_train.detect.inference.scales import detect_split, multiply_adds_of_a_frame
-from perilune_train.detect.train.anchors import best_possible_recall, mean_best_iou
-from perilune_train.detect.train.network import (
-    anchor_report,
-    anchor_sizes,
-    build_network,
-    load_teacher,
-)
+from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
+from perilune_train.detect.train.distill import Teacher
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
+from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.records.provenance import check_terrain, protocol_of, training_provenance
 from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
-from perilune_train.training.fit import fit, own_share
+from perilune_train.training.fit import Hardware, Schedule, Wording, fit, own_share
+
+_ANCHOR_STREAM = 1
 
 
 def run_detect(
@@ -55,7 +56,7 @@ def run_detect(
 ) -> runs.RunFolder:
     """Train and evaluate a detector; all output is in the returned folder.
 
-    Resumes an interrupted run of the same settings and dataset, and leaves a finished one unchanged; `overwrite`
+    Resumes an interrupted run with equal settings and dataset, and leaves a finished one unchanged; `overwrite`
     replaces both.
 
     Raises UserError if the existing run has other settings or another dataset; if its last state is damaged; if the
@@ -105,24 +106,19 @@ def _run(
         say_page(anchor_report(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
     task.terrain = terrain.plain()
-    seconds = fit(
-        run,
-        task,
-        label="train detector",
+    schedule = Schedule(
         epochs=config.epochs,
         monitor="val/ap50_paper",
         mode="max",
-        resume=resume,
-        gradient_clip=config.gradient_clip,
-        precision=config.precision,
-        device=device,
-        devices=config.devices,
-        num_nodes=config.num_nodes,
-        strategy="ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy,
-        checkpoint_minutes=config.checkpoint_minutes,
         validate_every=config.validate_every,
-        learning_rate=f"detect.learning_rate, which is {config.learning_rate:g}",
+        checkpoint_minutes=config.checkpoint_minutes,
+        gradient_clip=config.gradient_clip,
     )
+    # Frozen weights have no gradient.
+    strategy = "ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy
+    hardware = Hardware(device, config.devices, config.num_nodes, strategy, config.precision)
+    wording = Wording("train detector", f"detect.learning_rate, which is {config.learning_rate:g}")
+    seconds = fit(run, task, schedule, hardware, wording, resume)
     if not runs.is_first_process():
         return run
     if share != ALONE:
@@ -156,18 +152,52 @@ def evaluate(
 ) -> Metrics:
     """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only.
 
-    `sizes_px` (S, 2) are those of the training labels.
+    `sizes_px` (S, 2) are the sizes of the training labels.
     """
     detector = open_detector(run.best, config)
     found_val, _ = detect_split(detector, splits["val"], "val")
-    found, rate = detect_split(detector, splits["test"], "test")
+    found_test, rate = detect_split(detector, splits["test"], "test")
     matches = match_detections(splits["val"], found_val, config)
     threshold, chosen_on = threshold_on_validation(detector, splits["val"], found_val)
-    evaluation = evaluate_split(splits["test"], found, config, threshold)
-    write_detections(run.root / "detections.parquet", splits["test"], found)
+    evaluation = evaluate_split(splits["test"], found_test, config, threshold)
+    write_detections(run.root / "detections.parquet", splits["test"], found_test)
     about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, chosen_on)
     about.append(anchor_report(detector.network, sizes_px, config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}
     return metrics | {"test/images_per_s": round(rate, 2)}
+
+
+def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> YOLOv3:
+    """Build the network with anchors for these label sizes (N, 2). Raises UserError if there are no labels."""
+    if len(sizes_px) == 0:
+        raise UserError(where, "labels", "no visible crater in the training split", "at least one")
+    count = len(config.strides) * ANCHORS_PER_SCALE
+    rng = np.random.default_rng([config.seed, _ANCHOR_STREAM])
+    anchors = kmeans_anchors(sizes_px, count, rng, plain=config.anchor_sampling == "plain")
+    lightning.seed_everything(config.seed, verbose=False)
+    shaped = torch.as_tensor(anchors).view(len(config.strides), ANCHORS_PER_SCALE, 2)
+    return YOLOv3(shaped, config.in_channels, config.width, config.attention, config.strides)
+
+
+def load_teacher(path: Path, config: DetectConfig) -> Teacher:
+    """Load the teacher. Raises UserError if its input channels or strides differ from the student's."""
+    network = load_detector(path)
+    expected = {"in_channels": config.in_channels, "strides": list(config.strides)}
+    runs.check_architecture(path, runs.load_weights(path)["architecture"], expected)
+    return Teacher(network.requires_grad_(False))
+
+
+def anchor_sizes(network: YOLOv3) -> np.ndarray:
+    """Widths and heights (N, 2) in pixels of a network's anchors."""
+    return network.anchors.flatten(0, 1).double().cpu().numpy()
+
+
+def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
+    """State how well a network's anchors fit label sizes (N, 2), and so the best recall that training can reach."""
+    recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
+    return (
+        f"anchors: best possible recall {recall:.4f}, the fraction of training labels with an anchor within a factor "
+        f"of {ratio:g} in width and height"
+    )

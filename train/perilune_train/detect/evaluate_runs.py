@@ -1,21 +1,47 @@
-"""Compare several evaluations in one table and one picture."""
+"""Evaluate a finished run on a split of any dataset, and compare evaluations in a table and a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import for_markdown
 from perilune_shared.storage.tables.limits import RUN_TABLE
 from perilune_shared.storage.tables.read import read_table
-from perilune_train.detect.evaluate.figures import draw_curves
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.metrics import Curve
-from perilune_train.detect.evaluate.report import CURVE_FILE
+from perilune_train.detect.evaluate.pictures import draw_curves
+from perilune_train.detect.evaluate.report import CURVE_FILE, write_evaluation
+from perilune_train.detect.evaluate.split_evaluation import (
+    WRITTEN,
+    dataset_entries,
+    evaluate_split,
+    report_head,
+    selection_entries,
+    write_detections,
+)
+from perilune_train.detect.finished_run import check_output, chosen_threshold
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.scales import detect_split
+from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.marks import mark_files
-from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
-from perilune_train.records.provenance import Status, TerrainCheck
+from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics, write_metrics
+from perilune_train.records.provenance import (
+    EvaluatedSplit,
+    Provenance,
+    Status,
+    TerrainCheck,
+    check_terrain,
+    protocol_of,
+    read_provenance,
+    split_terrain,
+)
 from perilune_train.records.spread import read_spread
+from perilune_train.training import runs
 
 _COLUMNS = {
     "ap50_paper": "AP",
@@ -27,6 +53,59 @@ _COLUMNS = {
     "f1": "F1",
 }
 _LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
+
+
+def evaluate_again(
+    run: Path,
+    config: DetectConfig,
+    evaluated: EvaluatedSplit,
+    threshold: float | Literal["run", "validation"] = "run",
+    out: Path | None = None,
+) -> Path:
+    """Evaluate a run's best weights on a split of a dataset; all output is in the returned folder.
+
+    `threshold` is a score; "run" takes the threshold that the run chose, and "validation" chooses a new one on the
+    validation split of the dataset. Without `out`, the folder is `evaluation` in the run's folder.
+    """
+    folder = out or run / "evaluation"
+    check_output(folder, run)
+    choose_threshold, split = threshold == "validation", evaluated.split
+    if isinstance(threshold, str):
+        chosen, threshold_source = chosen_threshold(run), "of the run, chosen on its validation split"
+    else:
+        chosen, threshold_source = threshold, "given on the command line"
+    known = read_metrics(run).get("dataset/name")
+    dataset = open_single(evaluated.dataset)
+    best = runs.RunFolder(run).best
+    terrain = read_provenance(runs.load_weights(best), best)
+    if choose_threshold:
+        terrain = Provenance(split_terrain(dataset, "val", "calibrated")).joined([terrain])
+    terrain_check = check_terrain(terrain, dataset, split, evaluated.allow_overlap)
+    protocol = protocol_of(dataset.info)
+    if known is not None and known != dataset.info.name:
+        protocol = f"not the run's dataset ({known}); split by {dataset.info.split_by}"
+    if split != "test":
+        protocol += f"; {split} frames, used to {'train' if split == 'train' else 'select'} the network"
+    detector = open_detector(best, config)
+    frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
+    if choose_threshold:
+        val = load_split(dataset, "val", config.labels)
+        seen, _ = detect_split(detector, val, "val")
+        chosen, chosen_on = threshold_on_validation(detector, val, seen)
+        threshold_source = f"{chosen_on} of the dataset"
+    detections, rate = detect_split(detector, frames, split)
+    evaluation = evaluate_split(frames, detections, config, chosen)
+    write_detections(folder / "detections.parquet", frames, detections)
+    about = report_head(dataset, split, config, protocol, run.resolve().name, threshold_source)
+    write_evaluation(folder, evaluation, list(frames.frames.images), about)
+    metrics = (
+        selection_entries(config, frames) | dataset_entries(dataset, split, config) | {"dataset/protocol": protocol}
+    )
+    metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
+    metrics[f"{split}/images_per_s"] = round(rate, 2)
+    mark_files(folder, WRITTEN, terrain_check.mark)
+    write_metrics(folder, metrics | terrain_check.metrics())
+    return folder
 
 
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
@@ -47,7 +126,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
                 "ap50_paper: run `perilune-train detect evaluate` again",
             )
         if "images/name" in metrics:
-            # An evaluation on real images; its keys have no split as prefix.
+            # An evaluation on real images has keys without a split.
             split, figures, selection = "images", metrics, f"from {metrics.get('min_size_px')} px"
             entries: list[object] = [metrics.get("images/name"), split, None, selection, metrics.get("scales")]
         else:
@@ -61,7 +140,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         cells = [for_markdown(name), *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        # AP of the whole curve, not of the saved points.
+        # AP of the whole curve; the file has fewer points.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]
@@ -90,7 +169,7 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
 
 
 def read_curve(path: Path) -> Curve:
-    """Read the curve of an evaluation. Raises UserError if it is missing or another table."""
+    """Read the curve of an evaluation. Raises UserError if the table is missing or has other columns."""
     columns = read_table(path, RUN_TABLE, {"score": "number", "precision": "number", "recall": "number"})
     return Curve(*(columns.numbers(name) for name in ("score", "precision", "recall")))
 

@@ -55,12 +55,12 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
     groups = list(flown.groupby(["scene_id", "trajectory_id"]))[:_MOST_DESCENTS]
     figure = Figure(figsize=(14, 2.2 * len(groups) + 0.6), layout="constrained")
     axes = figure.subplots(len(groups), 3, squeeze=False, sharex=True)
-    for row, (ids, own) in zip(axes, groups, strict=True):
-        for axis, place in zip("xyz", row, strict=True):
-            draw_band(place, own, axis)
-            _label(place, f"{'/'.join(map(str, ids))}: {axis}", "", "m")
-    for place in axes[-1]:
-        place.set_xlabel("time (s)")
+    for row, (ids, flight) in zip(axes, groups, strict=True):
+        for axis, panel in zip("xyz", row, strict=True):
+            draw_band(panel, flight, axis)
+            _label(panel, f"{'/'.join(map(str, ids))}: {axis}", "", "m")
+    for panel in axes[-1]:
+        panel.set_xlabel("time (s)")
     axes[0, 0].legend()
     save_figure(path, figure)
 
@@ -68,7 +68,7 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
 def draw_matches(
     path: Path, image: NDArray[np.uint8], descent: SeenDescent, frame: int, catalogue: Catalogue, located: Located
 ) -> None:
-    """Draw a frame, its detections, matched (cyan) and not (red), and the catalogue's craters at the pose (yellow)."""
+    """Draw a frame: matched (cyan) and unmatched (red) detections, and the catalogue's craters at the pose (yellow)."""
     figure = Figure(figsize=(9, 9.4), layout="constrained")
     axis = figure.subplots()
     enlarged = cv2.resize(image, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
@@ -78,8 +78,8 @@ def draw_matches(
     )
     sightings, angle = descent.sightings[frame], np.linspace(0, 2 * np.pi, 60)
     matched = set(located.fix.sighting.tolist())
-    for place, (centre, radius) in enumerate(zip(sightings.centre_px, sightings.radius_px, strict=True)):
-        colour = "cyan" if place in matched else "red"
+    for number, (centre, radius) in enumerate(zip(sightings.centre_px, sightings.radius_px, strict=True)):
+        colour = "cyan" if number in matched else "red"
         axis.plot(centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle), color=colour, linewidth=1)
     seen = projected(catalogue, descent.camera, located.fix.pose, least_radius_px=float(sightings.radius_px.min()))
     axis.plot(*seen.centre_px.T, "+", color="yellow", markersize=5)

@@ -42,9 +42,9 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
     unit = bins[0].ap50_paper_spread.unit if bins else "unit"
     drawn = [(by, title) for by, title in _PANELS.items() if any(part.by == by for part in bins)]
     figure = Figure(figsize=(4.4 * max(len(drawn), 1), 3.8), layout="constrained")
-    for place, (by, title) in enumerate(drawn):
+    for column, (by, title) in enumerate(drawn):
         parts = [part for part in bins if part.by == by]
-        axes = figure.add_subplot(1, len(drawn), place + 1)
+        axes = figure.add_subplot(1, len(drawn), column + 1)
         heights = np.array([part.ap50_paper for part in parts])
         colours = ["#3b7dd8" if part.ap50_paper >= _GOAL else "#d8873b" for part in parts]
         axes.bar(range(len(parts)), heights, color=colours)
@@ -58,7 +58,7 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
         axes.axhline(_GOAL, linestyle="--", color="black", linewidth=0.8)
         for x, height in enumerate(heights):
             axes.text(x - 0.36, 0.02, f"{height:.2f}", fontsize=8, color="white")
-        axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if place == 0 else "")
+        axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if column == 0 else "")
         axes.set_xticks(range(len(parts)), [f"{part.label}\n{part.labels}" for part in parts], fontsize=8)
     figure.suptitle(
         f"AP (the paper's definition) with 95 % intervals, or a dot per {unit} if there are fewer than {MIN_UNITS}; "
@@ -84,14 +84,14 @@ def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) ->
     used: set[int] = set()
     chosen: dict[str, list[int]] = {}
     for name, order in orders.items():
-        seen: list[int] = []
+        picked: list[int] = []
         for others_too in (False, True):
             for index in order.tolist():
-                fresh = others_too or groups[index] not in [groups[other] for other in seen]
-                if len(seen) < count and index not in used and fresh:
-                    seen.append(index)
+                fresh = others_too or groups[index] not in [groups[other] for other in picked]
+                if len(picked) < count and index not in used and fresh:
+                    picked.append(index)
                     used.add(index)
-        chosen[name] = seen
+        chosen[name] = picked
     return {name: chosen[name] for name in ("best", "typical", "worst")}
 
 
@@ -102,10 +102,10 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
     f1 = evaluation.frame_f1()
     columns = 2 * count
     figure = Figure(figsize=(5 * columns, 5.2 * 3 + 0.5), layout="constrained")
-    places = {"best": 0, "typical": 1, "worst": 2}
+    row_of_name = {"best": 0, "typical": 1, "worst": 2}
     for name, index in rows:
-        place = places[name] * columns + 2 * chosen[name].index(index)
-        plain, drawn = (figure.add_subplot(3, columns, place + k) for k in (1, 2))
+        panel = row_of_name[name] * columns + 2 * chosen[name].index(index)
+        plain, drawn = (figure.add_subplot(3, columns, panel + k) for k in (1, 2))
         for axes in (plain, drawn):
             image = images[index]
             axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, image.shape[1], image.shape[0], 0))
@@ -134,9 +134,9 @@ def _title(evaluation: Evaluation, index: int) -> str:
 
 def _draw_marks(axes: Axes, evaluation: Evaluation, index: int) -> None:
     labels, matches, overlaps = evaluation.labels[index], evaluation.matches, evaluation.overlaps
-    own = (matches.frame == index) & (matches.scores >= evaluation.threshold)
+    shown = (matches.frame == index) & (matches.scores >= evaluation.threshold)
     missed = labels.selected.copy()
-    missed[matches.label[own & (matches.label >= 0)] - np.searchsorted(overlaps.label_frame, index)] = False
+    missed[matches.label[shown & (matches.label >= 0)] - np.searchsorted(overlaps.label_frame, index)] = False
     known = labels.labelled
     for ellipse, selected, lost in zip(labels.ellipses[known], labels.selected[known], missed[known], strict=True):
         cx, cy, a, b, theta = ellipse
@@ -144,6 +144,6 @@ def _draw_marks(axes: Axes, evaluation: Evaluation, index: int) -> None:
         axes.add_patch(
             Ellipse((cx, cy), 2 * a, 2 * b, angle=np.degrees(theta), fill=False, linewidth=width, color=colour)
         )
-    for box, outcome in zip(overlaps.boxes[own], matches.outcome[own], strict=True):
+    for box, outcome in zip(overlaps.boxes[shown], matches.outcome[shown], strict=True):
         colour = {FOUND: _FOUND, FALSE: _FALSE}.get(int(outcome), "white")
         axes.add_patch(Rectangle(box[:2], *(box[2:] - box[:2]), fill=False, linewidth=0.8, color=colour))

@@ -29,23 +29,22 @@ from perilune_train.landing.craters.catalogue import (
     with_errors,
 )
 from perilune_train.landing.filter.flight import Instruments, fly_together, together
-from perilune_train.landing.methods.flights import default_sigmas, lander_of, mounting_of, row_of, table_of
+from perilune_train.landing.methods.flights import Start, default_sigmas, lander_of, mounting_of, row_of, table_of
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
 from perilune_train.landing.monte_carlo.draw import drawn
-from perilune_train.landing.monte_carlo.figures import draw_bands, draw_consistency
-from perilune_train.landing.monte_carlo.page import page_of
-from perilune_train.landing.monte_carlo.scenario import Scenario
+from perilune_train.landing.monte_carlo.page import draw_bands, draw_consistency, page_of
+from perilune_train.landing.monte_carlo.scenario import Draws, Scenario
 from perilune_train.motion.data.trajectories import load_split
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.marks import mark_files
-from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.records.provenance import EvaluatedSplit, check_terrain, read_provenance
 from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, TABLE = "monte_carlo.md", "draws.parquet"
 PICTURES = ("errors.png", "consistency.png")
 REFERENCE: InertialGrade = "navigation"
-"""Inertial measurements that are taken as the true motion: the errors of this grade are smaller than those of
-`GRADE` by factors of 6 (noise of the specific force) to 1000."""
+"""Grade of the inertial measurements that count as the true motion: its errors are smaller than those of `GRADE` by
+factors of 6 (noise of the specific force) to 1000."""
 GRADE: InertialGrade = "tactical"
 _TOGETHER = 20
 """Number of draws of a descent that are flown together."""
@@ -54,7 +53,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """One descent and what its draws start from."""
+    """One descent and the inputs of its draws."""
 
     descent: SeenDescent
     """The descent with recorded detections."""
@@ -70,54 +69,45 @@ class Job:
 
     sites: list[Site]
     """All descents."""
-    mounting: Array
-    """rotation_camera_from_body (3, 3)."""
+    rotation_camera_from_body: Array
+    """Mounting of the camera (3, 3)."""
     sigmas: Array
     """Stated errors of the start."""
     scenario: Scenario
     """What goes wrong."""
     seed: int
-    """Of all draws."""
+    """Random seed of all draws."""
 
 
 def fly_draws(
-    address: Address,
-    split: str,
-    detector: Path,
-    out: Path,
-    scenario: Scenario = "nominal",
-    draws: int = 200,
-    attitude_deg: float = 0.5,
-    seed: int = 0,
-    workers: int | None = None,
-    allow_overlap: bool = False,
+    evaluated: EvaluatedSplit, detector: Path, out: Path, draws: Draws, workers: int | None = None
 ) -> pd.DataFrame:
-    """Fly the filter over `draws` random draws of every descent; returns a row per draw and frame.
+    """Fly the filter over random draws of every descent of a split; returns a row per draw and frame.
 
-    The detector runs once over every frame. Writes monte_carlo.md, draws.parquet and pictures to the new folder `out`,
-    or nothing. The result does not depend on the number of workers. Raises UserError if the detector was fitted to the
-    terrain of the split, unless `allow_overlap`, or if the dataset lacks frames or inertial measurements.
+    The detector of the run `detector` runs once over every frame. Writes monte_carlo.md, draws.parquet and pictures to
+    the new folder `out`, or nothing. The result does not depend on the number of workers, by default one per core.
+    Raises UserError if the detector was fitted to the terrain of the split and that is not accepted, or if the dataset
+    lacks frames or inertial measurements.
     """
-    dataset = open_single(address)
+    dataset, split = open_single(evaluated.dataset), evaluated.split
     best = RunFolder(detector).best
-    check = check_terrain(read_provenance(load_weights(best), best), dataset, split, allow_overlap)
+    check = check_terrain(read_provenance(load_weights(best), best), dataset, split, evaluated.allow_overlap)
     with new_folder(out) as folder:
         job = Job(
-            sites_of(dataset, split, detector, address),
+            sites_of(dataset, split, detector, evaluated.dataset),
             mounting_of(dataset),
-            default_sigmas(GRADE, attitude_deg),
-            scenario,
-            seed,
+            default_sigmas(GRADE, draws.attitude_deg),
+            draws.scenario,
+            draws.seed,
         )
         begun = time.perf_counter()
-        rows = pd.concat(all_draws(job, draws, workers or usable_cores()), ignore_index=True)
+        rows = pd.concat(all_draws(job, draws.count, workers or usable_cores()), ignore_index=True)
         rows = rows.sort_values(["scene_id", "trajectory_id", "draw", "time_s"], ignore_index=True)
         rows.to_parquet(folder / TABLE, index=False)
         draw_bands(folder / PICTURES[0], rows)
         draw_consistency(folder / PICTURES[1], rows)
-        about = {"scenario": scenario, "draws": draws, "seed": seed, "attitude_deg": attitude_deg}
         seconds = time.perf_counter() - begun
-        write_markdown(folder / PAGE, page_of(dataset.info.name, split, about, rows, seconds, PICTURES))
+        write_markdown(folder / PAGE, page_of(dataset.info.name, split, draws, rows, seconds, PICTURES))
         mark_files(folder, (PAGE, TABLE, *PICTURES), str(check.metrics()["terrain/mark"]))
     return rows
 
@@ -125,68 +115,80 @@ def fly_draws(
 def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> list[Site]:
     """The descents of a split, after the detector of a run has seen their frames."""
     trajectories = load_split(dataset, split)
-    references = {one.ids: _reference(dataset, one.ids, address) for one in trajectories}
+    references = {trajectory.ids: _reference(dataset, trajectory.ids, address) for trajectory in trajectories}
     descents, _ = seen_descents(dataset, trajectories, detector)
-    exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {one.ids[0] for one in descents}}
-    return [Site(one, references[one.ids], exact[one.ids[0]]) for one in descents]
+    exact = {
+        scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {descent.ids[0] for descent in descents}
+    }
+    return [Site(descent, references[descent.ids], exact[descent.ids[0]]) for descent in descents]
 
 
 def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Instruments:
-    """Measurements that are taken as the true motion."""
-    found = Instruments.of_trajectory(dataset, ids, REFERENCE)
-    if not len(found.inertial):
+    """Measurements that count as the true motion."""
+    instruments = Instruments.of_trajectory(dataset, ids, REFERENCE)
+    if not len(instruments.inertial):
         expected = f"measurements of the grade {REFERENCE} (see the setting dataset.nav.instruments.inertial_grades)"
         raise UserError(str(address), f"inertial of {'/'.join(ids)}", "nothing", expected)
-    return found
+    return instruments
 
 
-def flown_draws(job: Job, place: int, draws: Sequence[int]) -> list[pd.DataFrame]:
-    """Draws of one descent, flown together.
+def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFrame]:
+    """Fly draws of one descent together.
 
-    Each depends on the seed, the place of the descent and the number of the draw, and on the others by rounding alone.
+    Each draw depends on the seed, the number of the descent and the number of the draw; other draws change it by
+    rounding only.
     """
-    site, sigmas = job.sites[place], job.sigmas
-    landers, drawn_ones = [], []
+    site, sigmas = job.sites[number], job.sigmas
+    landers, drawn_descents = [], []
     for draw in draws:
-        rng = np.random.default_rng([job.seed, place, draw])
+        rng = np.random.default_rng([job.seed, number, draw])
         catalogue = with_errors(site.catalogue, CatalogueErrors(), rng)
-        one = drawn(site.descent, site.reference, GRADE, sigmas, job.scenario, rng)
-        landers.append(lander_of(one.descent, job.mounting, catalogue, GRADE, sigmas, one.off))
-        drawn_ones.append(one)
-    instruments = together([one.instruments for one in drawn_ones])
-    seen = zip(*(one.descent.sightings for one in drawn_ones), strict=True)
+        draw_of_descent = drawn(site.descent, site.reference, GRADE, sigmas, job.scenario, rng)
+        landers.append(
+            lander_of(
+                draw_of_descent.descent,
+                job.rotation_camera_from_body,
+                catalogue,
+                Start(GRADE, sigmas, draw_of_descent.start_error),
+            )
+        )
+        drawn_descents.append(draw_of_descent)
+    instruments = together([draw_of_descent.instruments for draw_of_descent in drawn_descents])
+    seen = zip(*(draw_of_descent.descent.sightings for draw_of_descent in drawn_descents), strict=True)
     rows: list[list[dict[str, object]]] = [[] for _ in draws]
     for estimates in fly_together(landers, instruments, site.descent.time_s, seen):
-        for own, estimate in zip(rows, estimates, strict=True):
-            own.append(row_of(site.descent, estimate, job.mounting))
-    return [table_of(site.descent, own).assign(draw=draw) for own, draw in zip(rows, draws, strict=True)]
+        for rows_of_draw, estimate in zip(rows, estimates, strict=True):
+            rows_of_draw.append(row_of(site.descent, estimate, job.rotation_camera_from_body))
+    return [
+        table_of(site.descent, rows_of_draw).assign(draw=draw) for rows_of_draw, draw in zip(rows, draws, strict=True)
+    ]
 
 
 def all_draws(job: Job, draws: int, workers: int) -> list[pd.DataFrame]:
-    """Tables of all flights, in any order; in this process if there is one worker."""
-    asked = [
-        (place, range(first, min(first + _TOGETHER, draws)))
+    """Tables of all flights, in any order; computed in this process if there is one worker."""
+    batches = [
+        (number, range(first, min(first + _TOGETHER, draws)))
         for first in range(0, draws, _TOGETHER)
-        for place in range(len(job.sites))
+        for number in range(len(job.sites))
     ]
     tables = []
     with progress_bar() as progress:
         task = progress.add_task("filter", total=draws * len(job.sites), unit="flights", note=job.scenario)
-        for flown in _flown(job, asked, min(workers, len(asked))):
+        for flown in _flown(job, batches, min(workers, len(batches))):
             tables += flown
             progress.advance(task, len(flown))
     return tables
 
 
-def _flown(job: Job, asked: list[tuple[int, range]], workers: int) -> Iterator[list[pd.DataFrame]]:
+def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator[list[pd.DataFrame]]:
     """Tables in any order."""
     if workers == 1:
-        yield from (flown_draws(job, *one) for one in asked)
+        yield from (flown_draws(job, *batch) for batch in batches)
         return
-    # spawn: torch's threads do not survive a fork.
+    # spawn: the threads of torch do not survive a fork.
     with _one_thread(), ProcessPoolExecutor(workers, get_context("spawn"), _begin, (job,)) as pool:
-        remaining = iter(asked)
-        running = {pool.submit(_of_job, *one) for one in islice(remaining, 2 * workers)}
+        remaining = iter(batches)
+        running = {pool.submit(_of_job, *batch) for batch in islice(remaining, 2 * workers)}
         while running:
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
@@ -198,7 +200,8 @@ def _flown(job: Job, asked: list[tuple[int, range]], workers: int) -> Iterator[l
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Processes that start inside have one thread for linear algebra: those of several workers slow each other down."""
+    """Give processes that start inside one thread for linear algebra: threads of several workers slow each other
+    down."""
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -218,5 +221,5 @@ def _begin(job: Job) -> None:
     _JOB.append(job)
 
 
-def _of_job(place: int, draws: range) -> list[pd.DataFrame]:
-    return flown_draws(_JOB[0], place, draws)
+def _of_job(number: int, draws: range) -> list[pd.DataFrame]:
+    return flown_draws(_JOB[0], number, draws)

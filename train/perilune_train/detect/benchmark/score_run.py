@@ -1,6 +1,7 @@
 """Score a run, or a table of detections, on the locked benchmark; writes page, figures and pictures."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from perilune_shared.export.foreign_text import code_span
@@ -41,15 +42,15 @@ def score_run(
     provenance = read_provenance(runs.load_weights(best), best)
     checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
     detector, loaded = open_detector(best, config), load_parts(parts)
-    found, rates = {}, {}
+    detections, rates = {}, {}
     for name, split in next(iter(loaded.values())).items():
-        found[name], rates[name] = detect_split(detector, split, name)
+        detections[name], rates[name] = detect_split(detector, split, name)
     scales = " and ".join(f"{factor:g}" for factor in config.evaluation.scales)
     about = [f"run {code_span(run.resolve().name)}, best weights, frames evaluated at scale {scales}"]
     about.append(f"threshold {threshold:.4f}, chosen on the validation split of the run's own dataset")
     more: Metrics = {"scored": f"run {run.resolve().name}", "scales": scales}
     more |= {f"images_per_s/{name}": round(rate, 2) for name, rate in rates.items()}
-    return _written(out, parts, loaded, found, threshold, about, more, checks)
+    return _write(out, parts, loaded, _Entry(detections, threshold, about, more, checks))
 
 
 def score_submission(
@@ -62,29 +63,37 @@ def score_submission(
     parts = open_parts("detect", data, manifests)
     loaded = load_parts(parts)
     ids = {name: split.frames.table["frame_id"].tolist() for name, split in next(iter(loaded.values())).items()}
-    found = read_submission(detections, ids)
+    submitted = read_submission(detections, ids)
     about = [f"detections of {code_span(name)}; training data and choices are as its authors state"]
     about.append(f"threshold {threshold:g}, as given; it must be chosen on other frames")
-    return _written(out, parts, loaded, found, threshold, about, {"scored": f"detections of {name}"}, [])
+    return _write(out, parts, loaded, _Entry(submitted, threshold, about, {"scored": f"detections of {name}"}, []))
 
 
-def _written(
-    out: Path,
-    parts: Sequence[Part],
-    loaded: dict[str, dict[str, DetectSplit]],
-    found: dict[str, list[Detections]],
-    threshold: float,
-    about: list[str],
-    more: Metrics,
-    checks: Sequence[TerrainCheck],
-) -> Score:
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """Detections to score, and what the page says about them."""
+
+    detections: dict[str, list[Detections]]
+    """Detections of each frame, by part of the benchmark."""
+    threshold: float
+    """Minimum score of the detections that count in precision, recall and F1."""
+    about: list[str]
+    """Lines of Markdown: what was scored and how."""
+    entries: Metrics
+    """Further entries of benchmark.json."""
+    checks: Sequence[TerrainCheck]
+    """Checks of the terrain of each part."""
+
+
+def _write(out: Path, parts: Sequence[Part], loaded: dict[str, dict[str, DetectSplit]], entry: _Entry) -> Score:
     """Score detections and write all files; returns the score."""
-    made = score(parts, loaded, found, threshold)
-    mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
-    for rule, evaluation in made.evaluations.items():
-        write_evaluation(out / rule, evaluation, made.images, [*about, f"labels: selection `{rule}`"])
-        mark_files(out / rule, _PICTURES, mark)
-    write_markdown(out / PAGE, page_of(made, about))
+    about, threshold = entry.about, entry.threshold
+    result = score(parts, loaded, entry.detections, threshold)
+    mark = "; ".join(dict.fromkeys(check.mark for check in entry.checks if check.mark))
+    for selection, evaluation in result.evaluations.items():
+        write_evaluation(out / selection, evaluation, result.images, [*about, f"labels: selection `{selection}`"])
+        mark_files(out / selection, _PICTURES, mark)
+    write_markdown(out / PAGE, page_of(result, about))
     mark_files(out, [PAGE], mark)
-    write_metrics(out, made.figures() | more | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
-    return made
+    write_metrics(out, result.figures() | entry.entries | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
+    return result
