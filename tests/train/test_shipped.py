@@ -90,7 +90,7 @@ def test_the_installed_network_is_the_one_on_its_card(model):
 
 def test_without_an_installed_network_a_run_is_needed(picture, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "_FOLDER", tmp_path)
-    detect = [("detect", *command) for command in (("predict", picture), ("benchmark",), ("export",))]
+    detect = [("detect", *command) for command in (("predict", picture), ("benchmark",), ("deploy",))]
     navigate = [("navigate", "benchmark"), ("navigate", "evaluate", "--dataset", tmp_path)]
     for command in (*detect, *navigate):
         done = in_process.call(main, *command, "--out", tmp_path / "out")

@@ -33,9 +33,10 @@ from perilune_render.cli.survey import survey
 from perilune_render.config.dataset import DatasetConfig
 from perilune_shared.config.page import annotated_yaml
 from perilune_shared.config.resolve import resolve, to_yaml
-from perilune_shared.console.command_line import new_program, run_command_line
+from perilune_shared.console.command_line import OverwriteFolder, add_renamed, new_program, run_command_line
 from perilune_shared.console.terminal import answer, answer_page, progress_bar
 from perilune_shared.errors import EXIT_USER_ERROR, UserError
+from perilune_shared.storage.replacement import replaceable
 
 app = new_program(
     "perilune-render",
@@ -95,6 +96,7 @@ def plan(
     height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
@@ -103,8 +105,8 @@ def plan(
     warn_of_suns(resolved, (one_kind(kind),))
     from perilune_render.dataset.manifest_only import write_manifest_only
 
-    with progress_bar() as progress:
-        write_manifest_only(resolved, one_kind(kind), preset, out, progress)
+    with replaceable(out, ("dataset.json",), overwrite=overwrite) as folder, progress_bar() as progress:
+        write_manifest_only(resolved, one_kind(kind), preset, folder, progress)
     counts = ps.open_dataset(out).info.counts
     answer(f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned")
 
@@ -204,23 +206,21 @@ def preview(
 
 
 @app.command()
-def export(
+def ground(
     preset: Preset = "small",
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Dataset whose first scene is exported (detect or nav).")] = "detect",
-    step: Annotated[
-        int, typer.Option(min=1, help="Vertex spacing of the exported mesh, as a multiple of the scene's.")
-    ] = 4,
+    kind: Annotated[KindChoice, typer.Option(help="Dataset whose first scene is written (detect or nav).")] = "detect",
+    step: Annotated[int, typer.Option(min=1, help="Vertex spacing of the mesh, as a multiple of the scene's.")] = 4,
     pixel_m: Annotated[float, typer.Option(min=0.01, help="Pixel size of a GeoTIFF on the ground, metres.")] = 1.0,
     out: Annotated[
         Path, typer.Option(help="File to write: .glb, .ply, .obj or .stl for a mesh, .tif for heights.")
     ] = Path("scene.glb"),
 ) -> None:
-    """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
+    """Write the ground of a configuration's first scene as a mesh or a GeoTIFF (metres, O_L: Z up, Y south, X west)."""
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene
@@ -235,6 +235,9 @@ def export(
     else:
         export_mesh(scene, out, step=step)
     answer(f"{out}: {len(scene.craters)} craters, {len(scene.boulders)} boulders")
+
+
+add_renamed(app, "export", "ground", ground)
 
 
 def main() -> None:

@@ -7,13 +7,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from perilune_shared.console.interrupts import ended_by_interrupt, ends_at_interrupt
-from perilune_shared.console.terminal import answer
+from perilune_shared.console.terminal import answer, say
 from perilune_shared.errors import DISK_FAULTS, EXIT_INTERRUPTED, EXIT_USER_ERROR, STOPPED, UserError, one_line
 from perilune_shared.threads import described_settings, set_up_program
 
@@ -30,6 +31,11 @@ Verbose = Annotated[
     ),
 ]
 """The option of a program, before the name of the command: `perilune-train -v detect train`."""
+
+OverwriteFolder = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the folder of --out, if an earlier run of this command wrote it.")
+]
+"""The option of commands that write a new folder, for `storage.replacement.replaceable`."""
 
 
 def new_program(name: str, version: str, summary: str) -> typer.Typer:
@@ -57,6 +63,17 @@ def new_program(name: str, version: str, summary: str) -> typer.Typer:
         pass
 
     return app
+
+
+def add_renamed(app: typer.Typer, old: str, new: str, command: Callable[..., None]) -> None:
+    """Let a command that is now called `new` be called by its former name: hidden, with a line on standard error."""
+
+    @wraps(command)
+    def renamed(*arguments: Any, **options: Any) -> None:
+        say(f"{old}: renamed to {new}")
+        command(*arguments, **options)
+
+    app.command(old, hidden=True)(renamed)
 
 
 _UNTRACKED = {

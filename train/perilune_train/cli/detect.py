@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config.resolve import parse_setting, resolve, resolve_over
+from perilune_shared.console.command_line import OverwriteFolder, add_renamed
 from perilune_shared.console.terminal import say, say_page
 from perilune_shared.errors import UserError
 from perilune_shared.storage.replacement import replaceable
@@ -13,7 +14,6 @@ from perilune_train.cli.options import (
     AllowOverlap,
     ConfigFile,
     Overwrite,
-    OverwriteFolder,
     Preset,
     RunName,
     RunsFolder,
@@ -320,7 +320,7 @@ def predict(
 
     tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
     settings = PredictSettings(tiling, min_score, max(min_size, 2 * min_radius_px), nodata, top)
-    with replaceable(out, ("detections.parquet",), overwrite=overwrite) as folder:
+    with replaceable(out, ("detections.parquet",), overwrite=overwrite, inputs=(run, *images)) as folder:
         count = predict_images(images, run, config, folder, settings)
     n_images = len(list(out.glob("*.overlay.png")))
     places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
@@ -328,8 +328,8 @@ def predict(
     say(f"{out}: {count} craters in {n_images} images; {written}")
 
 
-@app.command("export")
-def export(
+@app.command("deploy")
+def deploy(
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
     run: Annotated[
         Path | None, typer.Option(help="Folder of a finished run. [default: the detector that is installed]")
@@ -342,6 +342,7 @@ def export(
     ] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Also try 8-bit integers; needs --dataset.")] = False,
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write a trained detector as ONNX and OpenVINO files, for flight.
 
@@ -359,8 +360,14 @@ def export(
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.deploy.export import export_run
 
-    export_run(run or shipped_run("detect"), out, asked, size_px, dataset, int8, allow_overlap)
+    run = run or shipped_run("detect")
+    inputs = (run,) if dataset is None else (run, dataset)
+    with replaceable(out, ("detector.json", "README.md"), overwrite=overwrite, inputs=inputs) as folder:
+        export_run(run, folder, asked, size_px, dataset, int8, allow_overlap)
     say(f"{out}: README.md explains how to use the files")
+
+
+add_renamed(app, "export", "deploy", deploy)
 
 
 @app.command("weights")

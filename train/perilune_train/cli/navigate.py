@@ -6,10 +6,12 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config.resolve import resolve
+from perilune_shared.console.command_line import OverwriteFolder, add_renamed
 from perilune_shared.console.terminal import answer_page, say, say_page
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.inertial_grades import GRADES
+from perilune_shared.storage.replacement import replaceable
 from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
 from perilune_train.landing.monte_carlo.scenario import SCENARIOS
 from perilune_train.motion.config import NavigateConfig
@@ -121,6 +123,7 @@ def benchmark_landing(
         Path | None, typer.Option(help="New folder. [default: runs/benchmark/<name of the run>-landing]")
     ] = None,
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Score poses from craters and the filter on the locked benchmark: benchmark.md, benchmark.json, frames.parquet."""
     # torch takes seconds to load.
@@ -128,7 +131,9 @@ def benchmark_landing(
 
     run = detector or shipped_run("detect")
     folder = out or Path("runs/benchmark", f"{run.resolve().name}-landing")
-    figures = score_landing(run, data, manifests, folder, maps, allow_overlap)
+    inputs = (run, data, manifests) if maps is None else (run, data, manifests, maps)
+    with replaceable(folder, (FIGURES, "frames.parquet"), overwrite=overwrite, inputs=inputs) as new:
+        figures = score_landing(run, data, manifests, new, maps, allow_overlap)
     if f"filter/{POSITION}" in figures:
         say(f"filter: position RMSE {figures[f'filter/{POSITION}']:.3f} m")
     say(f"{folder}: {PAGE}, {FIGURES}, frames.parquet")
@@ -183,8 +188,8 @@ def compare(
     say(f"{out}: compare.md, errors.png")
 
 
-@app.command("export")
-def export(
+@app.command("deploy")
+def deploy(
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
     run: Annotated[
         Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
@@ -192,9 +197,10 @@ def export(
     dataset: Annotated[
         str | None,
         typer.Option(
-            help="Dataset (folder or address): export for its camera, and compare with torch on its validation frames."
+            help="Dataset (folder or address): write for its camera, and compare with torch on its validation frames."
         ),
     ] = None,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write a trained navigator as an ONNX file, for flight: one pair of frames and the state in, motion and state out.
 
@@ -204,8 +210,14 @@ def export(
     # torch takes seconds to load.
     from perilune_train.motion.deploy.export import export_navigator
 
-    largest = export_navigator(run or shipped_run("navigate"), out, dataset)
+    run = run or shipped_run("navigate")
+    inputs = (run,) if dataset is None else (run, dataset)
+    with replaceable(out, ("navigator.json", "README.md"), overwrite=overwrite, inputs=inputs) as folder:
+        largest = export_navigator(run, folder, dataset)
     say(f"{out}: README.md explains how to use the files; difference from torch {largest:.1e}")
+
+
+add_renamed(app, "export", "deploy", deploy)
 
 
 @app.command("methods")
@@ -225,6 +237,7 @@ def methods(
         Path | None, typer.Option("--map", help="Folder of a map by `navigate map`, a further catalogue.")
     ] = None,
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Fly all methods over a split: learned and classical motion, poses from craters, lost in space, the filter.
 
@@ -235,10 +248,12 @@ def methods(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.landing.methods.run import PAGE, fly_methods
+    from perilune_train.landing.methods.run import PAGE, TABLE, fly_methods
 
     networks = run or shipped_run("navigate"), detector or shipped_run("detect")
-    fly_methods(dataset, split, *networks, out, allow_overlap, maps)
+    inputs = (dataset, *networks) if maps is None else (dataset, *networks, maps)
+    with replaceable(out, (PAGE, TABLE), overwrite=overwrite, inputs=inputs) as folder:
+        fly_methods(dataset, split, *networks, folder, allow_overlap, maps)
     say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")
 
 
@@ -260,6 +275,7 @@ def monte_carlo(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes. [default: one per core]")] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/monte-carlo"),
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Fly the filter over random starts, catalogues and inertial errors of each descent.
 
@@ -274,7 +290,8 @@ def monte_carlo(
     from perilune_train.landing.monte_carlo.run import PAGE, fly_draws
 
     own = detector or shipped_run("detect")
-    fly_draws(dataset, split, own, out, scenario, draws, attitude_deg, seed, workers, allow_overlap)
+    with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, own)) as folder:
+        fly_draws(dataset, split, own, folder, scenario, draws, attitude_deg, seed, workers, allow_overlap)
     say(f"{out / PAGE}: table and pictures; draws.parquet")
 
 
@@ -286,6 +303,7 @@ def make_map(
     ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the catalogues.")] = Path("runs/navigate/map"),
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Make a crater catalogue of each scene from two images of an orbiter, with our own detector.
 
@@ -295,7 +313,9 @@ def make_map(
     # torch takes seconds to load.
     from perilune_train.landing.map.run import PAGE, map_scenes
 
-    map_scenes(dataset, detector or shipped_run("detect"), out, allow_overlap)
+    detector = detector or shipped_run("detect")
+    with replaceable(out, ("map.json", PAGE), overwrite=overwrite, inputs=(dataset, detector)) as folder:
+        map_scenes(dataset, detector, folder, allow_overlap)
     say(f"{out / PAGE}: errors and picture; one catalogue per scene beside it")
 
 
@@ -313,12 +333,13 @@ def fly(
     ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("flight"),
     live: Annotated[Path | None, typer.Option(help="Picture that is drawn again after each frame, *.png.")] = None,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Estimate position, velocity and attitude at each frame of a descent by craters, inertial unit and ranges.
 
     Prints one line per frame to standard output: time, status (tracking, coasting or lost), position and its deviations
     in O_L, largest deviation of the attitude, craters matched. Writes estimates.parquet, estimates.csv and flight.png.
-    `navigate unpack` writes an example of all files.
+    `navigate descent` writes an example of all files.
     """
     if live is not None and live.suffix.lower() != ".png":
         raise UserError("--live", "name", live, "a name that ends in .png")
@@ -329,7 +350,9 @@ def fly(
     descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
     for doubt in doubts_of(descent):
         say(f"warning: {imu}: {doubt}")
-    table = fly_descent(descent, run, out, answer_page, live)
+    inputs = (frames, camera, catalogue, imu, prior, run, *(path for path in (ranges, truth) if path is not None))
+    with replaceable(out, ("estimates.parquet", "flight.png"), overwrite=overwrite, inputs=inputs) as folder:
+        table = fly_descent(descent, run, folder, answer_page, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
@@ -342,8 +365,8 @@ def fly(
         answer_page(f"position error: {rms:.2f} m r.m.s., {end:.2f} m at the last frame")
 
 
-@app.command("unpack")
-def unpack(
+@app.command("descent")
+def descent(
     dataset: Annotated[
         str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
     ],
@@ -355,6 +378,7 @@ def unpack(
     velocity_mps: Annotated[float, typer.Option(help="Deviation of the prior's velocity on each axis.")] = 1.0,
     attitude_deg: Annotated[float, typer.Option(help="Deviation of the prior's attitude on each axis.")] = 0.5,
     seed: Annotated[int, typer.Option(help="Seed of the prior and of the errors of the catalogue.")] = 0,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write a descent as frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv.
 
@@ -374,6 +398,10 @@ def unpack(
     from perilune_shared.dataset.manifest import open_single
     from perilune_train.landing.fly.unpack import unpack_descent
 
-    count = unpack_descent(open_single(dataset), (ids[0], ids[1]), out, grade, exact, offset, seed)
+    with replaceable(out, ("camera.yaml", "prior.yaml"), overwrite=overwrite, inputs=(dataset,)) as folder:
+        count = unpack_descent(open_single(dataset), (ids[0], ids[1]), folder, grade, exact, offset, seed)
     names = "frames, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml, truth.csv"
     say(f"{out}: {count} frames; {names}")
+
+
+add_renamed(app, "unpack", "descent", descent)
