@@ -331,6 +331,14 @@ def fly(
     run: Annotated[
         Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
     ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option(
+            help="Craters of another detector, in place of --run: a Parquet or CSV table with image (name of the"
+            " frame's file), x0_px, y0_px, x1_px, y1_px (pixels from the outer corner of the first pixel) and score (0"
+            " to 1), as detections.parquet of `detect predict`."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("flight"),
     live: Annotated[Path | None, typer.Option(help="Picture that is drawn again after each frame, *.png.")] = None,
     overwrite: OverwriteFolder = False,
@@ -343,16 +351,20 @@ def fly(
     """
     if live is not None and live.suffix.lower() != ".png":
         raise UserError("--live", "name", live, "a name that ends in .png")
-    run = run or shipped_run("detect")
+    if run is not None and detections is not None:
+        raise UserError("--detections", "options", "together with --run", "one of them")
+    source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
-    from perilune_train.landing.fly.run import doubts_of, fly_descent, read_descent
+    from perilune_train.landing.fly.detections import by_network, by_table
+    from perilune_train.landing.fly.run import DescentFiles, doubts_of, fly_descent, read_descent
 
-    descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
+    descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, ranges, truth))
+    detect = by_table(source, descent.frames.paths) if detections else by_network(source)
     for doubt in doubts_of(descent):
         say(f"warning: {imu}: {doubt}")
-    inputs = (frames, camera, catalogue, imu, prior, run, *(path for path in (ranges, truth) if path is not None))
+    inputs = (frames, camera, catalogue, imu, prior, source, *(path for path in (ranges, truth) if path is not None))
     with replaceable(out, ("estimates.parquet", "flight.png"), overwrite=overwrite, inputs=inputs) as folder:
-        table = fly_descent(descent, run, folder, answer_page, live)
+        table = fly_descent(descent, detect, folder, answer_page, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
