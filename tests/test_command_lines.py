@@ -122,3 +122,16 @@ def test_a_shell_completes_commands(program):
     line["COMP_WORDS"] = f"{program} val" if program == "perilune-manifest" else line["COMP_WORDS"]
     shown = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env=line)
     assert shown.output.split() == ["validate" if program == "perilune-manifest" else "config"]
+
+
+def test_commands_about_one_dataset_share_one_kind_by_default():
+    kinds = {
+        name.split()[1]: (parameter.default, parameter.help)
+        for name, command in COMMANDS
+        for parameter in command.params
+        if name.startswith("perilune-render ") and parameter.name == "kind"
+    }
+    one = kinds["plan"]
+    assert one[0] == "detect" and kinds["preview"] == kinds["ground"] == one
+    # `dataset` makes both datasets of a preset; poses that a user gives are a path, as of navigation.
+    assert {name: kind[0] for name, kind in kinds.items() if kind != one} == {"dataset": "both", "frames": "nav"}

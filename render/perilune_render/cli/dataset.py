@@ -95,7 +95,9 @@ def dataset(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
+    kind: Annotated[
+        KindChoice, typer.Option(help="Datasets of the preset: detect (crater detection), nav (navigation) or both.")
+    ] = "both",
     out: Annotated[
         str | None,
         typer.Option(

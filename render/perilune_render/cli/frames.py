@@ -50,7 +50,9 @@ def frames(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[Kind, typer.Option(help="What the dataset is for: crater detection or navigation.")] = "nav",
+    kind: Annotated[
+        Kind, typer.Option(help="What the dataset is for: detect (crater detection) or nav (navigation).")
+    ] = "nav",
     workers: Annotated[
         int | None, typer.Option(min=0, max=1024, help="Worker processes. [default: one for each core]")
     ] = None,

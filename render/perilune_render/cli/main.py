@@ -15,12 +15,10 @@ from perilune_render.cli.options import (
     Catalogue,
     Config,
     Dem,
-    KindChoice,
+    OneKind,
     Preset,
     Setting,
     Unit,
-    first_kind,
-    one_kind,
     resolved_config,
     warn_of_size,
     with_unit,
@@ -95,18 +93,18 @@ def plan(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
+    kind: OneKind = "detect",
     overwrite: OverwriteFolder = False,
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
-    warn_of_suns(resolved, (one_kind(kind),))
+    warn_of_suns(resolved, (kind,))
     from perilune_render.dataset.manifest_only import write_manifest_only
 
     with replaceable(out, ("dataset.json",), overwrite=overwrite) as folder, progress_bar() as progress:
-        write_manifest_only(resolved, one_kind(kind), preset, folder, progress)
+        write_manifest_only(resolved, kind, preset, folder, progress)
     counts = ps.open_dataset(out).info.counts
     answer(f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned")
 
@@ -162,9 +160,7 @@ def preview(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[
-        KindChoice, typer.Option(help="Dataset whose first scene and trajectory are shown (detect or nav).")
-    ] = "detect",
+    kind: OneKind = "detect",
     poses: Annotated[
         Path | None, typer.Option(help="Poses as for `frames`, in place of the descents of the configuration.")
     ] = None,
@@ -193,15 +189,13 @@ def preview(
     from perilune_render.terrain.scene import site_of
 
     if poses is None:
-        plan = make_plan(resolved, first_kind(kind))
+        plan = make_plan(resolved, kind)
     else:
-        plan, resolved = given_plan(
-            read_poses(poses, *site_of(resolved), camera_axes), resolved, first_kind(kind), poses
-        )
-    setting_of_sun = "sun_elevation_deg" if poses else f"dataset.{first_kind(kind)}.sun.elevation_deg"
+        plan, resolved = given_plan(read_poses(poses, *site_of(resolved), camera_axes), resolved, kind, poses)
+    setting_of_sun = "sun_elevation_deg" if poses else f"dataset.{kind}.sun.elevation_deg"
     warn_of_sun(resolved, setting_of_sun, max(each.sun_elevation_deg for each in plan.scenes))
     map_path = out.with_name(f"{out.stem}-map.png")
-    write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
+    write_preview(plan, resolved, poses or f"configuration: dataset.{kind}", out, map_path)
     answer(f"look at {out} and {map_path}")
 
 
@@ -213,7 +207,7 @@ def ground(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Dataset whose first scene is written (detect or nav).")] = "detect",
+    kind: OneKind = "detect",
     step: Annotated[int, typer.Option(min=1, help="Vertex spacing of the mesh, as a multiple of the scene's.")] = 4,
     pixel_m: Annotated[float, typer.Option(min=0.01, help="Pixel size of a GeoTIFF on the ground, metres.")] = 1.0,
     out: Annotated[
@@ -228,7 +222,7 @@ def ground(
 
     if out.suffix not in MESH_SUFFIXES + RASTER_SUFFIXES:
         raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
-    plan = make_plan(resolved, first_kind(kind))
+    plan = make_plan(resolved, kind)
     scene = cached_scene(resolved, plan.view, plan.scenes[0].seed)
     if out.suffix in RASTER_SUFFIXES:
         export_raster(scene, out, pixel_m)
