@@ -275,7 +275,12 @@ def compare(
 
 @app.command("predict")
 def predict(
-    images: Annotated[list[Path], typer.Argument(help="Images of any size, or folders of images.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Images of any size, folders of images, videos (MP4, AVI, Matroska), TIFF of several pages."
+        ),
+    ],
     run: Annotated[
         Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
     ] = None,
@@ -303,7 +308,8 @@ def predict(
     """Find craters in images.
 
     Writes detections.parquet and detections.csv (one row per crater, in pixels of the upright image, from the outer
-    corner of its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference.
+    corner of its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference. Frames of
+    a video, and pages, are images named <file>.<index, six digits>.png or .tif.
     """
     if min_score is not None and not 0 < min_score <= 1:
         raise UserError("--min-score", "score", min_score, "above 0, at most 1")

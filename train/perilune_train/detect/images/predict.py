@@ -1,6 +1,7 @@
 """Detect craters in images of any size: tables, overlays and, for images with a georeference, GeoJSON."""
 
 import json
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from perilune_train.detect.images.georeference import (
 from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
+from perilune_train.detect.images.sequences import frames_of
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
@@ -48,14 +50,18 @@ class PredictSettings:
 
 
 def predict_images(given: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
-    """Find craters in images and folders of images; returns their number.
+    """Find craters in images, folders of images, videos and TIFF files of several pages; returns their number.
 
-    Writes all output to the new folder `out`, or nothing. Raises UserError on the first image that cannot be read,
-    before detection starts.
+    A frame of a video, or a page, is an image with its index in the name (sequences.py). Writes all output to the new
+    folder `out`, or nothing. Raises UserError on the first image that cannot be read, before detection starts.
     """
+    settings.tiling.check()
+    with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
+        return _predict(expanded(given, Path(folder)), run, config, out, settings)
+
+
+def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
     tiling, nodata = settings.tiling, settings.nodata
-    tiling.check()
-    paths = expanded(given)
     check_names(paths, [path.name for path in paths])
     with new_folder(out) as folder, progress_bar() as progress:
         check = progress.add_task("check", total=len(paths), unit="images", note="")
@@ -127,12 +133,15 @@ def strongest(found: Detections, top: int | None) -> Detections:
     return Detections(found.boxes[best], found.scores[best])
 
 
-def expanded(given: list[Path]) -> list[Path]:
-    """The images that are given, and those of given folders. Raises UserError on a folder without images."""
+def expanded(given: list[Path], frames: Path) -> list[Path]:
+    """The images that are given, those of given folders, and the frames of videos, which are written into `frames`.
+
+    Raises UserError on a folder without images, and on a video that cannot be decoded.
+    """
     paths = []
     for path in given:
         if not path.is_dir():
-            paths.append(path)
+            paths += frames_of(path, frames) or [path]
             continue
         own = pictures_of(path)
         if not own:
