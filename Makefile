@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-one-light bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -351,6 +351,9 @@ bench-monte-carlo: setup-dev # time of 1200 flights of the navigation filter on 
 
 bench-stream: setup-dev # navigation trained on rendered sequences against a dataset alone, at equal processor time; writes runs/bench/stream.json
 	@$(BIN)/python -m benchmarks.train.stream
+
+bench-one-light: setup-dev # agreement of the light on craters of lunar pictures and of others (MOON=folder OTHERS=folder)
+	@$(BIN)/python -m benchmarks.train.one_light $(call quoted,$(MOON)) --others $(call quoted,$(OTHERS))
 
 bench-suppress: setup-dev # time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress

@@ -23,6 +23,7 @@ from perilune_train.detect.images.georeference import (
     features,
     read_georeference,
 )
+from perilune_train.detect.images.one_light import doubt_of
 from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
@@ -31,6 +32,8 @@ from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.training import runs
+
+_SHOWN_DOUBTS = 5
 
 
 @dataclass(frozen=True)
@@ -76,11 +79,13 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
         threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
         detector = open_detector(runs.RunFolder(run).best, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
-        tables, shapes = [], []
+        tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
             found = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
+            if doubt := doubt_of(image, found):
+                doubts.append(f"warning: {path.name}: {doubt}")
             found = strongest(of_size(above(found, threshold), settings.min_size_px), settings.top)
             tables.append(table_of(path.name, found))
             write_overlay(folder / f"{path.name}.overlay.png", image, found, threshold)
@@ -96,6 +101,10 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
         write_csv(table.round(4), folder / "detections.csv")
         if any(reference is not None for reference in references):
             (folder / "detections.geojson").write_text(json.dumps(collection(shapes)) + "\n", encoding="utf-8")
+    for line in doubts[:_SHOWN_DOUBTS]:
+        say(line)
+    if len(doubts) > _SHOWN_DOUBTS:
+        say(f"warning: {len(doubts) - _SHOWN_DOUBTS} more images that may not show the Moon")
     return len(table)
 
 
