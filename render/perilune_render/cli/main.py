@@ -164,7 +164,9 @@ def preview(
     poses: Annotated[
         Path | None, typer.Option(help="Poses as for `frames`, in place of the descents of the configuration.")
     ] = None,
-    scene: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`; the same as CONFIG.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="With --poses: settings of the scene, as for `frames`; equivalent to CONFIG.")
+    ] = None,
     camera: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`.")] = None,
     camera_axes: CameraAxes = None,
     out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(

@@ -58,7 +58,7 @@ Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels
 
 
 def check_nodata(value: float | None) -> None:
-    """Raise UserError if it is not a finite number."""
+    """Raise UserError if the value of pixels without data is not a finite number."""
     if value is not None and not abs(value) < float("inf"):
         raise UserError("--nodata", "value", value, "a finite number; others are always taken as no data")
 
