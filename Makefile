@@ -39,16 +39,19 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-one-light bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results release clean
 
-help: ## list the targets
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
+# `##@ Title` begins a group of targets; `##` describes a target.
+help: ## list these targets
+	@awk -F ':[^#]*## ' '/^##@ / { printf "\n%s\n", substr($$0, 5) } /^[a-z-]+:[^#]*## / { printf "  %-22s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 	@echo
-	@echo 'PRESET=tiny|demo|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder  DRAWS=number  SCENARIO=name  REPORT=demo|paper|benchmark'
+	@echo 'PRESET=tiny|demo|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  NAME=run  OVERWRITE=1'
+	@echo 'DEM=file.tif  CATALOGUE=file.csv  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port'
 	@echo
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
 
+##@ Start
 setup: $(VENV)/.ready ## create the environment (.venv) with all packages
 
 $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pyproject.toml train/pyproject.toml perilune/pyproject.toml scripts/system-libraries
@@ -61,7 +64,7 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e "render[blender]" -e "train[geo]" -e perilune
 	@touch $@
 
-setup-dev: $(VENV)/.ready-dev ## also install the tools of tests, checks, documentation and benchmarks
+setup-dev: $(VENV)/.ready-dev # also install the tools of tests, checks, documentation and benchmarks
 
 $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
 	@scripts/system-libraries --browser
@@ -69,7 +72,7 @@ $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
 	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e "train[export,geo]" -r requirements-dev.txt
 	@touch $@
 
-demo: setup ## run all steps: set-up, frames, detection, navigation, explanation, report (PRESET=demo; tiny shows that all steps work)
+demo: setup ## all steps on small data: frames, detection, navigation, explanation, report (PRESET=demo; tiny shows that all steps work)
 	@$(BIN)/python scripts/demo.py --preset $(PRESET) --name $(NAME) --data $(call quoted,$(DATA)) --runs $(call quoted,$(RUNS)) \
 	  $(if $(DEM),--dem $(call quoted,$(DEM))) $(if $(CATALOGUE),--catalogue $(call quoted,$(CATALOGUE))) $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $(SETTINGS)
 	@echo
@@ -80,6 +83,7 @@ demo: setup ## run all steps: set-up, frames, detection, navigation, explanation
 	@echo "Explanation $(RUNS)/explain/$(NAME)               claims.json, metrics.json, *.png, *.parquet"
 	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
 
+##@ Datasets and training
 dataset: setup ## render the preset's datasets (KIND=detect|nav for one); run again to resume
 	@$(RENDER) --kind $(KIND)
 
@@ -99,44 +103,13 @@ train:
 train-detect: detect-frames ## train and evaluate crater detection; run again to resume (OVERWRITE=1 replaces)
 	@$(BIN)/perilune-train detect train $(TRAIN) --dataset "$(DATA)/detect" $(OVER)
 
-train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
+train-detect-baseline: detect-frames # the same network without attention, into <name>-none
 	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out "$(RUNS)" --name $(NAME)-none --dataset "$(DATA)/detect" $(OVER)
-
-# A part of the benchmark is in a folder of its own.
-BENCHMARK := data/benchmark$(if $(SCENES),-$(SCENES)-scenes)
-benchmark-frames: setup ## render the locked benchmark (KIND=nav for navigation, SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
-	@scripts/render-benchmark $(if $(filter nav,$(KIND)),nav,detect) $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
-
-# $(1): what kind of run RUN must be.
-define checked_run
-test -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a $(1) run" >&2; exit 2; }
-endef
-
-benchmark: setup ## score the installed detector, or a run (RUN=folder), on the locked benchmark; writes runs/benchmark/
-	@$(if $(RUN),$(call checked_run,detect))
-	@$(MAKE) --no-print-directory benchmark-frames KIND=detect
-	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
-
-benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder), on the locked benchmark of navigation; writes runs/benchmark/<name>-navigate
-	@$(if $(RUN),$(call checked_run,navigate))
-	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
-	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
-
-benchmark-landing: setup ## score craters and the filter on the locked benchmark with the installed detector, or a run (DETECTOR=folder, MAPS=folder of maps); writes runs/benchmark/<name>-landing
-	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
-	@$(BIN)/perilune-train navigate benchmark-landing $(if $(DETECTOR),--detector $(call quoted,$(DETECTOR))) \
-	  $(if $(MAPS),--maps $(call quoted,$(MAPS))) --data $(BENCHMARK)
-
-# The experiment has presets of its own: PRESET=paper unless one is given.
-paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=whole, gpu or full, GROUND=lunar, CALIBRATE=1, ATTITUDE=1, MINUTES=number, DARKNET=yolov3.weights)
-	@$(BIN)/python scripts/paper.py --preset $(if $(filter file,$(origin PRESET)),paper,$(PRESET)) $(if $(PART),--part $(PART)) \
-	  $(if $(GROUND),--ground $(GROUND)) $(if $(CALIBRATE),--calibrate) $(if $(ATTITUDE),--attitude) \
-	  $(if $(MINUTES),--minutes $(MINUTES)) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam identity:attention=cbam_identity unguided:loss.lambda_guide=0 strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
 ABLATED = "$(RUNS)/detect/$(NAME)" $(foreach one,$(ABLATION),"$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))")
-ablate-detect: train-detect ## train with one change each (other attention, no guidance, other strides, other widths) and compare
+ablate-detect: train-detect ## train detection with one change each (attention, guidance, strides, widths) and compare
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" $(OVER) &&) true
 	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
@@ -146,6 +119,12 @@ train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
 	@$(BIN)/perilune-train navigate train $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
 
+# Each network without attention; the stack network starts from the detector without attention, if there is one.
+train-nav-baseline: nav-frames # the same networks without attention, into <name>-none and <name>-none-stack
+	@$(BIN)/perilune-train navigate train $(COMMON) --set navigate.warp.attention=none --set navigate.stack.attention=none \
+	  --out $(call quoted,$(RUNS)) --name $(NAME)-none --dataset "$(DATA)/nav" $(OVER)
+
+##@ Landing
 METHODS := $(RUNS)/navigate/$(NAME)-methods
 MAP := $(RUNS)/navigate/$(NAME)-map
 
@@ -156,42 +135,33 @@ $(BIN)/perilune-render survey --manifest "$(3)-plan" --out "$(3)" && \
 { test -e "$(4)/map.json" || $(BIN)/perilune-train navigate map --dataset "$(3)" --out "$(4)"; }
 endef
 
-navigate: nav-frames ## fly all methods of navigation over the test descents; writes runs/navigate/<name>-methods (OVERWRITE=1 replaces)
-	@$(if $(OVERWRITE),rm -rf "$(METHODS)")
-	@if test -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \
+navigate: nav-frames ## fly all methods over the test descents; writes runs/navigate/<name>-methods
+	@if test -z "$(OVER)" -a -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \
 	  $(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(METHODS)" \
-	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)") $(if $(wildcard $(MAP)/map.json),--map "$(MAP)"); fi
+	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)") $(if $(wildcard $(MAP)/map.json),--map "$(MAP)") $(OVER); fi
 
-navigate-map: nav-frames ## render the test scenes from orbit, under another Sun, and map their craters; writes runs/navigate/<name>-map, which make navigate then uses
+navigate-map: nav-frames ## map the test scenes from orbit; make navigate then uses runs/navigate/<name>-map
 	@$(call surveyed,$(DATA)/nav,test,$(DATA)/survey,$(MAP))
 
 DRAWS ?= 200
 SCENARIO ?= nominal
 MONTE_CARLO := $(RUNS)/navigate/$(NAME)-monte-carlo-$(SCENARIO)
-navigate-monte-carlo: nav-frames ## the filter over 200 draws of each test descent (DRAWS=number SCENARIO=nominal|outage|wrong-prior|false-detections); writes runs/navigate/<name>-monte-carlo-<scenario>
-	@$(if $(OVERWRITE),rm -rf "$(MONTE_CARLO)")
-	@if test -f "$(MONTE_CARLO)/monte_carlo.md"; then echo "$(MONTE_CARLO): finished, left unchanged; OVERWRITE=1 replaces it"; else \
+navigate-monte-carlo: nav-frames ## fly the filter over 200 draws of each test descent (DRAWS=number SCENARIO=nominal|outage|wrong-prior|false-detections)
+	@if test -z "$(OVER)" -a -f "$(MONTE_CARLO)/monte_carlo.md"; then echo "$(MONTE_CARLO): finished, left unchanged; OVERWRITE=1 replaces it"; else \
 	  $(BIN)/perilune-train navigate monte-carlo --dataset "$(DATA)/nav" --draws $(call quoted,$(DRAWS)) \
-	  --scenario $(call quoted,$(SCENARIO)) --out "$(MONTE_CARLO)"; fi
+	  --scenario $(call quoted,$(SCENARIO)) --out "$(MONTE_CARLO)" $(OVER); fi
 
-# Each network without attention; the stack network starts from the detector without attention, if there is one.
-train-nav-baseline: nav-frames ## the same networks without attention, into <name>-none and <name>-none-stack
-	@$(BIN)/perilune-train navigate train $(COMMON) --set navigate.warp.attention=none --set navigate.stack.attention=none \
-	  --out $(call quoted,$(RUNS)) --name $(NAME)-none --dataset "$(DATA)/nav" $(OVER)
+closed-loop: setup ## fly a descent in closed loop: guidance, filter, and images from the server; writes runs/closed-loop
+	@$(BIN)/python examples/closed_loop.py --out "$(RUNS)/closed-loop"
 
+##@ Explanation and report
 explain: ## attention masks and correlations of the trained networks
 	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
 	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
 
-# The experiment and the benchmark have folders of their own.
-REPORT ?= demo
-REPORTED = $(if $(filter demo,$(REPORT)),--name $(NAME) --dataset "$(DATA)" --runs "$(RUNS)" --out "$(RUNS)/report/$(NAME)")
-report: setup ## one HTML page of datasets, runs and frames, and a summary (REPORT=demo|paper|benchmark); writes runs/report/
-	@$(BIN)/perilune-train report --kind $(call quoted,$(REPORT)) $(REPORTED)
-
 # The navigator's poses need all frames of a descent, without its craters.
 STACK := $(RUNS)/navigate/$(NAME)-stack
-explain-causal: detect-frames ## remove single craters from the ground of the test scenes, render again, and measure what they do to masks, detections and poses; writes runs/explain/<name>-causal
+explain-causal: detect-frames ## remove single craters from the test scenes, and measure what changes; writes runs/explain/<name>-causal
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
 	@$(BIN)/perilune-render counterfactual --manifest "$(DATA)/detect" --craters-per-scene 12 --out "$(DATA)/causal"
 	@$(BIN)/perilune-render counterfactual --manifest "$(DATA)/detect" --craters-per-scene 0 --sun-azimuth-offset-deg 40 --out "$(DATA)/turned"
@@ -199,20 +169,64 @@ explain-causal: detect-frames ## remove single craters from the ground of the te
 	@$(BIN)/perilune-train causal $(COMMON) --runs $(call quoted,$(RUNS)) --name $(NAME) --dataset "$(DATA)/detect" --counterfactual "$(DATA)/causal" \
 	  --turned "$(DATA)/turned" $(if $(wildcard $(STACK)/metrics.json),--nav-dataset "$(DATA)/nav" --nav-counterfactual "$(DATA)/causal-nav") $(OVER)
 
-closed-loop: setup ## fly a descent in closed loop: guidance, navigation filter and images from the server; writes runs/closed-loop
-	@$(BIN)/python examples/closed_loop.py --out "$(RUNS)/closed-loop"
+# The experiment and the benchmark have folders of their own.
+REPORT ?= demo
+REPORTED = $(if $(filter demo,$(REPORT)),--name $(NAME) --dataset "$(DATA)" --runs "$(RUNS)" --out "$(RUNS)/report/$(NAME)")
+report: setup ## one HTML page of datasets, runs and frames (REPORT=demo|paper|benchmark); writes runs/report/
+	@$(BIN)/perilune-train report --kind $(call quoted,$(REPORT)) $(REPORTED)
 
+##@ Benchmarks and the paper's experiment
+# A part of the benchmark is in a folder of its own.
+BENCHMARK := data/benchmark$(if $(SCENES),-$(SCENES)-scenes)
+benchmark-frames: setup # render the locked benchmark (KIND=nav for navigation, SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
+	@scripts/render-benchmark $(if $(filter nav,$(KIND)),nav,detect) $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
+
+# $(1): what kind of run RUN must be.
+define checked_run
+test -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a $(1) run" >&2; exit 2; }
+endef
+
+benchmark: setup ## score the installed detector, or a run (RUN=folder), on the locked benchmark (SCENES=2 for a part of it); writes runs/benchmark/
+	@$(if $(RUN),$(call checked_run,detect))
+	@$(MAKE) --no-print-directory benchmark-frames KIND=detect
+	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
+
+benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder); writes runs/benchmark/<name>-navigate
+	@$(if $(RUN),$(call checked_run,navigate))
+	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
+	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
+
+benchmark-landing: setup ## score craters and the filter (DETECTOR=folder, MAPS=folder of maps); writes runs/benchmark/<name>-landing
+	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
+	@$(BIN)/perilune-train navigate benchmark-landing $(if $(DETECTOR),--detector $(call quoted,$(DETECTOR))) \
+	  $(if $(MAPS),--maps $(call quoted,$(MAPS))) --data $(BENCHMARK)
+
+# The experiment has presets of its own: PRESET=paper unless one is given.
+paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=whole, gpu or full, GROUND=lunar, CALIBRATE=1, ATTITUDE=1, MINUTES=number, DARKNET=yolov3.weights)
+	@$(BIN)/python scripts/paper.py --preset $(if $(filter file,$(origin PRESET)),paper,$(PRESET)) $(if $(PART),--part $(PART)) \
+	  $(if $(GROUND),--ground $(GROUND)) $(if $(CALIBRATE),--calibrate) $(if $(ATTITUDE),--attitude) \
+	  $(if $(MINUTES),--minutes $(MINUTES)) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
+
+bench: ## run one measurement (NAME=labels); without NAME list them
+ifneq ($(origin NAME),command line)
+	@awk -F ':[^#]*# ' '/^bench-[a-z-]+:[^#]*# / { printf "  %-22s%s\n", substr($$1, 7), $$2 }' $(MAKEFILE_LIST)
+else
+	@grep -qF -- bench-$(call quoted,$(NAME)): $(MAKEFILE_LIST) || { echo "NAME: got "$(call quoted,$(NAME))", expected a name that make bench lists" >&2; exit 2; }
+	@$(MAKE) --no-print-directory bench-$(call quoted,$(NAME)) NAME=$(call quoted,$(PRESET))
+endif
+
+##@ Development
 JOBS ?= 2
 # A test marked `slow` kills processes, starts Ray or a browser, or renders the shared manifests again.
 test: setup-dev ## run the tests, in JOBS=2 processes (SLOW=1 also runs those marked slow, as .ci/run does)
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 -m "$(if $(SLOW),not hostile,not slow and not hostile)"
 
-test-hostile: setup-dev ## run hostile and broken input through every command; prints the number of inputs, peak memory and longest time
+test-hostile: setup-dev ## run hostile and broken input through every command
 	@log=$$(mktemp) && trap 'rm -f "$$log"' EXIT && PERILUNE_HOSTILE_LOG="$$log" OMP_NUM_THREADS=1 \
 	  $(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 -m hostile tests/hostile
 
 # Tracing slows every line of every library, on Python before 3.12.
-coverage: setup-dev ## run all tests, the slow ones too, and print their line coverage, which has no target; takes 1.6 times as long
+coverage: setup-dev ## run all tests and print their line coverage; takes 1.6 times as long
 	@PYTEST_ADDOPTS="--cov --cov-report=term" $(MAKE) --no-print-directory test SLOW=1
 
 lint: setup-dev ## ruff (rules and format) and mypy
@@ -223,120 +237,125 @@ lint: setup-dev ## ruff (rules and format) and mypy
 docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve
 
-docs-build: setup-dev ## build the documentation into site/; a broken link or name is an error
+docs-build: setup-dev # build the documentation into site/; a broken link or name is an error
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-bench-render: setup-dev ## time of a frame, compared with a bare Blender loop; writes runs/bench/render.json
+bench-render: setup-dev # time of a frame, compared with a bare Blender loop; writes runs/bench/render.json
 	@$(BIN)/python -m benchmarks.dataset.render
 
-bench-kill: setup-dev ## renderings disturbed at random moments (SIGKILL, Ctrl-C, full disk, lost nodes and stores), resumed and compared; writes runs/bench/kill.json
+bench-kill: setup-dev # renderings disturbed at random moments (SIGKILL, Ctrl-C, full disk, lost nodes and stores), resumed and compared; writes runs/bench/kill.json
 	@$(BIN)/python -m benchmarks.kill
 
-bench-scale: setup-dev ## frames per second by executor, number of processes and threads; writes runs/bench/scale.json
+bench-scale: setup-dev # frames per second by executor, number of processes and threads; writes runs/bench/scale.json
 	@$(BIN)/python -m benchmarks.dataset.scale
 
-bench-requests: setup-dev ## requests of a frame, trajectory, scene and dataset in an S3 store; writes runs/bench/requests.json
+bench-requests: setup-dev # requests of a frame, trajectory, scene and dataset in an S3 store; writes runs/bench/requests.json
 	@$(BIN)/python -m benchmarks.dataset.requests
 
-bench-scaling: setup-dev ## core hours and bytes of up to 100 million frames, estimated; writes runs/bench/scaling.json
+bench-scaling: setup-dev # core hours and bytes of up to 100 million frames, estimated; writes runs/bench/scaling.json
 	@$(BIN)/python -m benchmarks.dataset.scaling
 
-compare-nac: setup ## compare rendered frames with real NAC crops (NAC=folder); writes runs/nac/
+compare-nac: bench-nac
+
+bench-nac: setup # compare rendered frames with real NAC crops (NAC=folder); writes runs/nac/
 	@$(BIN)/python -m benchmarks.nac.compare "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
 
-bench-terrain: setup-dev ## time and memory of generating terrain on one core; writes runs/bench/terrain.json
+bench-terrain: setup-dev # time and memory of generating terrain on one core; writes runs/bench/terrain.json
 	@$(BIN)/python -m benchmarks.scene.terrain
 
-bench-megapixel: setup-dev ## memory and time of a descent in 1024 x 1024 pixels, and KLT residuals on changes of level; writes runs/bench/megapixel.json
+bench-megapixel: setup-dev # memory and time of a descent in 1024 x 1024 pixels, and KLT residuals on changes of level; writes runs/bench/megapixel.json
 	@$(BIN)/python -m benchmarks.scene.megapixel
 
-bench-photometry: setup-dev ## rendered radiance, compared with the formulas; writes runs/bench/photometry.json
+bench-photometry: setup-dev # rendered radiance, compared with the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python -m benchmarks.scene.photometry
 
-bench-manifest: setup-dev ## time and memory of reading 100,000 frames and 5 million labels; writes runs/bench/manifest.json
+bench-manifest: setup-dev # time and memory of reading 100,000 frames and 5 million labels; writes runs/bench/manifest.json
 	@$(BIN)/python -m benchmarks.dataset.manifest
 
-bench-plan: setup-dev ## time and memory of planning 10 million frames; writes runs/bench/plan.json
+bench-plan: setup-dev # time and memory of planning 10 million frames; writes runs/bench/plan.json
 	@$(BIN)/python -m benchmarks.dataset.plan
 
-bench-memory: setup-dev ## resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
+bench-memory: setup-dev # resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
 	@$(BIN)/python -m benchmarks.dataset.memory
 
-bench-profile: setup-dev ## processor time of each step of a frame with the engine heightfield; writes runs/bench/profile_frames.json
+bench-profile: setup-dev # processor time of each step of a frame with the engine heightfield; writes runs/bench/profile_frames.json
 	@$(BIN)/python -m benchmarks.dataset.profile_frames
 
-bench-develop: setup-dev ## frames developed per second on one core; writes runs/bench/develop.json
+bench-develop: setup-dev # frames developed per second on one core; writes runs/bench/develop.json
 	@$(BIN)/python -m benchmarks.dataset.develop
 
-bench-regenerate: setup-dev ## number of frames that are identical when rendered again from the manifest; writes runs/bench/regenerate.json
+bench-regenerate: setup-dev # number of frames that are identical when rendered again from the manifest; writes runs/bench/regenerate.json
 	@$(BIN)/python -m benchmarks.dataset.regenerate
 
-bench-same-bytes: setup-dev ## hash of every stage of a frame, to find where two processors differ (COMPARE=file of another machine); writes runs/bench/same_bytes.json
+bench-same-bytes: setup-dev # hash of every stage of a frame, to find where two processors differ (COMPARE=file of another machine); writes runs/bench/same_bytes.json
 	@$(BIN)/python -m benchmarks.dataset.same_bytes $(if $(COMPARE),--compare $(call quoted,$(COMPARE)))
 
-bench-labels: setup-dev ## label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
+bench-labels: setup-dev # label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
 
-bench-truth: setup-dev ## depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
+bench-truth: setup-dev # depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
 	@$(BIN)/python -m benchmarks.scene.truth
 
-bench-other-ground: setup-dev ## rims and the installed detector over ground of another generator (.venv/bin/pip install terraingenpy); writes runs/bench/other_ground.json
+bench-other-ground: setup-dev # rims and the installed detector over ground of another generator (.venv/bin/pip install terraingenpy); writes runs/bench/other_ground.json
 	@$(BIN)/python -m benchmarks.scene.other_ground
 
-bench-engines: setup-dev ## frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json
+bench-engines: setup-dev # frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json
 	@$(BIN)/python -m benchmarks.scene.engines
 
-bench-serve: setup-dev ## frames per second of the image server, and its memory over 20,000 frames; writes runs/bench/serve.json
+bench-serve: setup-dev # frames per second of the image server, and its memory over 20,000 frames; writes runs/bench/serve.json
 	@$(BIN)/python -m benchmarks.scene.serve
 
-bench-contrast: setup-dev ## AUC of contrast for the craters that the detector finds; writes runs/bench/contrast.json
+bench-contrast: setup-dev # AUC of contrast for the craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python -m benchmarks.train.contrast "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
 
 GATES ?= "$(RUNS)/detect/$(NAME)"
-bench-gates: detect-frames ## AP and variation of attention masks of detect runs on the validation split (GATES="runs/detect/a runs/detect/b"); writes runs/bench/gates.json
+bench-gates: detect-frames # AP and variation of attention masks of detect runs on the validation split (GATES="runs/detect/a runs/detect/b"); writes runs/bench/gates.json
 	@$(BIN)/python -m benchmarks.train.gates "$(DATA)/detect" $(GATES)
 
-bench-infer: setup-dev ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
+bench-infer: setup-dev # time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
 
-bench-paper-causes: setup-dev ## why short trainings of the paper's detector failed: ground, loss and gates, about half an hour on two cores; writes runs/paper/paper-causes.json
+bench-paper-causes: setup-dev # why short trainings of the paper's detector failed: ground, loss and gates, about half an hour on two cores; writes runs/paper/paper-causes.json
 	@$(BIN)/python -m benchmarks.train.paper_causes
 
-bench-captured: setup-dev ## training speed of both detectors with steps one operation at a time and captured, on a GPU; writes runs/bench/captured.json
+bench-captured: setup-dev # training speed of both detectors with steps one operation at a time and captured, on a GPU; writes runs/bench/captured.json
 	@$(BIN)/python -m benchmarks.train.captured
 
-bench-pose-limits: setup-dev ## what limits the navigator of poses (steps, descents, views, features), on the experiment's runs; writes runs/bench/pose-limits.json
+bench-pose-limits: setup-dev # what limits the navigator of poses (steps, descents, views, features), on the experiment's runs; writes runs/bench/pose-limits.json
 	@$(BIN)/python -m benchmarks.train.pose_limits --detector $(RUNS)/paper/detect/yolov3-half-0 --dataset data/paper/headline/nav --hidden 256
 
-bench-shared: setup-dev ## speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
+bench-shared: setup-dev # speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
 	@$(BIN)/python -m benchmarks.shared
 
-bench-latency: setup-dev ## where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
+bench-latency: setup-dev # where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
 	@$(BIN)/python -m benchmarks.train.latency
 
-bench-train: detect-frames ## training speed, compared with training from memory and with a bare loop; writes runs/bench/train.json
+bench-train: detect-frames # training speed, compared with training from memory and with a bare loop; writes runs/bench/train.json
 	@$(BIN)/python -m benchmarks.train.train --dataset "$(DATA)/detect" --preset $(PRESET)
 
-bench-transfer: detect-frames ## compare four ways to start from a frozen backbone; writes runs/bench/transfer.json
+bench-transfer: detect-frames # compare four ways to start from a frozen backbone; writes runs/bench/transfer.json
 	@$(BIN)/python -m benchmarks.train.transfer --dataset "$(DATA)/detect"
 
-bench-landing: setup-dev ## all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
+bench-landing: setup-dev # all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@$(call surveyed,data/shipped/nav,val,data/shipped/survey,runs/bench/landing-map)
 	@$(BIN)/perilune-train navigate methods --dataset data/shipped/nav --split val --allow-overlap --map runs/bench/landing-map --out runs/bench/landing
 
-bench-motion: setup-dev ## relative motion under noise, blur and a wrong prior, on the validation descents of shipped-nav; writes runs/bench/motion.json
+bench-motion: setup-dev # relative motion under noise, blur and a wrong prior, on the validation descents of shipped-nav; writes runs/bench/motion.json
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@$(BIN)/python -m benchmarks.train.motion data/shipped/nav
 
-bench-monte-carlo: setup-dev ## time of 1200 flights of the navigation filter on two cores, over the validation descents of shipped-nav; writes runs/bench/monte_carlo.json
+bench-monte-carlo: setup-dev # time of 1200 flights of the navigation filter on two cores, over the validation descents of shipped-nav; writes runs/bench/monte_carlo.json
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.train.monte_carlo data/shipped/nav
 
-bench-stream: setup-dev ## navigation trained on rendered sequences against a dataset alone, at equal processor time; writes runs/bench/stream.json
+bench-stream: setup-dev # navigation trained on rendered sequences against a dataset alone, at equal processor time; writes runs/bench/stream.json
 	@$(BIN)/python -m benchmarks.train.stream
 
-bench-suppress: setup-dev ## time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
+bench-one-light: setup-dev # agreement of the light on craters of lunar pictures and of others (MOON=folder OTHERS=folder)
+	@$(BIN)/python -m benchmarks.train.one_light $(call quoted,$(MOON)) --others $(call quoted,$(OTHERS))
+
+bench-suppress: setup-dev # time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress
 
 # With RECORD=files, first copy these JSON files of runs or benchmarks into results/.

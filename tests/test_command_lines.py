@@ -15,6 +15,7 @@ import perilune_render.cli.main
 import perilune_shared
 import perilune_shared.cli.main
 import perilune_train.cli.main
+from perilune_shared.errors import UserError
 
 PROGRAMS = {
     "perilune-manifest": perilune_shared.cli.main.app,
@@ -25,10 +26,11 @@ HEAVY = {"pandas", "pyarrow", "numpy", "scipy", "matplotlib", "PIL", "cv2", "num
 
 
 def commands(name: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
-    """A command and all its subcommands, each with what a user types."""
+    """A command and all its subcommands, each with what a user types, without former names."""
     yield name, command
     for sub, found in getattr(command, "commands", {}).items():
-        yield from commands(f"{name} {sub}", found)
+        if not found.hidden:
+            yield from commands(f"{name} {sub}", found)
 
 
 COMMANDS = [pair for name, app in PROGRAMS.items() for pair in commands(name, typer.main.get_command(app))]
@@ -75,6 +77,32 @@ def test_a_command_line_starts_without_heavy_libraries(module):
     assert not loaded(f"import {module}") & HEAVY
 
 
+@pytest.mark.parametrize(
+    ("typed", "renamed"),
+    [
+        ("perilune-render export", "ground"),
+        ("perilune-train detect export", "deploy"),
+        ("perilune-train navigate export", "deploy"),
+        ("perilune-train navigate unpack", "descent"),
+    ],
+)
+def test_a_former_name_takes_the_same_options_and_names_the_new_one(typed, renamed, tmp_path):
+    program, *above, old = typed.split()
+
+    def run(name: str, *words: object):
+        shown = CliRunner().invoke(PROGRAMS[program], [*above, name, *map(str, words)], env={"COLUMNS": "200"})
+        return shown, " ".join(shown.stdout.partition("[OPTIONS]")[2].split())
+
+    listed = dict(commands(program, typer.main.get_command(PROGRAMS[program])))
+    assert " ".join([program, *above, renamed]) in listed and typed not in listed
+    assert run(old, "--help")[1] == run(renamed, "--help")[1] != ""
+    words = {"ground": ("--out", tmp_path / "x.none"), "descent": ("--dataset", tmp_path, "--trajectory", "none")}
+    words["deploy"] = ("--out", tmp_path / "new", "--run", tmp_path)
+    (before, _), (after, _) = run(old, *words[renamed]), run(renamed, *words[renamed])
+    assert isinstance(before.exception, UserError) and str(before.exception) == str(after.exception)
+    assert before.stderr == f"{old}: renamed to {renamed}\n" and after.stderr == ""
+
+
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_program_tells_its_version_and_short_help(program):
     def printed(*words: str) -> str:
@@ -94,3 +122,16 @@ def test_a_shell_completes_commands(program):
     line["COMP_WORDS"] = f"{program} val" if program == "perilune-manifest" else line["COMP_WORDS"]
     shown = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env=line)
     assert shown.output.split() == ["validate" if program == "perilune-manifest" else "config"]
+
+
+def test_commands_about_one_dataset_share_one_kind_by_default():
+    kinds = {
+        name.split()[1]: (parameter.default, parameter.help)
+        for name, command in COMMANDS
+        for parameter in command.params
+        if name.startswith("perilune-render ") and parameter.name == "kind"
+    }
+    one = kinds["plan"]
+    assert one[0] == "detect" and kinds["preview"] == kinds["ground"] == one
+    # `dataset` makes both datasets of a preset; poses that a user gives are a path, as of navigation.
+    assert {name: kind[0] for name, kind in kinds.items() if kind != one} == {"dataset": "both", "frames": "nav"}

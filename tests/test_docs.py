@@ -19,7 +19,8 @@ from perilune_render.config.dataset import DatasetConfig
 from perilune_shared.config.page import annotated_yaml, keys
 from perilune_shared.config.resolve import resolve
 from perilune_shared.dataset.schema import TABLES
-from perilune_train.cli.main import SECTIONS
+from perilune_train.cli.main import SECTIONS, main
+from tests.helpers import in_process
 
 TOP = Path(__file__).parent.parent
 DOCS = TOP / "docs"
@@ -94,6 +95,9 @@ def test_example_runs(page, block, quick, tmp_path, monkeypatch):
     (tmp_path / "data").mkdir()
     (tmp_path / "data/tiny").symlink_to(quick)
     monkeypatch.chdir(tmp_path)
+    if '"descent"' in block:
+        words = ("--dataset", "data/tiny/nav", "--trajectory", "scene-0000/trajectory-0000", "--out", "descent")
+        assert in_process.call(main, "navigate", "descent", *words).returncode == 0
     exec(compile(block.replace("data/small", "data/tiny"), page, "exec"), {})  # noqa: S102 - our own page
 
 

@@ -91,3 +91,42 @@ def test_an_environment_of_another_python_is_named(tmp_path):
     assert "got Python 3.12.1, expected Python 3.11" in done.stderr
     cure = f"mv {python.parents[1]} {python.parents[1]}-old  and then  make setup PYTHON=python3.11"
     assert cure in done.stderr and len(done.stderr.splitlines()) == 2  # make adds a line of its own
+
+
+def test_help_shows_few_targets_in_groups_and_bench_shows_the_rest():
+    lines = make("help").stdout.splitlines()
+    targets = [line.split()[0] for line in lines if re.match(r"  [a-z]", line) and not line.startswith("  make ")]
+    groups = [line for line in lines if re.fullmatch(r"[A-Z][a-z' ]+", line)]
+    assert 20 <= len(targets) <= 30 and len(groups) >= 4 and "train-detect" in targets
+    assert not [name for name in targets if name.startswith("bench-")]
+    names = [line.split()[0] for line in make("bench").stdout.splitlines() if line.startswith("  ")]
+    defined = re.findall(r"^bench-([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert sorted(names) == sorted(defined) and len(names) > 30
+
+
+@pytest.mark.parametrize(("name", "module"), [("labels", "benchmarks.scene.labels"), ("nac", "benchmarks.nac.compare")])
+def test_a_benchmark_by_its_name_and_by_its_former_target(name, module):
+    former = {"labels": "bench-labels", "nac": "compare-nac"}[name]
+    new, old = words_of_module(module, "bench", f"NAME={name}"), words_of_module(module, former)
+    assert new == old and module in new
+
+
+def words_of_module(module: str, *arguments: str) -> list[str]:
+    (line,) = (line for line in make("-n", *arguments).stdout.splitlines() if f"-m {module}" in line)
+    return shlex.split(line)
+
+
+def test_a_benchmark_uses_the_runs_of_the_preset():
+    assert "runs/detect/tiny" in words_of_module("benchmarks.train.contrast", "bench", "NAME=contrast", "PRESET=tiny")
+
+
+@pytest.mark.parametrize("name", ["nothing", "it's", "."])
+def test_an_unknown_benchmark_is_told(name):
+    done = make("bench", f"NAME={name}", check=False)
+    assert done.returncode == 2 and f"NAME: got {name}, expected a name that make bench lists" in done.stderr
+
+
+@pytest.mark.parametrize("target", ["navigate", "navigate-monte-carlo"])
+def test_finished_results_stay_unless_they_are_to_be_replaced(target):
+    assert "--overwrite" not in make("-n", target).stdout
+    assert "--overwrite" in make("-n", target, "OVERWRITE=1").stdout

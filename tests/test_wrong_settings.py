@@ -1,16 +1,25 @@
 """Wrong values of every setting are refused in our own words, never in pydantic's."""
 
+import copy
+import json
 import re
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
 
+from perilune_render.cli import frames
 from perilune_render.config.dataset import DatasetConfig
+from perilune_render.server.native import answers
 from perilune_shared.config.resolve import Section, resolve
+from perilune_shared.config.yaml_text import parse_yaml
+from perilune_shared.dataset.info_file import checked_info
+from perilune_shared.editing import migrate
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import SECTIONS
+from perilune_train.landing.fly import settings
 
 MODELS = [("dataset", DatasetConfig, "perilune_render"), *((name, m, "perilune_train") for name, m in SECTIONS.items())]
 WRONG = (
@@ -70,3 +79,89 @@ def test_what_is_wrong_is_named(setting, message):
     with pytest.raises(UserError) as raised:
         resolve(DatasetConfig, "dataset", "perilune_render", "tiny", None, (setting,))
     assert message in str(raised.value)
+
+
+PRIOR = {
+    "position_m": [0, 0, 900], "velocity_mps": [0, 0, -30], "rotation_wxyz": [0, 1, 0, 0], "position_sigma_m": 2.0,
+    "velocity_sigma_mps": 0.1, "attitude_sigma_deg": 0.1, "inertial": {"gyro_bias_deg_per_h": 1.0},
+    "site_latitude_deg": 1, "site_longitude_deg": 2,
+    "catalogue_columns": {"longitude_deg": "l", "latitude_deg": "b", "radius_km": "r"},
+}  # fmt: skip
+CAMERA = {
+    "width_px": 64, "height_px": 64, "fx_px": 70.0, "fy_px": 70.0, "cx_px": 32.0, "cy_px": 32.0,
+    "distortion": [0.0] * 5, "rotation_camera_from_body": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+}  # fmt: skip
+FRAME_CAMERA = {"width_px": 64, "height_px": 64, "horizontal_fov_deg": 30, "mounting": {}}
+INFO = Path(__file__).parent.parent / "data_manifests/shipped-nav/dataset.json"
+OLD = {
+    "schema_version": "2", "preset": "tiny", "kind": "nav", "seed": 0, "config": {}, "versions": {},
+    "developed_from": {"name": "a", "sha256": "0" * 64},
+}  # fmt: skip
+REQUEST = {"request": "frame", "position_m": [0, 0, 900], "rotation_wxyz": [0, 1, 0, 0], "scene": 0}
+
+
+def info() -> dict[str, typing.Any]:
+    content = json.loads(INFO.read_text())
+    del content["sha256"]
+    for recipe in content["recipes"].values():
+        recipe["config"] = {}
+    return content
+
+
+READERS: dict[str, tuple[dict[str, typing.Any], Callable[[typing.Any, Path], object]]] = {
+    "prior.yaml": (PRIOR, lambda content, path: settings.read_prior(written(path, content))),
+    "camera.yaml": (CAMERA, lambda content, path: settings.read_camera(written(path, content))),
+    "camera of frames": (FRAME_CAMERA, lambda content, path: frames.read_camera(written(path, content))),
+    "dataset.json": (info(), lambda content, path: checked_info(content, path)),
+    "dataset.json of version 2": (OLD, lambda content, path: migrate._info(dict(content), str(path))),
+    "request": (REQUEST, lambda content, path: answers._parsed(json.dumps(content).encode())),
+}
+
+
+def written(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def changes(content: dict[str, typing.Any]) -> Iterator[dict[str, typing.Any]]:
+    """Content with each value changed to every wrong one, and with an unknown key at each level."""
+    for place in places(content):
+        for text in (*WRONG, "1.0e300"):
+            if text in ("1e400", "{1: [2]}"):
+                continue
+            changed, value = copy.deepcopy(content), parse_yaml(text, "value")
+            above: typing.Any = changed
+            for key in place[:-1]:
+                above = above[key]
+            above[place[-1]] = value
+            yield changed
+
+
+def places(tree: object, above: tuple = ()) -> Iterator[tuple]:
+    pairs = [*tree.items(), ("unknown", None)] if isinstance(tree, dict) else []
+    pairs = [*enumerate(tree)][:2] if isinstance(tree, list) else pairs
+    for key, value in pairs:
+        yield (*above, key)
+        yield from places(value, (*above, key))
+
+
+@pytest.mark.filterwarnings("ignore:(overflow|invalid value) encountered")
+@pytest.mark.parametrize("name", READERS)
+def test_no_foreign_sentence_about_a_file_or_a_request(name: str, tmp_path: Path):
+    content, read = READERS[name]
+    messages = []
+    for changed in changes(content):
+        try:
+            read(changed, tmp_path / "file.yaml")
+        except UserError as error:
+            messages.append(str(error))
+    assert len(messages) > 50
+    theirs = [message for message in messages if THEIRS.search(message) or message.endswith("expected another value")]
+    assert theirs == []
+
+
+def test_a_missing_field_of_a_file_is_named_without_the_file():
+    content = {**info(), "schema_version": "4"}
+    del content["name"]
+    with pytest.raises(UserError, match=r"^dataset.json: name: got nothing, expected a value$"):
+        checked_info(content, "dataset.json")

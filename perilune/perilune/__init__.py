@@ -1,4 +1,4 @@
-"""Find lunar craters, render labelled lunar scenes, and read datasets of lunar landings.
+"""Find lunar craters, render labelled lunar scenes, read datasets of lunar landings, and fly a landing filter.
 
     import perilune
 
@@ -13,8 +13,10 @@
     dataset[0].show()
     frames = dataset.torch(split="train", selection="visible")
 
-The detector and `torch` need the extra `train`, scenes the extra `render`. Each part is imported when a name of it is
-first used.
+    estimates = perilune.fly("descent", detector=my_function)
+
+The detector, `torch` and `fly` need the extra `train`, scenes the extra `render`. Each part is imported when a name of
+it is first used.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
     from perilune_train.detect.images.find import CraterDetector as CraterDetector
     from perilune_train.detect.images.find import Craters as Craters
     from perilune_train.detect.images.find import load_detector as load_detector
+    from perilune_train.landing.fly.from_python import fly as fly
+    from perilune_train.landing.fly.run import DescentFiles as DescentFiles
 
 __version__ = "0.1.0"
 _MODULES = {
@@ -41,18 +45,22 @@ _MODULES = {
     "perilune_render.scenes": ("RenderedFrame", "Scene"),
     "perilune_shared.geometry.poses": ("Pose", "descent", "look_at", "look_down"),
     "perilune_train.detect.images.find": ("CraterDetector", "Craters", "load_detector"),
+    "perilune_train.landing.fly.from_python": ("fly",),
+    "perilune_train.landing.fly.run": ("DescentFiles",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = [
     "CraterDetector",
     "Craters",
     "Dataset",
+    "DescentFiles",
     "MissingPart",
     "Pose",
     "RenderedFrame",
     "Scene",
     "UserError",
     "descent",
+    "fly",
     "load_detector",
     "look_at",
     "look_down",

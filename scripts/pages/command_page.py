@@ -19,13 +19,15 @@ def command_page(program: str, app: typer.Typer) -> str:
 
 
 def commands(program: str, app: typer.Typer) -> dict[str, Any]:
-    """Return every command by its full name, for example "perilune-train detect train"."""
+    """Return every command by its full name, for example "perilune-train detect train", without former names."""
     return dict(_leaves(program, typer.main.get_command(app)))
 
 
 def _leaves(name: str, command: Any) -> Iterator[tuple[str, Any]]:
     for below, each in getattr(command, "commands", {}).items():
         full = f"{name} {below}"
+        if each.hidden:
+            continue
         yield from _leaves(full, each) if hasattr(each, "commands") else [(full, each)]
 
 

@@ -44,7 +44,7 @@ USES = (
     use("perilune-render counterfactual", "--manifest data/detect --out without --frames-per-trajectory 1"),
     use("perilune-render frames", "--preset tiny --poses poses.csv --out frames", *_SCENE),
     use("perilune-render preview", "--preset tiny --out preview.png", *QUICK),
-    use("perilune-render export", "--preset tiny --out scene.glb", *QUICK),
+    use("perilune-render ground", "--preset tiny --out scene.glb", *QUICK),
     use(
         "perilune-render spice",
         "--kernels none.bsp --spacecraft LRO --camera-frame C --start 2026-03-01T12:00:00 --end 2026-03-01T13:00:00 "
@@ -71,7 +71,7 @@ USES = (
     use("perilune-train detect evaluate", "--dataset drawn/detect --run runs/detect/tiny --out evaluated"),
     use("perilune-train detect predict", "preview.png --out predicted"),
     use(
-        "perilune-train detect export",
+        "perilune-train detect deploy",
         "--out exported --run runs/detect/tiny --size-px 96 --dataset drawn/detect --int8",
     ),
     use("perilune-train detect compare", "runs/detect/tiny --out compared"),
@@ -81,11 +81,11 @@ USES = (
     use("perilune-train navigate evaluate", "--dataset drawn/nav --run runs/navigate/tiny"),
     use("perilune-train navigate calibrate", "--dataset drawn/nav --run runs/navigate/tiny"),
     use("perilune-train navigate compare", "runs/navigate/tiny --out nav-compared"),
-    use("perilune-train navigate export", "--out nav-exported --run runs/navigate/tiny"),
+    use("perilune-train navigate deploy", "--out nav-exported --run runs/navigate/tiny"),
     use("perilune-train navigate map", "--dataset survey --out map"),
     use("perilune-train navigate methods", "--dataset data/nav --out methods"),
     use("perilune-train navigate monte-carlo", "--dataset data/nav --draws 1 --out monte-carlo"),
-    use("perilune-train navigate unpack", "--dataset data/nav --trajectory scene-0000/trajectory-0000 --out descent"),
+    use("perilune-train navigate descent", "--dataset data/nav --trajectory scene-0000/trajectory-0000 --out descent"),
     use(
         "perilune-train navigate fly",
         "--frames descent/frames --camera descent/camera.yaml --catalogue descent/catalogue.parquet --imu "

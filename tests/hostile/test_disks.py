@@ -51,10 +51,10 @@ COMMANDS: dict[str, tuple[Callable[[], object], list[str]]] = {
     "hugging face": (manifest, ["export", "data", "--format", "huggingface", "--out", "OUT"]),
     "predict": (train, ["detect", "predict", "image.png", "--run", "run", "--out", "OUT", "--threshold", "1e-6"]),
     "compare": (train, ["detect", "compare", "evaluation", "--out", "OUT"]),
-    "export of a detector": (train, ["detect", "export", "--run", "run", "--out", "OUT", "--formats", "onnx"]),
+    "export of a detector": (train, ["detect", "deploy", "--run", "run", "--out", "OUT", "--formats", "onnx"]),
     "preview": (render, ["preview", "--preset", "tiny", *_HEIGHTFIELD, "--out", "OUT.png"]),
     "plan": (render, ["plan", "--preset", "tiny", "--kind", "detect", "--out", "OUT"]),
-    "ground": (render, ["export", "--preset", "tiny", "--out", "OUT.ply"]),
+    "ground": (render, ["ground", "--preset", "tiny", "--out", "OUT.ply"]),
 }
 """Commands by name; OUT is their output."""
 

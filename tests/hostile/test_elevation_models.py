@@ -50,7 +50,7 @@ def sparse(path, side, **options):
 
 
 def export(dem, out, *more):
-    return ["export", *SMALL, "--dem", dem, *more, "--out", out]
+    return ["ground", *SMALL, "--dem", dem, *more, "--out", out]
 
 
 def test_a_polar_product_of_30336_pixels_takes_the_memory_of_the_scene(tmp_path):

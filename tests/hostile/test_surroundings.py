@@ -18,7 +18,7 @@ COMMANDS = (
     "perilune-manifest pack",
     "perilune-train detect train",
     "perilune-train detect evaluate",
-    "perilune-train detect export",
+    "perilune-train detect deploy",
     "perilune-train navigate methods",
     "perilune-train report",
 )

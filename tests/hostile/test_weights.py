@@ -291,7 +291,7 @@ def test_navigators(name: str, tmp_path: Path) -> None:
     path = tmp_path / "run" / "checkpoints" / "best.ckpt"
     path.parent.mkdir(parents=True)
     path.write_bytes(saved(NAVIGATOR | changes, state("warp")))
-    arguments = ("navigate", "export", "--run", tmp_path / "run", "--out", tmp_path / "out")
+    arguments = ("navigate", "deploy", "--run", tmp_path / "run", "--out", tmp_path / "out")
     refused(f"{name}, navigator", main, *arguments, naming=naming, memory_mb=450)
     assert not (tmp_path / "out").exists()
 

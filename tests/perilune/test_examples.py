@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from tests.helpers import in_process
+
+from perilune_train.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,6 +36,13 @@ def test_render_scene(run, tmp_path):
     printed = run("render_scene.py", tmp_path / "descent.png", *small)
     assert printed.startswith("Scene(mare: ") and "RenderedFrame(64 x 64 px" in printed
     assert Image.open(tmp_path / "descent.png").size == (1024, 1024)
+
+
+def test_own_detector(run, quick, tmp_path):
+    words = ("--dataset", quick / "nav", "--trajectory", "scene-0000/trajectory-0000", "--out", tmp_path / "descent")
+    assert in_process.call(main, "navigate", "descent", *words).returncode == 0
+    head, *rows = run("own_detector.py", tmp_path / "descent").splitlines()
+    assert head.split() == ["time_s", "status", "x_m", "y_m", "z_m", "n_matched"] and len(rows) > 2
 
 
 def test_read_dataset(run, quick, tmp_path):

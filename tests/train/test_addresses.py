@@ -40,7 +40,7 @@ _NAVIGATE = ("fusion=warp", "device=cpu", "precision=float32", "warp.size_px=32"
 COMMANDS = {
     "train": "detect train --preset tiny --name a --out {out} --dataset {address}/detect",
     "evaluate": "detect evaluate --run {run} --dataset {address}/detect",
-    "export": "detect export --run {run} --out {out} --dataset {address}/detect",
+    "export": "detect deploy --run {run} --out {out} --dataset {address}/detect",
     "navigate": "navigate train --preset tiny --name a --out {out} --dataset {address}/nav",
     "explain": "explain --name a --out {out} --detector {run}/checkpoints/best.ckpt --navigator {stack} "
     "--dataset {address}",

@@ -97,7 +97,7 @@ def test_their_weights_take_eight_mebibytes_of_a_clone():
 
 def test_without_an_installed_network_a_run_is_needed(picture, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "_FOLDER", tmp_path)
-    detect = [("detect", *command) for command in (("predict", picture), ("benchmark",), ("export",))]
+    detect = [("detect", *command) for command in (("predict", picture), ("benchmark",), ("deploy",))]
     navigate = [("navigate", "benchmark"), ("navigate", "evaluate", "--dataset", tmp_path)]
     for command in (*detect, *navigate):
         done = in_process.call(main, *command, "--out", tmp_path / "out")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import perilune_shared as ps
-from perilune_render.cli.dataset import How, made_or_exit
+from perilune_render.cli.dataset import JobOptions, finished_or_exit
 from perilune_render.config.counterfactual import CounterfactualConfig
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.progress import say
@@ -43,14 +43,14 @@ def counterfactual(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render frames of a dataset again without some of its craters, or under another Sun, with all else equal.
+    """Render frames of a dataset again without some craters, or under another Sun, with everything else equal.
 
     Frames and craters keep their ids. The table of the removed craters is OUT.removed.parquet. Run the same command
     again to resume.
     """
     # Checked before the manifest is read, which takes seconds.
     resolve_over(CounterfactualConfig, "counterfactual", "--sun-azimuth-offset-deg", _sun(sun_azimuth_offset_deg))
-    how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
+    options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     given, store, table = ps.open_dataset(manifest), open_store(out), _table_beside(out)
     from perilune_render.dataset.begin import new_info
     from perilune_render.dataset.from_manifest import plan_from_manifest
@@ -82,7 +82,7 @@ def counterfactual(
     name = f"{info.name}-counterfactual"
     kept = {"name": name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     begun = new_info(config, plan, recipe).model_copy(update=kept)
-    made = made_or_exit(Job(plan, config, begun, manifest), store, how)
+    made = finished_or_exit(Job(plan, config, begun, manifest), store, options)
     if made is not None:
         _write(craters, *table)
         answer(
@@ -96,7 +96,7 @@ def _sun(offset_deg: float) -> dict[str, float]:
 
 
 def _table_beside(out: str) -> tuple[Store, str]:
-    """Store and name of the table of removed craters: a dataset's own folder holds only files of the format."""
+    """Return store and name of the table of removed craters, beside the dataset: its folder holds only known files."""
     if "://" in out:
         above, _, name = out.rstrip("/").rpartition("/")
     else:

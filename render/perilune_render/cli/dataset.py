@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 
 
 _ENDED_S = 2.0
-"""Time from Ctrl-C to the end of a rendering, if its current step takes longer, seconds. SIGKILL would do no harm."""
+"""Longest time from Ctrl-C to the end of the process, seconds. Finished trajectories survive even SIGKILL."""
 _UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
 
 
 @dataclass(frozen=True, slots=True)
-class How:
-    """How a job is rendered, and which part of it."""
+class JobOptions:
+    """Options of a command that renders: with which processes, and which part of the work."""
 
     executor: Literal["local", "ray"]
     """Processes on this machine, or actors of Ray."""
@@ -72,8 +72,8 @@ class How:
         shard: str | None,
         finish: bool,
         dry_run: bool,
-    ) -> "How":
-        """From the options of the command. Raises UserError on a shard that is none, and on options that exclude."""
+    ) -> "JobOptions":
+        """Check the options of a command. Raises UserError on a malformed shard or options that exclude each other."""
         given = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
         if len(given) > 1:
             raise UserError("dataset", "options", " and ".join(given), "one of them")
@@ -96,7 +96,9 @@ def dataset(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
+    kind: Annotated[
+        KindChoice, typer.Option(help="Datasets of the preset: detect (crater detection), nav (navigation) or both.")
+    ] = "both",
     out: Annotated[
         str | None,
         typer.Option(
@@ -138,16 +140,16 @@ def dataset(
     ] = False,
 ) -> None:
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
-    how = How.of(executor, address, workers, threads, shard, finish, dry_run)
+    options = JobOptions.of(executor, address, workers, threads, shard, finish, dry_run)
     if manifest is not None:
         given = [name for name in ("preset", "config", "setting", "height_unit", "kind") if was_given(context, name)]
-        _render_manifest(manifest, out, dem, catalogue, given, how)
+        _render_manifest(manifest, out, dem, catalogue, given, options)
         return
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
     store, failed = open_store(out if out is not None else f"data/{preset}"), False
-    with first_worker(how, resolved) as early:
+    with first_worker(options, resolved) as early:
         # Importing pyarrow and Numba takes seconds; check the settings first.
         from perilune_render.jobs.job import Job
         from perilune_render.jobs.run import RenderingFailed
@@ -156,7 +158,7 @@ def dataset(
         warn_of_suns(resolved, kinds)
         for name in kinds:
             try:
-                made = _made(Job.planned(resolved, name, preset), store.sub(name), how, early)
+                made = _made(Job.planned(resolved, name, preset), store.sub(name), options, early)
             except RenderingFailed as error:
                 _print_failures(error)
                 failed = True
@@ -171,51 +173,51 @@ def dataset(
         raise typer.Exit(1)
 
 
-def first_worker(how: How, config: DatasetConfig) -> "contextlib.AbstractContextManager[Worker | None]":
-    """A worker that starts while this process plans the job; None if no worker of this machine renders it."""
-    if how.executor != "local" or how.workers == 0 or how.finish:
+def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.AbstractContextManager[Worker | None]":
+    """Start a worker while this process plans the job; yield None if no worker of this machine will render it."""
+    if options.executor != "local" or options.workers == 0 or options.finish:
         return contextlib.nullcontext()
     from perilune_render.jobs.worker import early_worker
 
     return early_worker(config.render.engine)
 
 
-def _made(job: "Job", out: Store, how: How, early: "Worker | None" = None) -> "Dataset | None":
-    """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
+def _made(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
+    """Estimate, render or finish; return the dataset if finished. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
-    if how.workers is None and how.executor == "local":
+    if options.workers is None and options.executor == "local":
         from perilune_render.jobs.local import default_workers
 
-        how = replace(how, workers=default_workers(job, how.threads))
-    if how.executor == "local" or how.threads is not None:  # the machines of Ray may have other numbers of cores
-        job = job.with_threads(how.threads, how.workers or 1)
-    if how.finish:
+        options = replace(options, workers=default_workers(job, options.threads))
+    if options.executor == "local" or options.threads is not None:  # machines of Ray may have other numbers of cores
+        job = job.with_threads(options.threads, options.workers or 1)
+    if options.finish:
         return finish_job(job, out)
-    if how.dry_run:
-        _print_estimate(job, out, how, early)
+    if options.dry_run:
+        _print_estimate(job, out, options, early)
         return None
     with ended_by_interrupt(after_s=_ENDED_S, at_end=_kill_processes), progress_bar() as progress:
-        if how.shard is None:
-            return render_job(job, out, progress, _executor(how, early))
-        n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how, early))
+        if options.shard is None:
+            return render_job(job, out, progress, _executor(options, early))
+        n_rendered = render_shard(job, out, Shard(*options.shard), progress, _executor(options, early))
     answer(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish")
     return None
 
 
-def made_or_exit(job: "Job", out: Store, how: How, early: "Worker | None" = None) -> "Dataset | None":
-    """Do what the options ask for; the dataset if it is finished. Ends the command if trajectories failed."""
+def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
+    """Estimate, render or finish; return the dataset if it is finished. Exit with code 1 if trajectories failed."""
     from perilune_render.jobs.run import RenderingFailed
 
     try:
-        return _made(job, out, how, early)
+        return _made(job, out, options, early)
     except RenderingFailed as error:
         _print_failures(error)
         raise typer.Exit(1) from None
 
 
 def _kill_processes() -> None:
-    """Kill all processes that this one has started; those of Ray would go on for a minute."""
+    """Kill all child processes; those of Ray would run for another minute."""
     import psutil
 
     for process in psutil.Process().children(recursive=True):
@@ -223,11 +225,11 @@ def _kill_processes() -> None:
             process.kill()
 
 
-def _print_estimate(job: "Job", out: Store, how: How, early: "Worker | None") -> None:
+def _print_estimate(job: "Job", out: Store, options: JobOptions, early: "Worker | None") -> None:
     from perilune_render.jobs.estimate import estimate
 
     with progress_bar() as progress:
-        found = estimate(job, out, progress, _executor(how, early), how.workers or 1)
+        found = estimate(job, out, progress, _executor(options, early), options.workers or 1)
     hours = f"{found.seconds / 3600:.2f} hours" if found.seconds > 360 else f"{found.seconds:.0f} seconds"
     size = next(f"{found.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if found.n_bytes >= 10**n or n == 0)
     answer(f"{out}: {found.n_frames} frames left, {hours}, {size}")
@@ -240,25 +242,25 @@ def _print_failures(error: "RenderingFailed") -> None:
     say(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}")
 
 
-def _executor(how: How, early: "Worker | None") -> "MakeExecutor":
-    if how.workers == 0:
+def _executor(options: JobOptions, early: "Worker | None") -> "MakeExecutor":
+    if options.workers == 0:
         # Imports Blender, which takes seconds.
         from perilune_render.jobs.in_process import Here
 
         return Here
-    if how.executor == "ray":
+    if options.executor == "ray":
         try:
             from perilune_render.jobs.ray_actors import RayActors
         except ModuleNotFoundError:
             raise UserError("--executor", "ray", "not installed", "pip install 'perilune-render[ray]'") from None
-        return partial(RayActors, n_workers=how.workers, address=how.address)
+        return partial(RayActors, n_workers=options.workers, address=options.address)
     from perilune_render.jobs.local import LocalWorkers
 
-    return partial(LocalWorkers, n_workers=how.workers or 1, early=early)
+    return partial(LocalWorkers, n_workers=options.workers or 1, early=early)
 
 
 def _render_manifest(
-    manifest: str, out: str | None, dem: Path | None, catalogue: Path | None, others: list[str], how: How
+    manifest: str, out: str | None, dem: Path | None, catalogue: Path | None, others: list[str], options: JobOptions
 ) -> None:
     if out is None or others:
         found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
@@ -270,7 +272,7 @@ def _render_manifest(
     from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
     from perilune_render.jobs.job import Job
 
-    made = made_or_exit(Job(*plan_from_manifest(given, dem, catalogue), manifest), store, how)
+    made = finished_or_exit(Job(*plan_from_manifest(given, dem, catalogue), manifest), store, options)
     if made is None:
         return
     same, known, other_scenes = compare_hashes(given, made)

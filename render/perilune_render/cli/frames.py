@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_render.cli.dataset import How, first_worker, made_or_exit
+from perilune_render.cli.dataset import JobOptions, finished_or_exit, first_worker
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
 from perilune_render.cli.sun import warn_of_sun
 from perilune_render.config.cameras import CameraConfig
@@ -50,7 +50,9 @@ def frames(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[Kind, typer.Option(help="What the dataset is for: crater detection or navigation.")] = "nav",
+    kind: Annotated[
+        Kind, typer.Option(help="What the dataset is for: detect (crater detection) or nav (navigation).")
+    ] = "nav",
     workers: Annotated[
         int | None, typer.Option(min=0, max=1024, help="Worker processes. [default: one for each core]")
     ] = None,
@@ -63,12 +65,12 @@ def frames(
     A trajectory of the poses is the unit of work: an interrupted one starts again. Run the same command again to
     resume.
     """
-    how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
+    options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     config = with_camera(
         resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True), camera
     )
     store = open_store(out)
-    with first_worker(how, config) as early:
+    with first_worker(options, config) as early:
         from perilune_render.dataset.begin import new_info
         from perilune_render.jobs.job import Job
         from perilune_render.poses.file import read_poses
@@ -80,7 +82,7 @@ def frames(
         plan, config = given_plan(given, config, kind, poses)
         warn_of_sun(config, "sun_elevation_deg", max(scene.sun_elevation_deg for scene in plan.scenes))
         begun = new_info(config, plan, recipe_of(config, kind, preset))
-        made = made_or_exit(Job(plan, config, begun, str(poses)), store, how, early)
+        made = finished_or_exit(Job(plan, config, begun, str(poses)), store, options, early)
     if made is not None:
         counts = made.info.counts
         answer(f"{made.store}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}")

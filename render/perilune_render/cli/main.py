@@ -15,12 +15,10 @@ from perilune_render.cli.options import (
     Catalogue,
     Config,
     Dem,
-    KindChoice,
+    OneKind,
     Preset,
     Setting,
     Unit,
-    first_kind,
-    one_kind,
     resolved_config,
     warn_of_size,
     was_given,
@@ -34,9 +32,10 @@ from perilune_render.cli.survey import survey
 from perilune_render.config.dataset import DatasetConfig
 from perilune_shared.config.page import annotated_yaml
 from perilune_shared.config.resolve import resolve, to_yaml
-from perilune_shared.console.command_line import new_program, run_command_line
+from perilune_shared.console.command_line import OverwriteFolder, add_renamed, new_program, run_command_line
 from perilune_shared.console.terminal import answer, answer_page, progress_bar
 from perilune_shared.errors import EXIT_USER_ERROR, UserError
+from perilune_shared.storage.replacement import replaceable
 
 app = new_program(
     "perilune-render",
@@ -96,7 +95,7 @@ def plan(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
+    kind: OneKind = "detect",
     manifest: Annotated[
         str | None,
         typer.Option(
@@ -104,6 +103,7 @@ def plan(
             "again by its recipe."
         ),
     ] = None,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
     from perilune_render.dataset.manifest_only import write_left_out_frames, write_manifest_only
@@ -113,15 +113,16 @@ def plan(
         given = [name.replace("_", "-").replace("setting", "set") for name in options if was_given(context, name)]
         if given:
             raise UserError("--manifest", "options", f"--{given[0]}", "--out alone: the rest comes from the manifest")
-        with progress_bar() as progress:
-            write_left_out_frames(ps.open_dataset(manifest), out, progress)
+        replaced = replaceable(out, ("dataset.json",), overwrite=overwrite, inputs=(manifest,))
+        with replaced as folder, progress_bar() as progress:
+            write_left_out_frames(ps.open_dataset(manifest), folder, progress)
     else:
         resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
         if kind != "nav":
             warn_of_size(resolved)
-        warn_of_suns(resolved, (one_kind(kind),))
-        with progress_bar() as progress:
-            write_manifest_only(resolved, one_kind(kind), preset, out, progress)
+        warn_of_suns(resolved, (kind,))
+        with replaceable(out, ("dataset.json",), overwrite=overwrite) as folder, progress_bar() as progress:
+            write_manifest_only(resolved, kind, preset, folder, progress)
     counts = ps.open_dataset(out).info.counts
     answer(f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned")
 
@@ -177,13 +178,13 @@ def preview(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[
-        KindChoice, typer.Option(help="Dataset whose first scene and trajectory are shown (detect or nav).")
-    ] = "detect",
+    kind: OneKind = "detect",
     poses: Annotated[
         Path | None, typer.Option(help="Poses as for `frames`, in place of the descents of the configuration.")
     ] = None,
-    scene: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`; the same as CONFIG.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="With --poses: settings of the scene, as for `frames`; equivalent to CONFIG.")
+    ] = None,
     camera: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`.")] = None,
     camera_axes: CameraAxes = None,
     out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(
@@ -208,36 +209,32 @@ def preview(
     from perilune_render.terrain.scene import site_of
 
     if poses is None:
-        plan = make_plan(resolved, first_kind(kind))
+        plan = make_plan(resolved, kind)
     else:
-        plan, resolved = given_plan(
-            read_poses(poses, *site_of(resolved), camera_axes), resolved, first_kind(kind), poses
-        )
-    setting_of_sun = "sun_elevation_deg" if poses else f"dataset.{first_kind(kind)}.sun.elevation_deg"
+        plan, resolved = given_plan(read_poses(poses, *site_of(resolved), camera_axes), resolved, kind, poses)
+    setting_of_sun = "sun_elevation_deg" if poses else f"dataset.{kind}.sun.elevation_deg"
     warn_of_sun(resolved, setting_of_sun, max(each.sun_elevation_deg for each in plan.scenes))
     map_path = out.with_name(f"{out.stem}-map.png")
-    write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
+    write_preview(plan, resolved, poses or f"configuration: dataset.{kind}", out, map_path)
     answer(f"look at {out} and {map_path}")
 
 
 @app.command()
-def export(
+def ground(
     preset: Preset = "small",
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Dataset whose first scene is exported (detect or nav).")] = "detect",
-    step: Annotated[
-        int, typer.Option(min=1, help="Vertex spacing of the exported mesh, as a multiple of the scene's.")
-    ] = 4,
+    kind: OneKind = "detect",
+    step: Annotated[int, typer.Option(min=1, help="Vertex spacing of the mesh, as a multiple of the scene's.")] = 4,
     pixel_m: Annotated[float, typer.Option(min=0.01, help="Pixel size of a GeoTIFF on the ground, metres.")] = 1.0,
     out: Annotated[
         Path, typer.Option(help="File to write: .glb, .ply, .obj or .stl for a mesh, .tif for heights.")
     ] = Path("scene.glb"),
 ) -> None:
-    """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
+    """Write the ground of a configuration's first scene as a mesh or a GeoTIFF (metres, O_L: Z up, Y south, X west)."""
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene
@@ -245,13 +242,16 @@ def export(
 
     if out.suffix not in MESH_SUFFIXES + RASTER_SUFFIXES:
         raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
-    plan = make_plan(resolved, first_kind(kind))
+    plan = make_plan(resolved, kind)
     scene = cached_scene(resolved, plan.view, plan.scenes[0].seed)
     if out.suffix in RASTER_SUFFIXES:
         export_raster(scene, out, pixel_m)
     else:
         export_mesh(scene, out, step=step)
     answer(f"{out}: {len(scene.craters)} craters, {len(scene.boulders)} boulders")
+
+
+add_renamed(app, "export", "ground", ground)
 
 
 def main() -> None:

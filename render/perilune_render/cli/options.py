@@ -15,6 +15,8 @@ from perilune_shared.errors import UserError
 
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""
+OneKind = Annotated[Kind, typer.Option(help="Dataset of the preset: detect (crater detection) or nav (navigation).")]
+"""The option of commands that are about one dataset; its default is detect."""
 Preset = Annotated[
     str,
     typer.Option(
@@ -43,18 +45,6 @@ def was_given(context: typer.Context, name: str) -> bool:
     """Whether an option was given on the command line."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
-
-
-def first_kind(kind: KindChoice) -> Kind:
-    """The kind itself; `detect` for `both`."""
-    return "detect" if kind == "both" else kind
-
-
-def one_kind(kind: KindChoice) -> Kind:
-    """The kind itself. Raises UserError for `both`."""
-    if kind == "both":
-        raise UserError("--kind", "kind", "both", "detect or nav (one dataset)")
-    return first_kind(kind)
 
 
 def warn_of_size(config: DatasetConfig) -> None:

@@ -18,7 +18,7 @@ _PORT = 10363
 _NATIVE_PORT = 10364
 _LOOPBACK = "127.0.0.1"
 _OWN = (_LOOPBACK, "::1", "localhost")
-"""Addresses that only this machine reaches."""
+"""Loopback addresses: only this machine reaches them."""
 _Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
 
 
@@ -32,7 +32,7 @@ def serve(
     catalogue: Catalogue = None,
     engine: Annotated[Literal["heightfield", "cycles"], typer.Option(help="Renderer.")] = "heightfield",
     host: Annotated[
-        str, typer.Option(help="Address to listen on; another than this machine's own opens it to others.")
+        str, typer.Option(help="Address to listen on; other machines can connect unless it is a loopback address.")
     ] = _LOOPBACK,
     port: Annotated[int, typer.Option(min=0, max=65535, help="PANGU: port; 0 takes a free one.")] = _PORT,
     native_port: Annotated[
@@ -40,15 +40,15 @@ def serve(
         typer.Option(min=0, max=65535, help="Port of the interface for `perilune_shared.client`; 0 takes a free one."),
     ] = _NATIVE_PORT,
     sun_azimuth: Annotated[
-        _Zero, typer.Option(help="PANGU: where the Sun's azimuth is 0, and its sense.")
+        _Zero, typer.Option(help="PANGU: direction in which the Sun's azimuth is 0, and the sense in which it grows.")
     ] = "clockwise-from-y",
     roll: Annotated[
         Literal["left", "right"], typer.Option(help="PANGU: where positive roll leans the camera's top.")
     ] = "left",
     allow_quit: Annotated[bool, typer.Option("--allow-quit", help="PANGU: let a client end the server.")] = False,
-    max_clients: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of clients at once.")] = 16,
+    max_clients: Annotated[int, typer.Option(min=1, max=1000, help="Maximum number of connected clients.")] = 16,
     idle_s: Annotated[
-        float, typer.Option(min=1, help="Disconnect a client that sends nothing for so long, seconds.")
+        float, typer.Option(min=1, help="Time without a request after which a client is disconnected, seconds.")
     ] = 600.0,
     scenes: Annotated[
         int,
@@ -95,12 +95,14 @@ def serve(
             f"{stated.sun_elevation_deg:g} degrees, until a client sets it"
         )
         say(
-            f"not known of PANGU, so options: --sun-azimuth {sun_azimuth}, --roll {roll}; cameras 0 and 1 are the "
-            "same, each client has its own camera and Sun"
+            "PANGU does not document these conventions, so they are options: "
+            f"--sun-azimuth {sun_azimuth}, --roll {roll}; cameras 0 and 1 are one camera, and each client has its own "
+            "camera and Sun"
         )
         say(
-            "not known either, and fixed: first viewpoint 1000 m above the site, straight down; a pulse that misses "
-            "has range 0 and cosine 0; error codes 1 (refused) and 2 (faulty); docs/reference/pangu.md has the rest"
+            "not documented either, and fixed here: first viewpoint 1000 m above the site, straight down; a pulse that "
+            "misses has range 0 and cosine 0; error codes 1 (refused) and 2 (faulty); docs/reference/pangu.md has the "
+            "rest"
         )
         say(f"perilune_shared.client at {native_address(host, own.port)}")
         if host not in _OWN:

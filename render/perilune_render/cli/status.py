@@ -28,5 +28,5 @@ def status(
         if found.n_silent:
             lines.append(f"  silent        {found.n_silent} processes, for {SILENT_S:.0f} s or more")
         lines += [f"  failed        {name}: {error}" for name, error in found.failed.items()]
-        # Names and messages are those of other processes: each stays within its line.
+        # Other processes wrote the names and messages; a line break in one must not start a line.
         answer_page("\n".join("".join(line.splitlines()) for line in lines))

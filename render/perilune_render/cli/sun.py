@@ -19,8 +19,8 @@ def highest_sun_deg(latitude_deg: float) -> float:
 def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None:
     """Warn if the Sun never stands this high at the site; `where` names the setting.
 
-    Only of a site that is stated, by an elevation model or a `dataset.terrain.latitude_deg` of the user: other ground
-    is procedural and of no place. Raises UserError if the elevation model cannot be read.
+    The site must be stated, by an elevation model or by the user's `dataset.terrain.latitude_deg`: other ground is
+    procedural and belongs to no place. Raises UserError if the elevation model cannot be read.
     """
     latitude = _stated_latitude_deg(config)
     if latitude is None or elevation_deg <= highest_sun_deg(latitude):
@@ -33,7 +33,7 @@ def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None
 
 
 def warn_of_suns(config: DatasetConfig, kinds: tuple[Kind, ...]) -> None:
-    """`warn_of_sun` of the Suns that are drawn for datasets of these kinds."""
+    """Warn of the highest Sun that may be drawn for datasets of these kinds."""
     for kind in kinds:
         warn_of_sun(config, f"dataset.{kind}.sun.elevation_deg", config.kind(kind).sun.elevation_deg.high)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import perilune_shared as ps
-from perilune_render.cli.dataset import How, made_or_exit
+from perilune_render.cli.dataset import JobOptions, finished_or_exit
 from perilune_render.config.survey import SurveyConfig
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.terminal import answer
@@ -52,7 +52,7 @@ def survey(
         "sun_elevation_deg": sun_elevation_deg,
     }
     settings = resolve_over(SurveyConfig, "survey", "survey", values)
-    how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
+    options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     given, store = ps.open_dataset(manifest), open_store(out)
     from perilune_render.dataset.begin import new_info
     from perilune_render.dataset.from_manifest import plan_from_manifest
@@ -68,7 +68,7 @@ def survey(
     recipe = recipe_of(config, info.kind, info.recipe().preset)
     kept = {"name": f"{info.name}-survey", "split_by": info.split_by, "history": info.history, "licence": info.licence}
     begun = new_info(config, plan, recipe).model_copy(update=kept)
-    made = made_or_exit(Job(plan, config, begun, manifest), store, how)
+    made = finished_or_exit(Job(plan, config, begun, manifest), store, options)
     if made is not None:
         counts = made.info.counts
         answer(

@@ -1,13 +1,16 @@
 """Commands of `perilune-manifest` that edit or compare datasets."""
 
+from contextlib import AbstractContextManager
 from typing import Annotated
 
 import typer
 
 import perilune_shared as ps
+from perilune_shared.console.command_line import OverwriteFolder
 from perilune_shared.console.terminal import answer, answer_table, progress_bar
 from perilune_shared.dataset.names import ImageChoice, ImageMode, SplitUnit
 from perilune_shared.errors import UserError
+from perilune_shared.storage.replacement import replaceable
 
 EXIT_DIFFERENT = 1
 
@@ -40,6 +43,11 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
+def _new_dataset(out: str, overwrite: bool, *inputs: str) -> AbstractContextManager[str]:
+    """Where to write the dataset at `out`, made of the datasets `inputs`."""
+    return replaceable(out, ("dataset.json",), overwrite=overwrite, inputs=inputs)
+
+
 def _print_counts(out: str) -> None:
     """Print the counts of the new dataset and whether its splits share terrain."""
     info = ps.open_dataset(out).info
@@ -57,12 +65,13 @@ def merge(
     name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
     images: ImagesOption = "copy",
     link: LinkOption = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Merge several datasets into one. A scene or frame that is in two of them is written once."""
     from perilune_shared.editing.merge import merge as merge_datasets
 
-    with progress_bar() as progress:
-        merge_datasets([ps.open_dataset(path) for path in datasets], out, name, _mode(images, link), progress)
+    with _new_dataset(out, overwrite, *datasets) as folder, progress_bar() as progress:
+        merge_datasets([ps.open_dataset(path) for path in datasets], folder, name, _mode(images, link), progress)
     _print_counts(out)
 
 
@@ -77,12 +86,13 @@ def subset(
     mb: Annotated[float | None, typer.Option(help="Maximum size of all PNGs, 10^6 bytes.")] = None,
     images: ImagesOption = "copy",
     link: LinkOption = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Copy part of a dataset: by conditions on columns, number of frames or size."""
     from perilune_shared.editing.subset import subset as choose
 
-    with progress_bar() as progress:
-        choose(ps.open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
+    with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
+        choose(ps.open_dataset(dataset), folder, tuple(where or ()), frames, mb, _mode(images, link), progress)
     _print_counts(out)
 
 
@@ -97,12 +107,13 @@ def split(
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the split.")] = 0,
     images: ImagesOption = "copy",
     link: LinkOption = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Re-split a dataset into train, val and test, by scene, trajectory or frame."""
     from perilune_shared.editing.split import split_dataset
 
-    with progress_bar() as progress:
-        split_dataset(ps.open_dataset(dataset), out, by, val, test, seed, _mode(images, link), progress)
+    with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
+        split_dataset(ps.open_dataset(dataset), folder, by, val, test, seed, _mode(images, link), progress)
     _print_counts(out)
 
 
@@ -119,12 +130,14 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
     raise typer.Exit(EXIT_DIFFERENT)
 
 
-def migrate(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
+def migrate(
+    dataset: DatasetArgument, out: OutOption, link: LinkOption = False, overwrite: OverwriteFolder = False
+) -> None:
     """Convert a dataset of an older schema version to the current one."""
     from perilune_shared.editing.migrate import migrate as migrate_dataset
 
-    with progress_bar() as progress:
-        migrate_dataset(dataset, out, progress, link=link)
+    with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
+        migrate_dataset(dataset, folder, progress, link=link)
     _print_counts(out)
 
 
@@ -132,21 +145,24 @@ def pack(
     dataset: DatasetArgument,
     out: OutOption,
     shard_mb: Annotated[float, typer.Option(help="Size of a shard of frames, megabytes.")] = 128,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Pack frames with poses and labels into Parquet shards by split, and each table into one file, for streaming."""
     from perilune_shared.editing.pack import pack as pack_dataset
 
-    with progress_bar() as progress:
-        pack_dataset(ps.open_dataset(dataset), out, shard_mb, progress)
+    with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
+        pack_dataset(ps.open_dataset(dataset), folder, shard_mb, progress)
     _print_counts(out)
 
 
-def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
+def unpack(
+    dataset: DatasetArgument, out: OutOption, link: LinkOption = False, overwrite: OverwriteFolder = False
+) -> None:
     """Unpack frames from Parquet into one PNG file per frame."""
     from perilune_shared.editing.pack import unpack as unpack_dataset
 
-    with progress_bar() as progress:
-        unpack_dataset(ps.open_dataset(dataset), out, progress, link=link)
+    with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
+        unpack_dataset(ps.open_dataset(dataset), folder, progress, link=link)
     _print_counts(out)
 
 
@@ -158,10 +174,11 @@ def attach(
         bool, typer.Option("--rehash", help="Accept frames with other hashes and record their hashes.")
     ] = False,
     link: LinkOption = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Combine a manifest without frames and the frames regenerated from it into a dataset."""
     from perilune_shared.editing.attach import attach as attach_frames
 
-    with progress_bar() as progress:
-        attach_frames(ps.open_dataset(manifest), frames, out, rehash, progress, link=link)
+    with _new_dataset(out, overwrite, manifest, frames) as folder, progress_bar() as progress:
+        attach_frames(ps.open_dataset(manifest), frames, folder, rehash, progress, link=link)
     _print_counts(out)

@@ -6,11 +6,21 @@ import typer
 
 import perilune_shared as ps
 from perilune_shared.cli.edit import DatasetArgument, LinkOption
+from perilune_shared.console.command_line import OverwriteFolder
 from perilune_shared.console.terminal import answer, progress_bar
 from perilune_shared.errors import UserError
+from perilune_shared.storage.replacement import replaceable
 
 ExportFormat = Literal["coco", "yolo", "tum", "kitti", "croissant", "huggingface"]
 _WITH_LABELS = ("coco", "yolo", "huggingface")
+_KNOWN_BY = {
+    "coco": ("instances_*.json",),
+    "yolo": ("data.yaml", "labels/**/*.txt"),
+    "tum": ("*/trajectory-*.txt",),
+    "kitti": ("*/*.times.txt",),
+    "huggingface": ("README.md", "data/*/*.parquet"),
+}
+"""Files by which a folder of a format is known."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -43,6 +53,7 @@ def export(
         ),
     ] = "all",
     link: LinkOption = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write labels, trajectories or metadata in formats of other tools."""
     from perilune_shared.config.errors import nearest
@@ -55,7 +66,6 @@ def export(
     from perilune_shared.export.trajectory import export_kitti, export_tum
     from perilune_shared.export.yolo import export_yolo
     from perilune_shared.labels.thresholds import SELECTIONS
-    from perilune_shared.storage.new_store import check_empty
 
     opened = ps.open_dataset(dataset)
     check_keys(opened)
@@ -79,20 +89,20 @@ def export(
         return
     if out is None:
         raise UserError("--out", "folder", "none", f"a new folder for the {format} files")
-    check_empty(out)
-    with progress_bar() as progress:
+    known = replaceable(out, _KNOWN_BY[format], overwrite=overwrite, inputs=(dataset,))
+    with known as folder, progress_bar() as progress:
         match format:
             case "coco":
-                done = f"{export_coco(opened, out, progress, split, choose)} annotations"
+                done = f"{export_coco(opened, folder, progress, split, choose)} annotations"
                 done += "" if choose is None else " of selected labels; the others are marked iscrowd"
             case "yolo":
-                done = f"{export_yolo(opened, out, progress, split, choose, link=link)} boxes"
+                done = f"{export_yolo(opened, folder, progress, split, choose, link=link)} boxes"
             case "huggingface":
-                done = f"{export_hugging_face(opened, out, progress, split, choose)} frames"
+                done = f"{export_hugging_face(opened, folder, progress, split, choose)} frames"
             case "tum":
-                done = f"{export_tum(opened, out, progress, split)} trajectories"
+                done = f"{export_tum(opened, folder, progress, split)} trajectories"
             case "kitti":
-                done = f"{export_kitti(opened, out, progress, split)} trajectories"
+                done = f"{export_kitti(opened, folder, progress, split)} trajectories"
     _say(f"{out}: {done}")
 
 

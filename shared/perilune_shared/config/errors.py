@@ -100,10 +100,10 @@ def user_error_of(
     if location and location[-1] == _KEY:
         field = ".".join([section, *location[:-2]])
         return UserError(where, field, f"the key {formatted(fault['input'])}", expected_of(fault))
-    return UserError(where, field, _got(fault), expected_of(fault))
+    return UserError(where, field, got_of(fault), expected_of(fault))
 
 
-def _got(fault: ErrorDetails) -> str:
+def got_of(fault: ErrorDetails) -> str:
     """The value that is wrong; of settings that do not fit together only those that the message names."""
     if fault["type"] == "missing":
         return "nothing"

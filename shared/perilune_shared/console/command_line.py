@@ -7,13 +7,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from perilune_shared.console.interrupts import ended_by_interrupt, ends_at_interrupt
-from perilune_shared.console.terminal import answer
+from perilune_shared.console.terminal import answer, say
 from perilune_shared.errors import DISK_FAULTS, EXIT_INTERRUPTED, EXIT_USER_ERROR, STOPPED, UserError, one_line
 from perilune_shared.threads import described_settings, set_up_program
 
@@ -30,6 +31,11 @@ Verbose = Annotated[
     ),
 ]
 """The option of a program, before the name of the command: `perilune-train -v detect train`."""
+
+OverwriteFolder = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the folder of --out, if an earlier run of this command wrote it.")
+]
+"""The option of commands that write a new folder, for `storage.replacement.replaceable`."""
 
 
 def new_program(name: str, version: str, summary: str) -> typer.Typer:
@@ -59,13 +65,24 @@ def new_program(name: str, version: str, summary: str) -> typer.Typer:
     return app
 
 
+def add_renamed(app: typer.Typer, old: str, new: str, command: Callable[..., None]) -> None:
+    """Let a command that is now called `new` be called by its former name: hidden, with a line on standard error."""
+
+    @wraps(command)
+    def renamed(*arguments: Any, **options: Any) -> None:
+        say(f"{old}: renamed to {new}")
+        command(*arguments, **options)
+
+    app.command(old, hidden=True)(renamed)
+
+
 _UNTRACKED = {
     "DO_NOT_TRACK": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
     "ORT_DISABLE_TELEMETRY": "1",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
-"""Variables by which libraries report no use to their makers; a value that the user has set stays."""
+"""Environment variables that switch off telemetry of libraries; a value that the user has set stays."""
 
 
 def _check_arguments() -> None:
@@ -78,11 +95,11 @@ def _check_arguments() -> None:
 def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -> None:
     """Run a command line; print user errors and disk errors in one line and exit with code 2.
 
-    First sets the threads of the numerical libraries (`threads.set_up_program`), which are not imported yet, and the
-    variables by which libraries report no use to their makers.
+    First sets the threads of the numerical libraries (`threads.set_up_program`), which are not imported yet, and
+    switches off the telemetry of libraries.
 
-    Ctrl-C ends the command with one line and exit code 130, after `ended_after_s` at the latest: then the processes
-    that it has started are ended too. Ctrl-C at the end of the process, when all work is done, is ignored.
+    Ctrl-C ends the command with one line and exit code 130, after `ended_after_s` at the latest, when its child
+    processes are ended too. Ctrl-C at the end of the process, when all work is done, is ignored.
     """
     with _interrupts() as interrupted, ended_by_interrupt(after_s=ended_after_s, at_end=_end_children):
         message = _error_of(app, interrupted)
@@ -94,7 +111,7 @@ def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -
 
 
 def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
-    """Run a command line; the line to print if a user has caused its end, else None."""
+    """Run a command line; return the line to print if the user caused its end, else None."""
     try:
         _check_arguments()
         set_up_program()
@@ -161,7 +178,7 @@ def _interrupts() -> Iterator[list[bool]]:
 
 
 def _end_children() -> None:
-    """Ask the processes that this one has started to end (Linux)."""
+    """Ask all child processes to end (Linux)."""
     for path in Path("/proc/self/task").glob("*/children"):
         for child in path.read_text(encoding="ascii").split():
             with contextlib.suppress(ProcessLookupError):

@@ -1,7 +1,7 @@
-"""All that the command lines print: lines, pages, tables and the progress bar.
+"""Output of the command lines: lines, pages, tables and the progress bar.
 
-Names from files are part of most lines, so none reaches the terminal with a control character, and none is read as
-markup. `tests/test_house.py` finds prints elsewhere.
+Most lines contain names from files. These functions replace control characters and do not interpret markup.
+`tests/test_house.py` finds prints elsewhere.
 """
 
 import sys
@@ -36,7 +36,7 @@ def say(line: object, style: str | None = None) -> None:
 
 
 def say_page(text: str) -> None:
-    """Print several lines on standard error; a name in them cannot start a line unless the caller lets it."""
+    """Print several lines on standard error. The caller must keep names from files within one line."""
     console.print(Text(_lines(text)), soft_wrap=True)
 
 
@@ -99,7 +99,7 @@ class _Note(ProgressColumn):
 
 
 class _LoggedProgress(Progress):
-    """Progress that prints a line once a minute where the console is no terminal: Rich shows only the end there."""
+    """Progress that prints a line once a minute if the console is not a terminal, where Rich shows only the end."""
 
     def __init__(self, *columns: ProgressColumn, clock: Callable[[], float], **fields: Any) -> None:
         super().__init__(*columns, get_time=clock, **fields)

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from perilune_shared.config.errors import expected_of, formatted
+from perilune_shared.config.errors import expected_of, got_of
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError, shortened
@@ -84,7 +84,7 @@ def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in fault["loc"])
-        raise UserError(path, field or "content", formatted(fault["input"]), expected_of(fault)) from None
+        raise UserError(path, field or "content", got_of(fault), expected_of(fault)) from None
     except RecursionError as error:
         raise UserError(path, "content", error, "JSON with fewer levels") from None
     _check_texts(info, path)

@@ -9,7 +9,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import pyarrow as pa
+from pydantic import ValidationError
 
+from perilune_shared.config.errors import expected_of, got_of
 from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.info_file import INFO_NAME, checked_info, read_object
@@ -92,8 +94,10 @@ def _info(content: dict[str, Any], path: str) -> DatasetInfo:
         origin = {**origin, "camera_config": None}
     try:
         recipe = Recipe.model_validate({**recipe_fields, "kind": content["kind"], "developed_from": origin})
-    except ValueError as error:
-        raise UserError(path, "config", str(error).splitlines()[0], "the settings of a dataset") from None
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in fault["loc"])
+        raise UserError(path, field or "config", got_of(fault), expected_of(fault)) from None
     return checked_info(
         {
             **content,

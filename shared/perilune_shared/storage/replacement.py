@@ -1,25 +1,37 @@
 """Replace a folder that an earlier run of a command wrote: the option `--overwrite`."""
 
 import contextlib
+import ctypes
+import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
+from perilune_shared.console.interrupts import interrupts_held, unfinished
 from perilune_shared.errors import UserError
+from perilune_shared.storage.locks import lock
 from perilune_shared.storage.store import open_store
 
 Out = TypeVar("Out", str, Path)
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+"""From linux/fcntl.h and linux/fs.h."""
 
 
 @contextlib.contextmanager
-def replaceable(out: Out, known_by: tuple[str, ...], *, overwrite: bool) -> Iterator[Out]:
+def replaceable(
+    out: Out, known_by: tuple[str, ...], *, overwrite: bool, inputs: tuple[str | Path, ...] = ()
+) -> Iterator[Out]:
     """Yield where a command is to write: `out`, or with `overwrite` a new folder that then takes the place of `out`.
 
-    The old folder stays until the new one is complete. It is replaced only if it has one of the files or folders
-    `known_by`, which the command always writes, so that a wrong `out` deletes no other data. Raises UserError if it
-    has none of them, if it is not empty and not to be replaced, or with `overwrite` if `out` is in an object store.
+    The old folder stays until the new one is complete; an interrupted command leaves one of the two. `known_by` has
+    patterns of files that the command always writes: the folder is replaced only if it has a match for each, so that a
+    wrong `out` deletes no other data. `inputs` are what the command reads: paths or addresses.
+
+    Raises UserError if the folder is not empty and not to be replaced. With `overwrite` raises UserError if a file of
+    `known_by` is missing, if the folder holds an input or the current folder, or if `out` is in an object store.
     """
     folder = open_store(out).folder
     if overwrite and folder is None:
@@ -29,24 +41,58 @@ def replaceable(out: Out, known_by: tuple[str, ...], *, overwrite: bool) -> Iter
         return
     if not overwrite:
         raise UserError(out, "--out", "a path that is not empty", "a new or empty folder; --overwrite replaces it")
-    if folder.is_symlink() or not any(folder.joinpath(name).exists() for name in known_by):
-        expected = "a folder that this command has written, with " + " or ".join(known_by)
-        raise UserError(out, "--overwrite", "another folder", expected)
-    if Path.cwd().is_relative_to(folder.resolve()):
-        raise UserError(out, "--overwrite", "the current folder, or one that has it", "another folder")
+    _check_replaceable(folder, out, known_by, inputs)
     folder = folder.absolute()
-    made = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.new")
-    old = made.with_suffix(".old")
-    try:
-        yield type(out)(made)
-        if not made.exists():
-            return
-        folder.rename(old)
-        try:
-            made.rename(folder)
-        except OSError:
-            old.rename(folder)
-            raise
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
+    with lock(folder.with_name(f".{folder.name}.lock"), folder):
+        leftover = re.compile(rf"\.{re.escape(folder.name)}\.[0-9a-f]+\.(new|old)")
+        for path in folder.parent.iterdir():
+            if leftover.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
+        made = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.new")
+        with unfinished(made):
+            try:
+                yield type(out)(made)
+                if made.exists():
+                    _replace(folder, made)
+            finally:
+                shutil.rmtree(made, ignore_errors=True)
+
+
+def _check_replaceable(
+    folder: Path, out: str | Path, known_by: tuple[str, ...], inputs: tuple[str | Path, ...]
+) -> None:
+    if folder.is_symlink() or not all(any(folder.glob(pattern)) for pattern in known_by):
+        expected = "a folder that this command has written, with " + " and ".join(known_by)
+        raise UserError(out, "--overwrite", "another folder", expected)
+    place = folder.resolve()
+    if Path.cwd().is_relative_to(place):
+        raise UserError(out, "--overwrite", "the current folder, or one that has it", "another folder")
+    for read in inputs:
+        source = open_store(read).folder
+        if source is not None and source.resolve().is_relative_to(place):
+            raise UserError(out, "--overwrite", f"a folder that holds the input {read}", "another folder")
+
+
+def _replace(folder: Path, made: Path) -> None:
+    """Put a folder in the place of another one, which is deleted."""
+    with interrupts_held():
+        if not _exchanged(folder, made):
+            old = made.with_suffix(".old")
+            folder.rename(old)
+            try:
+                made.rename(folder)
+            except OSError:
+                old.rename(folder)
+                raise
+            made = old
+    shutil.rmtree(made, ignore_errors=True)
+
+
+def _exchanged(folder: Path, other: Path) -> bool:
+    """Exchange two folders in one step, if the system can (Linux), so that a killed process leaves both whole."""
+    renameat2 = getattr(ctypes.CDLL(None), "renameat2", None) if os.name == "posix" else None
+    names = os.fsencode(folder), os.fsencode(other)
+    return (
+        renameat2 is not None
+        and renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], ctypes.c_uint(_RENAME_EXCHANGE)) == 0
+    )

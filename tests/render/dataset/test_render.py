@@ -219,14 +219,14 @@ def test_preview_and_export(tmp_path):
     assert run("preview", *coarse, "--out", tmp_path / "p.png").returncode == 0
     picture = cv2.imread(str(tmp_path / "p.png"))
     assert picture.shape == (520, 1040, 3) and picture.std() > 10
-    assert run("export", *coarse, "--step", 3, "--out", tmp_path / "m.ply").returncode == 0
+    assert run("ground", *coarse, "--step", 3, "--out", tmp_path / "m.ply").returncode == 0
     import trimesh
 
     mesh = trimesh.load(tmp_path / "m.ply")
     assert len(mesh.faces) > 10_000 and mesh.extents[0] > 2000
-    assert run("export", *coarse, "--pixel-m", 10, "--out", tmp_path / "m.tif").returncode == 0
+    assert run("ground", *coarse, "--pixel-m", 10, "--out", tmp_path / "m.tif").returncode == 0
     assert (tmp_path / "m.tif").stat().st_size > 10_000
-    bad = run("export", "--preset", "tiny", "--out", tmp_path / "m.xyz")
+    bad = run("ground", "--preset", "tiny", "--out", tmp_path / "m.xyz")
     assert bad.returncode == 2 and ".glb" in bad.stderr
 
 

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from perilune_shared.errors import UserError
+from perilune_shared.storage import replacement
 from perilune_shared.storage.replacement import replaceable
 
 
@@ -24,6 +25,46 @@ def test_an_older_folder_is_replaced_whole(tmp_path):
     assert content_of(tmp_path) == {"out/table": "new"}
 
 
+def test_an_older_folder_is_replaced_whole_without_an_exchange(tmp_path, monkeypatch):
+    """As on systems that cannot exchange two folders."""
+    monkeypatch.setattr(replacement, "_exchanged", lambda *_: False)
+    write(tmp_path / "out", "old")
+    with replaceable(tmp_path / "out", ("table",), overwrite=True) as folder:
+        write(folder, "new")
+    assert content_of(tmp_path) == {"out/table": "new"}
+
+    def fail(path: Path, target: Path) -> Path:
+        if path.suffix == ".new":
+            raise OSError
+        return rename(path, target)
+
+    rename = Path.rename
+    monkeypatch.setattr(Path, "rename", fail)
+    with pytest.raises(OSError), replaceable(tmp_path / "out", ("table",), overwrite=True) as folder:
+        write(folder, "newer")
+    assert content_of(tmp_path) == {"out/table": "new"}
+
+
+def test_what_a_killed_command_left_is_removed(tmp_path):
+    for name in ("out", ".out.0123456789abcdef.new", ".out.0123456789abcdef.old", ".out.new", ".other.01.new"):
+        write(tmp_path / name, name)
+    with replaceable(tmp_path / "out", ("table",), overwrite=True) as folder:
+        write(folder, "new")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.01.new", ".out.new", "out"]
+
+
+def test_two_commands_at_once_do_not_replace_one_folder(tmp_path):
+    write(tmp_path / "out", "old")
+    with replaceable(tmp_path / "out", ("table",), overwrite=True) as folder:
+        write(folder, "new")
+        with (
+            pytest.raises(UserError, match="locked by"),
+            replaceable(tmp_path / "out", ("table",), overwrite=True),
+        ):
+            pytest.fail("not refused")
+    assert content_of(tmp_path) == {"out/table": "new"}
+
+
 def test_the_older_folder_stays_after_a_failure(tmp_path):
     write(tmp_path / "out", "old")
     with pytest.raises(ZeroDivisionError), replaceable(str(tmp_path / "out"), ("table",), overwrite=True) as folder:
@@ -42,6 +83,7 @@ def test_no_other_folder_is_deleted(tmp_path, monkeypatch):
     write(tmp_path / "out", "old")
     for out, known_by, message in (
         (str(tmp_path / "out"), ("picture",), "got another folder, expected a folder that this command has written"),
+        (str(tmp_path / "out"), ("table", "*.png"), r"has written, with table and \*.png"),
         ("s3://bucket/prefix", ("table",), "got an address"),
         (str(tmp_path / "out"), ("table",), "got the current folder"),
     ):
@@ -50,3 +92,16 @@ def test_no_other_folder_is_deleted(tmp_path, monkeypatch):
         with pytest.raises(UserError, match=message), replaceable(out, known_by, overwrite=True):
             pytest.fail("not refused")
     assert content_of(tmp_path) == {"out/table": "old"}
+
+
+@pytest.mark.parametrize("read", ["out", "out/table", "link"])
+def test_no_folder_that_is_read_is_deleted(tmp_path, read):
+    write(tmp_path / "out", "old")
+    (tmp_path / "link").symlink_to(tmp_path / "out")
+    inputs = ("memory://dataset", str(tmp_path / read))
+    with (
+        pytest.raises(UserError, match="got a folder that holds the input"),
+        replaceable(tmp_path / "out", ("table",), overwrite=True, inputs=inputs),
+    ):
+        pytest.fail("not refused")
+    assert content_of(tmp_path / "out") == {"table": "old"}

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from perilune_shared.config.resolve import parse_setting, resolve, resolve_over
+from perilune_shared.console.command_line import OverwriteFolder, add_renamed
 from perilune_shared.console.terminal import say, say_page
 from perilune_shared.errors import UserError
 from perilune_shared.storage.replacement import replaceable
@@ -13,7 +14,6 @@ from perilune_train.cli.options import (
     AllowOverlap,
     ConfigFile,
     Overwrite,
-    OverwriteFolder,
     Preset,
     RunName,
     RunsFolder,
@@ -58,7 +58,7 @@ Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels
 
 
 def check_nodata(value: float | None) -> None:
-    """Raise UserError if it is not a finite number."""
+    """Raise UserError if the value of pixels without data is not a finite number."""
     if value is not None and not abs(value) < float("inf"):
         raise UserError("--nodata", "value", value, "a finite number; others are always taken as no data")
 
@@ -280,7 +280,12 @@ def compare(
 
 @app.command("predict")
 def predict(
-    images: Annotated[list[Path], typer.Argument(help="Images of any size, or folders of images.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Images of any size, folders of images, videos (MP4, AVI, Matroska), TIFF of several pages."
+        ),
+    ],
     run: Annotated[
         Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
     ] = None,
@@ -308,7 +313,8 @@ def predict(
     """Find craters in images.
 
     Writes detections.parquet and detections.csv (one row per crater, in pixels of the upright image, from the outer
-    corner of its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference.
+    corner of its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference. Frames of
+    a video, and pages, are images named <file>.<index, six digits>.png or .tif.
     """
     if min_score is not None and not 0 < min_score <= 1:
         raise UserError("--min-score", "score", min_score, "above 0, at most 1")
@@ -325,7 +331,7 @@ def predict(
 
     tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
     settings = PredictSettings(tiling, min_score, max(min_size, 2 * min_radius_px), nodata, top)
-    with replaceable(out, ("detections.parquet",), overwrite=overwrite) as folder:
+    with replaceable(out, ("detections.parquet",), overwrite=overwrite, inputs=(run, *images)) as folder:
         count = predict_images(images, run, config, folder, settings)
     n_images = len(list(out.glob("*.overlay.png")))
     places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
@@ -333,8 +339,8 @@ def predict(
     say(f"{out}: {count} craters in {n_images} images; {written}")
 
 
-@app.command("export")
-def export(
+@app.command("deploy")
+def deploy(
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
     run: Annotated[
         Path | None, typer.Option(help="Folder of a finished run. [default: the detector that is installed]")
@@ -347,6 +353,7 @@ def export(
     ] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Also try 8-bit integers; needs --dataset.")] = False,
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write a trained detector as ONNX and OpenVINO files, for flight.
 
@@ -364,8 +371,14 @@ def export(
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.deploy.export import ExportedFiles, export_run
 
-    export_run(run or shipped_run("detect"), out, ExportedFiles(asked, size_px, int8), dataset, allow_overlap)
+    run = run or shipped_run("detect")
+    inputs = (run,) if dataset is None else (run, dataset)
+    with replaceable(out, ("detector.json", "README.md"), overwrite=overwrite, inputs=inputs) as folder:
+        export_run(run, folder, ExportedFiles(asked, size_px, int8), dataset, allow_overlap)
     say(f"{out}: README.md explains how to use the files")
+
+
+add_renamed(app, "export", "deploy", deploy)
 
 
 @app.command("weights")

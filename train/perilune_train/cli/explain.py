@@ -108,7 +108,9 @@ def causal(
     ] = None,
     gate: Annotated[
         str | None,
-        typer.Option(help="Gate of the headline, such as B_22. [default: that of runs/explain/<name>, else B_11]"),
+        typer.Option(
+            help="Gate of the headline, such as B_22. [default: the one that runs/explain/<name> chose, else B_11]"
+        ),
     ] = None,
     nav_dataset: Annotated[str | None, typer.Option(help="Navigation dataset with all craters, for poses.")] = None,
     nav_counterfactual: Annotated[

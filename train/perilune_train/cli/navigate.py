@@ -6,10 +6,12 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config.resolve import resolve
+from perilune_shared.console.command_line import OverwriteFolder, add_renamed
 from perilune_shared.console.terminal import answer_page, say, say_page
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.inertial_grades import GRADES
+from perilune_shared.storage.replacement import replaceable
 from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
 from perilune_train.landing.monte_carlo.scenario import SCENARIOS, Draws
 from perilune_train.motion.config import NavigateConfig
@@ -124,6 +126,7 @@ def benchmark_landing(
         Path | None, typer.Option(help="New folder. [default: runs/benchmark/<name of the run>-landing]")
     ] = None,
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Score poses from craters and the filter on the locked benchmark: benchmark.md, benchmark.json, frames.parquet."""
     # torch takes seconds to load.
@@ -131,7 +134,9 @@ def benchmark_landing(
 
     run = detector or shipped_run("detect")
     folder = out or Path("runs/benchmark", f"{run.resolve().name}-landing")
-    figures = score_landing(run, data, manifests, folder, maps, allow_overlap)
+    inputs = (run, data, manifests) if maps is None else (run, data, manifests, maps)
+    with replaceable(folder, (FIGURES, "frames.parquet"), overwrite=overwrite, inputs=inputs) as new:
+        figures = score_landing(run, data, manifests, new, maps, allow_overlap)
     if f"filter/{POSITION}" in figures:
         say(f"filter: position RMSE {figures[f'filter/{POSITION}']:.3f} m")
     say(f"{folder}: {PAGE}, {FIGURES}, frames.parquet")
@@ -186,8 +191,8 @@ def compare(
     say(f"{out}: compare.md, errors.png")
 
 
-@app.command("export")
-def export(
+@app.command("deploy")
+def deploy(
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
     run: Annotated[
         Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
@@ -195,9 +200,10 @@ def export(
     dataset: Annotated[
         str | None,
         typer.Option(
-            help="Dataset (folder or address): export for its camera, and compare with torch on its validation frames."
+            help="Dataset (folder or address): write for its camera, and compare with torch on its validation frames."
         ),
     ] = None,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write a trained navigator as an ONNX file, for flight: one pair of frames and the state in, motion and state out.
 
@@ -207,8 +213,14 @@ def export(
     # torch takes seconds to load.
     from perilune_train.motion.deploy.export import export_navigator
 
-    largest = export_navigator(run or shipped_run("navigate"), out, dataset)
+    run = run or shipped_run("navigate")
+    inputs = (run,) if dataset is None else (run, dataset)
+    with replaceable(out, ("navigator.json", "README.md"), overwrite=overwrite, inputs=inputs) as folder:
+        largest = export_navigator(run, folder, dataset)
     say(f"{out}: README.md explains how to use the files; difference from torch {largest:.1e}")
+
+
+add_renamed(app, "export", "deploy", deploy)
 
 
 @app.command("methods")
@@ -228,6 +240,7 @@ def methods(
         Path | None, typer.Option("--map", help="Folder of a map by `navigate map`, a further catalogue.")
     ] = None,
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Fly all methods over a split: learned and classical motion, poses from craters, lost in space, the filter.
 
@@ -238,11 +251,13 @@ def methods(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.landing.methods.fly_methods import PAGE, fly_methods
+    from perilune_train.landing.methods.fly_methods import PAGE, TABLE, fly_methods
     from perilune_train.records.provenance import EvaluatedSplit
 
     networks = run or shipped_run("navigate"), detector or shipped_run("detect")
-    fly_methods(EvaluatedSplit(dataset, split, allow_overlap), *networks, out, maps)
+    inputs = (dataset, *networks) if maps is None else (dataset, *networks, maps)
+    with replaceable(out, (PAGE, TABLE), overwrite=overwrite, inputs=inputs) as folder:
+        fly_methods(EvaluatedSplit(dataset, split, allow_overlap), *networks, folder, maps)
     say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")
 
 
@@ -264,6 +279,7 @@ def monte_carlo(
     workers: Annotated[int | None, typer.Option(min=1, help="Processes. [default: one per core]")] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/monte-carlo"),
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Fly the filter over random starts, catalogues and inertial errors of each descent.
 
@@ -280,7 +296,8 @@ def monte_carlo(
 
     own = detector or shipped_run("detect")
     drawn = Draws(scenario, draws, attitude_deg, seed)
-    fly_draws(EvaluatedSplit(dataset, split, allow_overlap), own, out, drawn, workers)
+    with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, own)) as folder:
+        fly_draws(EvaluatedSplit(dataset, split, allow_overlap), own, folder, drawn, workers)
     say(f"{out / PAGE}: table and pictures; draws.parquet")
 
 
@@ -292,6 +309,7 @@ def make_map(
     ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the catalogues.")] = Path("runs/navigate/map"),
     allow_overlap: AllowOverlap = False,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Make a crater catalogue of each scene from two images of an orbiter, with our own detector.
 
@@ -301,7 +319,9 @@ def make_map(
     # torch takes seconds to load.
     from perilune_train.landing.map.map_scenes import PAGE, map_scenes
 
-    map_scenes(dataset, detector or shipped_run("detect"), out, allow_overlap)
+    detector = detector or shipped_run("detect")
+    with replaceable(out, ("map.json", PAGE), overwrite=overwrite, inputs=(dataset, detector)) as folder:
+        map_scenes(dataset, detector, folder, allow_overlap)
     say(f"{out / PAGE}: errors and picture; one catalogue per scene beside it")
 
 
@@ -317,25 +337,40 @@ def fly(
     run: Annotated[
         Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
     ] = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option(
+            help="Craters of another detector, in place of --run: a Parquet or CSV table with image (name of the"
+            " frame's file), x0_px, y0_px, x1_px, y1_px (pixels from the outer corner of the first pixel) and score (0"
+            " to 1), as detections.parquet of `detect predict`."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("flight"),
     live: Annotated[Path | None, typer.Option(help="Picture that is drawn again after each frame, *.png.")] = None,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Estimate position, velocity and attitude at each frame of a descent by craters, inertial unit and ranges.
 
     Prints one line per frame to standard output: time, status (tracking, coasting or lost), position and its deviations
     in O_L, largest deviation of the attitude, craters matched. Writes estimates.parquet, estimates.csv and flight.png.
-    `navigate unpack` writes an example of all files.
+    `navigate descent` writes an example of all files.
     """
     if live is not None and live.suffix.lower() != ".png":
         raise UserError("--live", "name", live, "a name that ends in .png")
-    run = run or shipped_run("detect")
+    if run is not None and detections is not None:
+        raise UserError("--detections", "options", "together with --run", "one of them")
+    source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
-    from perilune_train.landing.fly.run import doubts_of, fly_descent, read_descent
+    from perilune_train.landing.fly.detections import by_network, by_table
+    from perilune_train.landing.fly.run import DescentFiles, doubts_of, fly_descent, read_descent
 
-    descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
+    descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, ranges, truth))
+    detect = by_table(source, descent.frames.paths) if detections else by_network(source)
     for doubt in doubts_of(descent):
         say(f"warning: {imu}: {doubt}")
-    table = fly_descent(descent, run, out, answer_page, live)
+    inputs = (frames, camera, catalogue, imu, prior, source, *(path for path in (ranges, truth) if path is not None))
+    with replaceable(out, ("estimates.parquet", "flight.png"), overwrite=overwrite, inputs=inputs) as folder:
+        table = fly_descent(descent, detect, folder, answer_page, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
@@ -348,8 +383,8 @@ def fly(
         answer_page(f"position error: {rms:.2f} m r.m.s., {end:.2f} m at the last frame")
 
 
-@app.command("unpack")
-def unpack(
+@app.command("descent")
+def descent(
     dataset: Annotated[
         str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
     ],
@@ -361,6 +396,7 @@ def unpack(
     velocity_mps: Annotated[float, typer.Option(help="Deviation of the prior's velocity on each axis.")] = 1.0,
     attitude_deg: Annotated[float, typer.Option(help="Deviation of the prior's attitude on each axis.")] = 0.5,
     seed: Annotated[int, typer.Option(help="Seed of the prior and of the errors of the catalogue.")] = 0,
+    overwrite: OverwriteFolder = False,
 ) -> None:
     """Write a descent as frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv.
 
@@ -380,6 +416,10 @@ def unpack(
     from perilune_shared.dataset.manifest import open_single
     from perilune_train.landing.fly.unpack import unpack_descent
 
-    count = unpack_descent(open_single(dataset), (ids[0], ids[1]), out, grade, exact, offset, seed)
+    with replaceable(out, ("camera.yaml", "prior.yaml"), overwrite=overwrite, inputs=(dataset,)) as folder:
+        count = unpack_descent(open_single(dataset), (ids[0], ids[1]), folder, grade, exact, offset, seed)
     names = "frames, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml, truth.csv"
     say(f"{out}: {count} frames; {names}")
+
+
+add_renamed(app, "unpack", "descent", descent)

@@ -20,7 +20,6 @@ Settings = Annotated[
 RunsFolder = Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")]
 RunName = Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace runs of this name.")]
-OverwriteFolder = Annotated[bool, typer.Option("--overwrite", help="Replace the folder of --out, if it exists.")]
 AllowOverlap = Annotated[
     bool,
     typer.Option(

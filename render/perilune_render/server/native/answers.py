@@ -14,7 +14,7 @@ from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World
 from perilune_shared.client import CRATER_COLUMNS
-from perilune_shared.config.errors import expected_of, formatted
+from perilune_shared.config.errors import expected_of, got_of
 from perilune_shared.config.resolve import Section
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
@@ -129,7 +129,7 @@ def _parsed(content: bytes) -> Section:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         field = ".".join(map(str, fault["loc"])) or kind
-        raise UserError("request", field, formatted(fault["input"]), expected_of(fault)) from None
+        raise UserError("request", field, got_of(fault), expected_of(fault)) from None
 
 
 def _answer(world: World, request: Section) -> list[bytes]:

@@ -36,7 +36,7 @@ def site(latitude, longitude):
 def exported(tmp_path, *arguments):
     """Heights of the exported ground, and its pixels' places east and north of the site, metres."""
     out = tmp_path / "ground.tif"
-    done = in_process.call(main, "export", *SMALL, *BARE, *arguments, "--pixel-m", "20", "--out", out)
+    done = in_process.call(main, "ground", *SMALL, *BARE, *arguments, "--pixel-m", "20", "--out", out)
     assert done.returncode == 0, done.stderr
     with rasterio.open(out) as file:
         height, n = file.read(1), file.width
@@ -46,7 +46,7 @@ def exported(tmp_path, *arguments):
 
 def refused(tmp_path, *arguments):
     """The one line of error of an export."""
-    done = in_process.call(main, "export", *SMALL, *arguments, "--out", tmp_path / "ground.tif")
+    done = in_process.call(main, "ground", *SMALL, *arguments, "--out", tmp_path / "ground.tif")
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error")]
     assert done.returncode == 2 and "Traceback" not in done.stderr and not (tmp_path / "ground.tif").exists()
     return line

@@ -283,7 +283,7 @@ def test_when_int8_is_worth_it(loss, seconds, kept):
     ],
 )
 def test_wrong_options_leave_nothing(run_folder, tmp_path, options, words):
-    result = CliRunner().invoke(app, ["detect", "export", "--run", run_folder, "--out", tmp_path / "x", *options])
+    result = CliRunner().invoke(app, ["detect", "deploy", "--run", run_folder, "--out", tmp_path / "x", *options])
     assert isinstance(result.exception, UserError)
     assert words in str(result.exception)
     assert list(tmp_path.iterdir()) == []

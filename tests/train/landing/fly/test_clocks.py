@@ -16,7 +16,7 @@ from tests.train.landing.fly.descent_files import (
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import matrix_from_quaternion
-from perilune_train.landing.fly.run import read_descent
+from perilune_train.landing.fly.run import DescentFiles, read_descent
 
 UNIX_NS = 1_403_715_524_907_143_168
 IMU = (
@@ -36,9 +36,8 @@ def folder(tmp_path):
 
 def read(folder, frames="frames", imu="imu.csv", ranges="ranges.csv", truth="truth.csv", camera="camera.yaml"):
     others = [None if name is None else folder / name for name in (ranges, truth)]
-    return read_descent(
-        folder / frames, folder / camera, folder / "catalogue.csv", folder / imu, folder / "prior.yaml", *others
-    )
+    needed = (folder / name for name in (frames, camera, "catalogue.csv", imu, "prior.yaml"))
+    return read_descent(DescentFiles(*needed, *others))
 
 
 def change(path, column, function):

@@ -107,7 +107,7 @@ def test_boxes_of_a_distorting_lens_become_those_of_a_pinhole():
 
 
 def unpack(dataset, trajectory, out):
-    return in_process.call(main, "navigate", "unpack", "--dataset", dataset, "--trajectory", trajectory, "--out", out)
+    return in_process.call(main, "navigate", "descent", "--dataset", dataset, "--trajectory", trajectory, "--out", out)
 
 
 def test_a_dataset_unpacked_and_flown(quick, tmp_path):

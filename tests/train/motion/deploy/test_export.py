@@ -55,7 +55,7 @@ def run_folder(request, tmp_path_factory):
 
 
 def call(*arguments):
-    return in_process.call(main, "navigate", "export", *map(str, arguments))
+    return in_process.call(main, "navigate", "deploy", *map(str, arguments))
 
 
 @pytest.fixture(scope="module")

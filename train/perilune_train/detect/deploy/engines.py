@@ -22,7 +22,7 @@ Array = NDArray[np.float32]
 Engine = Callable[[Array], tuple[Array, Array]]
 """Normalised images (N, C, H, W) in float32 to boxes (N, K, 4) in pixels and scores (N, K)."""
 EnginePrecision = Literal["f32", "bf16"]
-_EXPECTED = "a file written by `perilune-train detect export`"
+_EXPECTED = "a file written by `perilune-train detect deploy`"
 
 
 def package(name: str) -> Any:

@@ -1,6 +1,7 @@
 """Detect craters in images of any size: tables, overlays and, for images with a georeference, GeoJSON."""
 
 import json
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,17 @@ from perilune_train.detect.images.georeference import (
     features,
     read_georeference,
 )
+from perilune_train.detect.images.one_light import doubt_of
 from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
+from perilune_train.detect.images.sequences import frames_of
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.training import runs
+
+_SHOWN_DOUBTS = 5
 
 
 @dataclass(frozen=True)
@@ -48,14 +53,18 @@ class PredictSettings:
 
 
 def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
-    """Find craters in images and folders of images; returns their number.
+    """Find craters in images, folders of images, videos and TIFF files of several pages; returns their number.
 
-    Writes all output to the new folder `out`, or nothing. Raises UserError on the first image that cannot be read,
-    before detection starts.
+    A frame of a video, or a page, is an image with its index in the name (sequences.py). Writes all output to the new
+    folder `out`, or nothing. Raises UserError on the first image that cannot be read, before detection starts.
     """
+    settings.tiling.check()
+    with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
+        return _predict(expanded(sources, Path(folder)), run, config, out, settings)
+
+
+def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
     tiling, nodata = settings.tiling, settings.nodata
-    tiling.check()
-    paths = expanded(sources)
     check_names(paths, [path.name for path in paths])
     with new_folder(out) as folder, progress_bar() as progress:
         check = progress.add_task("check", total=len(paths), unit="images", note="")
@@ -70,11 +79,13 @@ def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Pa
         threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
         detector = open_detector(runs.RunFolder(run).best, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
-        tables, shapes = [], []
+        tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
             detections = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
+            if doubt := doubt_of(image, detections):
+                doubts.append(f"warning: {path.name}: {doubt}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
             tables.append(table_of(path.name, detections))
             write_overlay(folder / f"{path.name}.overlay.png", image, detections, threshold)
@@ -90,6 +101,10 @@ def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Pa
         write_csv(table.round(4), folder / "detections.csv")
         if any(reference is not None for reference in references):
             (folder / "detections.geojson").write_text(json.dumps(collection(shapes)) + "\n", encoding="utf-8")
+    for line in doubts[:_SHOWN_DOUBTS]:
+        say(line)
+    if len(doubts) > _SHOWN_DOUBTS:
+        say(f"warning: {len(doubts) - _SHOWN_DOUBTS} more images that may not show the Moon")
     return len(table)
 
 
@@ -127,12 +142,15 @@ def strongest(detections: Detections, top: int | None) -> Detections:
     return Detections(detections.boxes[best], detections.scores[best])
 
 
-def expanded(sources: list[Path]) -> list[Path]:
-    """The given images and the images of given folders. Raises UserError on a folder without images."""
+def expanded(sources: list[Path], frames: Path) -> list[Path]:
+    """The given images, the images of given folders, and the frames of videos, which are written into `frames`.
+
+    Raises UserError on a folder without images, and on a video that cannot be decoded.
+    """
     paths = []
     for path in sources:
         if not path.is_dir():
-            paths.append(path)
+            paths += frames_of(path, frames) or [path]
             continue
         images = pictures_of(path)
         if not images:

@@ -1,4 +1,4 @@
-"""Check that the files of a descent have one clock."""
+"""Check that the files of a descent use one clock."""
 
 from pathlib import Path
 

@@ -1,25 +1,20 @@
 """Fly the filter over the files of one descent and write what it estimates."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.metadata import CameraRecord
-from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
-from perilune_train.detect.images.predict import above
-from perilune_train.detect.images.read import read_grey
-from perilune_train.detect.inference.detector import open_detector
-from perilune_train.detect.inference.tiles import detect_image
-from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
@@ -28,15 +23,43 @@ from perilune_train.landing.filter.propagate import InertialNoise
 from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
 from perilune_train.landing.fly.catalogue import read_catalogue
 from perilune_train.landing.fly.clocks import check_clocks
+from perilune_train.landing.fly.detections import Detect, UnreadableFrame
 from perilune_train.landing.fly.picture import draw_flight
 from perilune_train.landing.fly.settings import FlightPrior, read_camera, read_prior
 from perilune_train.landing.fly.tables import FrameFiles, read_frame_files, read_instruments
 from perilune_train.landing.fly.truth import Truth, read_truth, with_errors_of
 from perilune_train.landing.fly.units import Prior, doubts
-from perilune_train.training.runs import RunFolder
 
 ESTIMATES, PICTURE = "estimates", "flight.png"
 _NOTHING = Detections(np.zeros((0, 4)), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class DescentFiles:
+    """The files of one descent; `perilune-train navigate descent` writes an example of all of them."""
+
+    frames: Path
+    """Folder of images with frames.csv: file, time_s."""
+    camera: Path
+    """Intrinsics and mounting: camera.yaml."""
+    catalogue: Path
+    """Craters of the landing site, Parquet or CSV."""
+    imu: Path
+    """Inertial measurements: imu.csv."""
+    prior: Path
+    """Expected state at the first frame, and errors of all that is measured: prior.yaml."""
+    ranges: Path | None = None
+    """Ranges of a laser altimeter: ranges.csv."""
+    truth: Path | None = None
+    """True poses, for errors beside the estimates: truth.csv."""
+
+    @classmethod
+    def of_folder(cls, folder: str | PathLike[str]) -> "DescentFiles":
+        """The files of a folder by their usual names; ranges.csv and truth.csv may be absent."""
+        root = Path(folder)
+        needed = (root / name for name in ("frames", "camera.yaml", "catalogue.parquet", "imu.csv", "prior.yaml"))
+        optional = (root / name for name in ("ranges.csv", "truth.csv"))
+        return cls(*needed, *(path if path.is_file() else None for path in optional))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,32 +80,35 @@ class Descent:
     """True poses of the frames, where they are known."""
 
 
-def read_descent(
-    frames: Path, camera: Path, catalogue: Path, imu: Path, prior: Path, ranges: Path | None, truth: Path | None
-) -> Descent:
+def read_descent(files: DescentFiles) -> Descent:
     """Read all files of a descent. Raises UserError on the first that is missing or wrong."""
-    record, expected = read_camera(camera), read_prior(prior)
-    craters = read_catalogue(catalogue, expected.catalogue_use)
-    files = read_frame_files(frames, record.intrinsics())
-    true = read_truth(truth, files.time_s, np.array(record.rotation_camera_from_body)) if truth else None
-    instruments = read_instruments(imu, ranges)
-    check_clocks(frames, files.time_s, imu, ranges, instruments)
-    return Descent(record, expected, files, instruments, craters, true)
+    record, expected = read_camera(files.camera), read_prior(files.prior)
+    craters = read_catalogue(files.catalogue, expected.catalogue_use)
+    frames = read_frame_files(files.frames, record.intrinsics())
+    mounting = np.array(record.rotation_camera_from_body)
+    true = read_truth(files.truth, frames.time_s, mounting) if files.truth else None
+    instruments = read_instruments(files.imu, files.ranges)
+    check_clocks(files.frames, frames.time_s, files.imu, files.ranges, instruments)
+    return Descent(record, expected, frames, instruments, craters, true)
 
 
 def fly_descent(
-    descent: Descent, run: Path, out: Path, tell: Callable[[str], None], live: Path | None = None
+    descent: Descent,
+    detect: Detect,
+    out: Path | None,
+    tell: Callable[[str], None] = lambda line: None,
+    live: Path | None = None,
 ) -> pd.DataFrame:
-    """Fly the filter over a descent with the detector of a run; returns one row per frame.
+    """Fly the filter over a descent with the craters that `detect` finds; returns one row per frame.
 
-    Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`, or nothing. `tell` receives a line
-    for each frame; `live` is a picture that is drawn again after each.
+    Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`, if it is given, or nothing. `tell`
+    receives a line for each frame; `live` is a picture that is drawn again after each.
     """
     rows: list[dict[str, object]] = []
     faults: dict[int, str] = {}
-    with new_folder(out) as folder:
+    with contextlib.nullcontext() if out is None else new_folder(out) as folder:
         lander = _lander(descent)
-        seen = _sightings(descent, run, faults)
+        seen = _sightings(descent, detect, faults)
         mounting = np.array(descent.camera.rotation_camera_from_body)
         for estimate in fly(lander, descent.instruments, descent.frames.time_s, seen):
             row = _row(estimate, descent.frames, mounting, faults.get(estimate.frame, ""))
@@ -91,9 +117,10 @@ def fly_descent(
             if live is not None:
                 draw_flight(live, with_errors_of(pd.DataFrame(rows), descent.truth))
         table = with_errors_of(pd.DataFrame(rows), descent.truth)
-        table.to_parquet(folder / f"{ESTIMATES}.parquet", index=False)
-        write_csv(table, folder / f"{ESTIMATES}.csv")
-        draw_flight(folder / PICTURE, table)
+        if folder is not None:
+            table.to_parquet(folder / f"{ESTIMATES}.parquet", index=False)
+            write_csv(table, folder / f"{ESTIMATES}.csv")
+            draw_flight(folder / PICTURE, table)
     return table
 
 
@@ -119,15 +146,12 @@ def _lander(descent: Descent) -> Lander:
     return Lander(state, InertialNoise.of(prior.unit), around)
 
 
-def _sightings(descent: Descent, run: Path, faults: dict[int, str]) -> Iterator[Sightings]:
+def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
     """Craters of one frame after the other; a frame that cannot be read has none, and its fault is noted."""
-    config, threshold = config_of_run(run), chosen_threshold(run)
-    detector = open_detector(RunFolder(run).best, config)
-    tiling = replace(Tiling(), scales=tuple(config.evaluation.scales))
     for number, path in enumerate(descent.frames.paths):
         try:
-            found = above(detect_image(detector, read_grey(path), tiling, lambda n: None), threshold)
-        except UserError as error:
+            found = detect(path)
+        except UnreadableFrame as error:
             faults[number], found = str(error), _NOTHING
         yield sightings_of(found, descent.camera.intrinsics())
 

@@ -29,7 +29,7 @@ _MOON_MPS2 = float(-gravity_mps2(0.0)[2])
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known at the first frame."""
+    """The expected state at the first frame, and its errors."""
 
     state: State
     """Expected state, at the time of the first frame."""
@@ -48,7 +48,7 @@ class _Reading:
     """One way to read the numbers of a log."""
 
     name: str
-    """What to say of it."""
+    """Name of the reading in messages."""
     force: float = 1.0
     """Factor of the specific forces."""
     added_mps2: float = 0.0
@@ -59,7 +59,7 @@ class _Reading:
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """What a reading gives."""
+    """The path that a reading of the measurements gives."""
 
     force_mps2: float
     """Mean specific force upwards."""
@@ -106,9 +106,9 @@ _RATES = (_Reading(""), _Reading("angular rates in degrees per second (times 0.0
 
 
 def doubts(measured: Increments, prior: Prior, *, is_lost: bool) -> list[str]:
-    """What is wrong with the units of a log, one text each; empty if nothing is.
+    """Return one text for each doubt about the units of a log.
 
-    With `is_lost` the flight has lost its position, so that less evidence is enough.
+    With `is_lost` the flight has lost its position, so less evidence is enough.
     """
     steps = _joined(measured.measured(), prior.state.time_s, prior.end_s)
     if steps is None:

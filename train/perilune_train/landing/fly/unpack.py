@@ -1,4 +1,4 @@
-"""Write one descent of a dataset as the files that `navigate fly` reads, with a prior and a catalogue that are off."""
+"""Write one descent of a dataset as files for `navigate fly`, with errors in the prior and the catalogue."""
 
 from pathlib import Path
 

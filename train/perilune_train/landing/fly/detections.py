@@ -1,0 +1,136 @@
+"""Craters in the frames of a descent: found by the network of a run or by a function of the user, or from a table."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.tables.columns import Kind
+from perilune_shared.storage.tables.limits import DETECTIONS
+from perilune_shared.storage.tables.read import read_table
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.images.predict import above
+from perilune_train.detect.images.read import read_grey
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.tiles import detect_image
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.training.runs import RunFolder
+
+Detect = Callable[[Path], Detections]
+"""Returns the craters in the image of a file. Raises UnreadableFrame if the image cannot be decoded."""
+Detector = Callable[[NDArray[np.uint8]], ArrayLike | Any]
+"""A function of the user: grey image (height, width) in, craters out; see `by_function`."""
+_BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
+_COLUMNS: dict[str, Kind] = {"image": "text", **dict.fromkeys((*_BOX, "score"), "number")}
+_ROW = ("x", "y", "width", "height", "score")
+_FAR_PX = 1e6
+"""Largest coordinate of a box, pixels."""
+_MOST_PER_FRAME = 10_000
+"""Maximum number of craters in a frame. The matching of craters needs some dozens."""
+
+
+class UnreadableFrame(UserError):
+    """An image that cannot be decoded; the flight goes on without its craters."""
+
+
+def by_network(run: Path) -> Detect:
+    """Find craters with the network of a detect run, at the threshold that the run chose."""
+    config, threshold = config_of_run(run), chosen_threshold(run)
+    detector = open_detector(RunFolder(run).best, config)
+    tiling = replace(Tiling(), scales=tuple(config.evaluation.scales))
+    return lambda path: above(detect_image(detector, _grey(path), tiling, lambda n: None), threshold)
+
+
+def by_function(detector: Detector) -> Detect:
+    """Find craters with a function of the user.
+
+    It takes a grey image, uint8 (height, width), and returns an array (N, 5) of x, y, width, height, score: the centre
+    and the size of the box around the rim, pixels from the outer corner of the first pixel, and a score from 0 to 1.
+    It may also return a table with the columns x0_px, y0_px, x1_px, y1_px and score, or an object with such a `table`,
+    as the `Craters` of `perilune.load_detector`. The function raises UserError on other values.
+    """
+    return lambda path: _checked(detector(_grey(path)), path)
+
+
+def by_table(path: Path, frames: list[Path]) -> Detect:
+    """Take craters from a CSV or Parquet table with the columns of `detections.parquet` of `detect predict`.
+
+    These are image (the name of the frame's file), x0_px, y0_px, x1_px, y1_px (the box around the rim, pixels from the
+    outer corner of the first pixel) and score (0 to 1). A frame without rows has no craters. Raises UserError if the
+    file cannot be read, lacks a column, names another image, or holds a number that is not finite, a box without area,
+    or too many rows of a frame.
+    """
+    names = [frame.name for frame in frames]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UserError(path, "image", f"two frames named {twice}", "frames with different names")
+    table = read_table(path, DETECTIONS, _COLUMNS)
+    if not table.n_rows:
+        raise UserError(path, "rows", 0, "one row for each crater in a frame")
+    box = [table.finite(name, -_FAR_PX, _FAR_PX) for name in _BOX]
+    table.check("x1_px", box[2] > box[0], "a number above x0_px")
+    table.check("y1_px", box[3] > box[1], "a number above y0_px")
+    scores, images = table.finite("score", 0, 1), table.texts("image")
+    number = {name: place for place, name in enumerate(names)}
+    frame = np.array([*(number.get(word, -1) for word in images.words), -1])[images.codes]
+    table.check("image", frame >= 0, f"a frame of the descent, such as {names[0]}")
+    order = np.argsort(frame, kind="stable")
+    bounds = np.searchsorted(frame[order], np.arange(len(names) + 1))
+    rows = {name: order[start:end] for name, (start, end) in zip(names, pairwise(bounds), strict=True)}
+    for name, own in rows.items():
+        _check_count(path, name, len(own))
+    boxes = np.column_stack(box)
+    return lambda frame: Detections(boxes[rows[frame.name]], scores[rows[frame.name]])
+
+
+def _grey(path: Path) -> NDArray[np.uint8]:
+    try:
+        return read_grey(path)
+    except UserError as error:
+        raise UnreadableFrame(error.where, error.field, error.found, error.expected) from None
+
+
+def _checked(found: Any, path: Path) -> Detections:
+    """The craters that a function of the user has returned for an image."""
+    found = getattr(found, "table", found)
+    is_table = isinstance(found, pd.DataFrame)
+    names, expected = (*_BOX, "score") if is_table else _ROW, f"an array (N, 5) of {', '.join(_ROW)}, or a table"
+    if is_table and (missing := [name for name in names if name not in found]):
+        raise UserError("detector", path.name, f"a table without {missing[0]}", f"the columns {', '.join(names)}")
+    try:
+        values = np.asarray(found[list(names)] if is_table else found, np.float64)
+    except (TypeError, ValueError):
+        raise UserError("detector", path.name, f"a {type(found).__name__}", expected) from None
+    if values.size == 0:
+        return Detections(np.zeros((0, 4)), np.zeros(0))
+    if values.ndim != 2 or values.shape[1] != len(names):
+        got = f"an array of shape {values.shape}" if values.ndim else f"a {type(found).__name__}"
+        raise UserError("detector", path.name, got, expected)
+    _check_count("detector", path.name, len(values))
+    first, second, scores = values[:, :2], values[:, 2:4], values[:, 4]
+    if not is_table:
+        first, second = first - second / 2, first + second / 2
+    boxes = np.hstack([first, second])
+    checks = (
+        (np.isfinite(values).all(axis=1) & (np.abs(boxes) <= _FAR_PX).all(axis=1), "finite numbers up to 1000000"),
+        ((second > first).all(axis=1), "a box with an area: width and height above 0"),
+        ((scores >= 0) & (scores <= 1), "a score from 0 to 1"),
+    )
+    for fits, wanted in checks:
+        if not fits.all():
+            row = int(fits.argmin())
+            given = ", ".join(f"{name} {value:g}" for name, value in zip(names, values[row], strict=True))
+            raise UserError("detector", f"{path.name}: row {row}", given, wanted)
+    return Detections(boxes, scores)
+
+
+def _check_count(where: object, name: str, count: int) -> None:
+    if count > _MOST_PER_FRAME:
+        raise UserError(where, name, f"{count} craters", f"at most {_MOST_PER_FRAME} in a frame")
