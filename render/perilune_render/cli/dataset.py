@@ -242,9 +242,9 @@ def _print_failures(error: "RenderingFailed") -> None:
 def _executor(how: How, early: "Worker | None") -> "MakeExecutor":
     if how.workers == 0:
         # Imports Blender, which takes seconds.
-        from perilune_render.jobs.in_process import Here
+        from perilune_render.jobs.in_process import InProcess
 
-        return Here
+        return InProcess
     if how.executor == "ray":
         try:
             from perilune_render.jobs.ray_actors import RayActors

@@ -45,7 +45,7 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
             hazard = {"hazard_path": scene_file_path(scene_plan.scene_id, "hazard")} if config.hazard else None
             frames = []
             for trajectory in trajectories:
-                ids = [trajectory.frame_id(place) for place in range(len(trajectory.splits))]
+                ids = [trajectory.frame_id(index) for index in range(len(trajectory.splits))]
                 paths = [{f"{kind}_path": frame_path(frame_id, kind) for kind in kinds} for frame_id in ids]
                 frames.append(tables.frame_table(trajectory, plan.rig[trajectory.camera].camera, scene_plan.sun, paths))
             writer.add_scene(

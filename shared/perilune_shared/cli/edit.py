@@ -79,10 +79,12 @@ def subset(
     link: LinkOption = False,
 ) -> None:
     """Copy part of a dataset: by conditions on columns, number of frames or size."""
+    from perilune_shared.editing.subset import Limit
     from perilune_shared.editing.subset import subset as choose
 
+    limit = None if frames is None and mb is None else Limit(frames, mb)
     with progress_bar() as progress:
-        choose(ps.open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
+        choose(ps.open_dataset(dataset), out, tuple(where or ()), limit, _mode(images, link), progress)
     _print_counts(out)
 
 
@@ -99,10 +101,10 @@ def split(
     link: LinkOption = False,
 ) -> None:
     """Re-split a dataset into train, val and test, by scene, trajectory or frame."""
-    from perilune_shared.editing.split import split_dataset
+    from perilune_shared.editing.split import Split, split_dataset
 
     with progress_bar() as progress:
-        split_dataset(ps.open_dataset(dataset), out, by, val, test, seed, _mode(images, link), progress)
+        split_dataset(ps.open_dataset(dataset), out, Split(by, val, test, seed), _mode(images, link), progress)
     _print_counts(out)
 
 

@@ -62,7 +62,7 @@ class KeyCheck:
         self._dataset = dataset
         scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
         _check_unique(dataset, "scenes", scenes)
-        self.scene_of = {name: place for place, name in enumerate(scenes["scene_id"])}
+        self.scene_of = {name: index for index, name in enumerate(scenes["scene_id"])}
         trajectories = dataset.table("trajectories", KEYS["trajectories"])
         _check_unique(dataset, "trajectories", trajectories.to_pandas())
         _check_known(dataset, "trajectories", "scene_id", trajectories["scene_id"], self.scene_of)
@@ -73,7 +73,7 @@ class KeyCheck:
             raise UserError(
                 dataset.store, "frames: trajectory_id", f"no {'/'.join(min(missing))}", f"trajectories; {_HINT}"
             )
-        self._frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
+        self._frame_of = {name: index for index, name in enumerate(frames["frame_id"].to_pylist())}
         if len(self._frame_of) != len(frames):
             _check_unique(dataset, "frames", frames.select(KEYS["frames"]).to_pandas())
         self._numbers, self._keys = _checked_ids_and_keys(dataset, "craters", self.scene_of)
@@ -82,7 +82,7 @@ class KeyCheck:
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
         """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
 
-        Raises UserError if a frame or crater is missing, or if `rows` has scene_id and it is not that of the frame.
+        Raises UserError if a frame or crater is missing, or if `rows` has another scene_id than the frame.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         if "scene_id" in rows.column_names:
@@ -120,12 +120,12 @@ class KeyCheck:
 
 def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
     """Look up each text of a column (N,) in `place_of`; -1 if it is missing. Each distinct text is looked up once."""
-    found = []
+    looked_up = []
     for chunk in column.chunks:
         words = chunk.dictionary_encode()
-        own = [*(place_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
-        found.append(np.array(own, np.int64)[words.indices.fill_null(len(own) - 1).to_numpy()])
-    return np.concatenate(found) if found else np.empty(0, np.int64)
+        indices = [*(place_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
+        looked_up.append(np.array(indices, np.int64)[words.indices.fill_null(len(indices) - 1).to_numpy()])
+    return np.concatenate(looked_up) if looked_up else np.empty(0, np.int64)
 
 
 def _checked_ids_and_keys(

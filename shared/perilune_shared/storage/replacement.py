@@ -15,11 +15,11 @@ Out = TypeVar("Out", str, Path)
 
 @contextlib.contextmanager
 def replaceable(out: Out, known_by: tuple[str, ...], *, overwrite: bool) -> Iterator[Out]:
-    """Yield where a command is to write: `out`, or with `overwrite` a new folder that then takes the place of `out`.
+    """Yield the folder to write: `out`, or with `overwrite` a new folder that replaces `out` when the block ends.
 
     The old folder stays until the new one is complete. It is replaced only if it has one of the files or folders
     `known_by`, which the command always writes, so that a wrong `out` deletes no other data. Raises UserError if it
-    has none of them, if it is not empty and not to be replaced, or with `overwrite` if `out` is in an object store.
+    has none of them, if it is not empty and `overwrite` is false, or with `overwrite` if `out` is in an object store.
     """
     folder = open_store(out).folder
     if overwrite and folder is None:
@@ -33,7 +33,7 @@ def replaceable(out: Out, known_by: tuple[str, ...], *, overwrite: bool) -> Iter
         expected = "a folder that this command has written, with " + " or ".join(known_by)
         raise UserError(out, "--overwrite", "another folder", expected)
     if Path.cwd().is_relative_to(folder.resolve()):
-        raise UserError(out, "--overwrite", "the current folder, or one that has it", "another folder")
+        raise UserError(out, "--overwrite", "the current folder, or a parent of it", "another folder")
     folder = folder.absolute()
     made = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.new")
     old = made.with_suffix(".old")

@@ -98,14 +98,14 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
 @pytest.mark.parametrize(
     ("module", "pattern", "replacement"),
     [
-        ("perilune_render.terrain.scene", '^"""', '"""Another docstring. '),
+        ("perilune_render.terrain.scene", '^r"""', 'r"""Another docstring. '),
         ("perilune_render.imaging.sensor", '    """Grey image', '    """Another docstring'),
         ("perilune_render.terrain.scene", '"""Share of a crater', '"""Another text'),
         ("perilune_render.terrain.craters.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
         ("perilune_render.terrain.relief", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli.main", '"Folder', '"Another folder'),
         ("perilune_render.preview.contact_sheet", "_N_FRAMES = 4", "_N_FRAMES = 5"),
-        ("perilune_render.dataset.overview", "= 12, 3, 6$", "= 13, 3, 6"),
+        ("perilune_render.dataset.finish", "= 12, 3, 6$", "= 13, 3, 6"),
         ("perilune_render.config.cameras", "= 256$", "= 257"),
         ("perilune_render.config.dataset", "_GROUND_FIELDS = ", "_GROUND_FIELDS = 1, "),
         ("perilune_render.config.dataset", "gt=0", "gt=1"),

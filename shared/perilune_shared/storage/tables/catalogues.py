@@ -102,8 +102,8 @@ def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]
     for known in _KNOWN.values():
         if set(known.values()) <= set(names):
             return dict(known)
-    found = {key: [name for name in names if pattern.fullmatch(name)] for key, pattern in _PATTERNS.items()}
-    exact = {key: [key] if key in names else matches for key, matches in found.items()}
+    matching = {key: [name for name in names if pattern.fullmatch(name)] for key, pattern in _PATTERNS.items()}
+    exact = {key: [key] if key in names else matches for key, matches in matching.items()}
     sizes = [(key, name) for key in METRES for name in exact[key]]
     diameters = [size for size in sizes if size[0].startswith("diameter")]
     sizes = [("diameter_m", "diameter_m")] if "diameter_m" in names else diameters or sizes
@@ -131,8 +131,8 @@ def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
     for low in np.unique(np.floor(np.log2(sizes))):
         # The window is wider than the octave, so that craters on both sides of its end are compared.
         high = 1.1 * 2 ** (low + 1)
-        own = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
-        order = own[np.argsort(x_m[own], kind="stable")]
+        similar = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
+        order = similar[np.argsort(x_m[similar], kind="stable")]
         for step in range(1, min(len(order), _MOST_NEIGHBOURS)):
             first, second = np.sort([order[:-step], order[step:]], axis=0)
             apart = np.abs(x_m[second] - x_m[first])
