@@ -53,8 +53,8 @@ class SceneOutputs:
         """The outputs beside a frame; `places_m` is the method of its frame source."""
         channels: Mapping[str, np.ndarray] = {}
         if self.hazard is not None and self.has_channels:
-            places = places_m(frame)
-            channels = self.hazard.at(places[..., 0], places[..., 1])
+            points = places_m(frame)
+            channels = self.hazard.at(points[..., 0], points[..., 1])
         if self.surface is None or self.flash_lidar is None:
             return FrameOutputs(channels)
         return FrameOutputs(channels, flash(self.surface, frame.shot, self.flash_lidar).exr())

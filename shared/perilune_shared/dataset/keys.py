@@ -86,9 +86,9 @@ class KeyCheck:
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         if "scene_id" in rows.column_names:
-            own = _looked_up(rows["scene_id"], self.scene_of) == self._scene_of_frame[frame]
-            if not own.all():
-                row = rows.slice(int(np.argmin(own)), 1).to_pylist()[0]
+            same_scene = _looked_up(rows["scene_id"], self.scene_of) == self._scene_of_frame[frame]
+            if not same_scene.all():
+                row = rows.slice(int(np.argmin(same_scene)), 1).to_pylist()[0]
                 found = f"{row['scene_id']} in a label of {row['frame_id']}"
                 raise UserError(self._dataset.store, "labels: scene_id", found, f"the scene of the frame; {_HINT}")
         ids = rows["crater_id"].to_numpy()
@@ -96,8 +96,8 @@ class KeyCheck:
         known = number < len(self._numbers)
         known[known] = self._numbers[number[known]] == ids[known]
         key = self._scene_of_frame[frame] * len(self._numbers) + number
-        place = np.searchsorted(self._keys, key[known])
-        known[known] = (place < len(self._keys)) & (self._keys[np.minimum(place, len(self._keys) - 1)] == key[known])
+        index = np.searchsorted(self._keys, key[known])
+        known[known] = (index < len(self._keys)) & (self._keys[np.minimum(index, len(self._keys) - 1)] == key[known])
         if not known.all():
             row = rows.slice(int(np.argmin(known)), 1).to_pylist()[0]
             found = f"no crater {row['crater_id']} of a label of {row['frame_id']} names"
@@ -113,7 +113,7 @@ class KeyCheck:
         repeated = np.flatnonzero(np.diff(keys) == 0)
         if len(repeated):
             frame_place, number_place = divmod(int(keys[repeated[0]]), len(self._numbers))
-            frame_id = next(name for name, place in self._frame_of.items() if place == frame_place)
+            frame_id = next(name for name, index in self._frame_of.items() if index == frame_place)
             found = f"crater {self._numbers[number_place]} of {frame_id} twice"
             raise UserError(self._dataset.store, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
 
@@ -134,8 +134,8 @@ def _checked_ids_and_keys(
     """Check the keys of craters or boulders; return all ids and all keys (scene and id as one integer), sorted."""
     rows = dataset.table(table, KEYS[table])
     scene = _check_known(dataset, table, "scene_id", rows["scene_id"], scene_of)
-    numbers, place = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
-    keys = np.sort(scene * len(numbers) + place)
+    numbers, position = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
+    keys = np.sort(scene * len(numbers) + position)
     if (np.diff(keys) == 0).any():
         _check_unique(dataset, table, rows.to_pandas())
     return numbers, keys

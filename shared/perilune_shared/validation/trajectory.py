@@ -74,9 +74,9 @@ def _frames(
         yield Fault.of("dataset.json", None, "split_by", info.split_by, f"frame: {key} is in several splits")
     index = frames["frame_index"].to_numpy()
     ids = frames["frame_id"].to_pylist()
-    for row, (frame_id, place) in enumerate(zip(ids, index.tolist(), strict=True)):
-        if frame_id != f"{key}/{place:06d}":
-            yield Fault.of(where, row, "frame_id", frame_id, f"{key}/{place:06d}")
+    for row, (frame_id, number) in enumerate(zip(ids, index.tolist(), strict=True)):
+        if frame_id != f"{key}/{number:06d}":
+            yield Fault.of(where, row, "frame_id", frame_id, f"{key}/{number:06d}")
             break
     time = frames["time_s"].to_numpy()
     order = np.argsort(index)
@@ -110,10 +110,10 @@ def _labels(
     craters: pa.Table,
     frames: pa.Table,
     labels: pa.Table,
-    places: dict[str, str],
+    files: dict[str, str],
 ) -> Iterator[Fault]:
     """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
-    where = places["labels"]
+    where = files["labels"]
     frame_of = _row_numbers(labels["frame_id"], frames["frame_id"])
     crater_of = _row_numbers(labels["crater_id"], craters["crater_id"])
     for name, found_at in (("frame_id", frame_of), ("crater_id", crater_of)):
@@ -152,7 +152,7 @@ def _labels(
     if len(odd):
         found = f"a pose that matches none of {n_labels[odd[0]]} labels"
         yield Fault.of(
-            places["frames"],
+            files["frames"],
             int(odd[0]),
             "position_m+rotation_wxyz",
             found,

@@ -107,15 +107,15 @@ def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]
     sizes = [(key, name) for key in METRES for name in exact[key]]
     diameters = [size for size in sizes if size[0].startswith("diameter")]
     sizes = [("diameter_m", "diameter_m")] if "diameter_m" in names else diameters or sizes
-    places = [exact[key] for key in PLACES]
-    if all(len(matches) == 1 for matches in places) and len(sizes) == 1:
-        return {"longitude_deg": places[0][0], "latitude_deg": places[1][0], sizes[0][0]: sizes[0][1]}
-    several = [name for matches in (*places, [name for _, name in sizes]) if len(matches) > 1 for name in matches]
+    coordinates = [exact[key] for key in PLACES]
+    if all(len(matches) == 1 for matches in coordinates) and len(sizes) == 1:
+        return {"longitude_deg": coordinates[0][0], "latitude_deg": coordinates[1][0], sizes[0][0]: sizes[0][1]}
+    several = [name for matches in (*coordinates, [name for _, name in sizes]) if len(matches) > 1 for name in matches]
     got = (
         f"columns {', '.join(several)}" if several else f"columns {', '.join(name for name in names if name) or 'none'}"
     )
     expected = "longitude_deg, latitude_deg and diameter_m or diameter_km"
-    if not several and all(places) and not sizes:
+    if not several and all(coordinates) and not sizes:
         expected = "a diameter or radius with its unit, as diameter_m or Diameter (km)"
     raise UserError(path, "columns", got, f"{expected}; {setting} can state which columns these are")
 
