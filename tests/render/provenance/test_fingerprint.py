@@ -176,6 +176,7 @@ def test_compiled_functions_are_found_in_every_module():
         "surface",
         "rocks",
         "cast",
+        "cell",
         "shade",
         "light",
         "query",

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from perilune_render.engines.heightfield.cast import NO_FACET, Ray, first_hit
+from perilune_render.engines.heightfield.cast import first_hit
+from perilune_render.engines.heightfield.cell import NO_FACET, Ray
 from perilune_render.engines.heightfield.shade import ground_at, rock_normal
 from perilune_render.engines.heightfield.surface import Surface
 from perilune_render.provenance.kernels import njit

@@ -22,14 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from perilune_render.engines.heightfield.beam import BLOCK_PX, begin_m, only_part
-from perilune_render.engines.heightfield.cast import (
-    NO_FACET,
-    Ray,
-    any_ring_at,
-    first_hit,
-    first_hit_anywhere,
-    first_hit_in_part,
-)
+from perilune_render.engines.heightfield.cast import any_ring_at, first_hit, first_hit_anywhere, first_hit_in_part
+from perilune_render.engines.heightfield.cell import NO_FACET, Ray
 from perilune_render.engines.heightfield.horizon import Horizon, surely_lit
 from perilune_render.engines.heightfield.prefetch import prefetch
 from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS, ring_vertex, vertex_index, vertex_xy
