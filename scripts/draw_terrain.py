@@ -24,7 +24,7 @@ from perilune_render.config.dataset import DatasetConfig
 from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import view_envelope
-from perilune_render.imaging.sensor import FixedPattern, develop
+from perilune_render.imaging.sensor import FixedPattern, expose, read_out
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.craters import profile
 from perilune_render.terrain.scene import Scene
@@ -86,7 +86,8 @@ def nadir_frames(
         with Renderer(scene, config, camera, sun_direction(70, elevation)) as renderer:
             radiance = renderer.render(np.array([*centre_m, altitude]), ROTATION_CAMERA_FROM_BODY)
         rng = np.random.default_rng(SEED)
-        frames.append(develop(radiance, config.sensor, camera, camera, np.zeros(3), pattern, rng))
+        exposure = expose(radiance, config.sensor, camera, camera, np.zeros(3))
+        frames.append(read_out(exposure, config.sensor, pattern, rng))
     return frames
 
 

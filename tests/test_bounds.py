@@ -19,8 +19,8 @@ def sections() -> list[type[Section]]:
     """All sections of the three packages; imports every file that defines one."""
     for package in (perilune_shared, perilune_render, perilune_train):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            parts = found.name.split(".")
-            if "config" in parts or parts[-1].startswith(("settings", "thresholds", "architecture", "native")):
+            names = found.name.split(".")
+            if "config" in names or names[-1].startswith(("settings", "thresholds", "architecture", "native")):
                 importlib.import_module(found.name)
     return list(descendants(Section))
 

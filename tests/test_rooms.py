@@ -21,7 +21,7 @@ ROOMS = {
         "jobs cli"
     ),
     "perilune/perilune": "parts datasets",
-    "render/perilune_render/config": "values cameras terrain survey counterfactual scene outputs dataset",
+    "render/perilune_render/config": "values cameras terrain derived scene outputs dataset",
     "render/perilune_render/engines": "frame_source blender heightfield open_engine",
     "render/perilune_render/cli": "options sun dataset frames spice serve status survey counterfactual main",
     "render/perilune_render/terrain": (
@@ -29,8 +29,7 @@ ROOMS = {
         "level_ground cache export"
     ),
     "render/perilune_render/jobs": (
-        "job records identity steps work_list report scene_renderer worker local in_process ray_actors run status "
-        "estimate"
+        "job records work_list report scene_renderer worker local in_process ray_actors run status estimate"
     ),
     "train/perilune_train": (
         "config compiled data records models training shipped detect motion landing explain report cli"

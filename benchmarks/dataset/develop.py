@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks.figures import write_figures
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.develop import develop_dataset
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_shared.config.resolve import resolve
@@ -40,7 +40,7 @@ def main() -> None:
     """Run the benchmark on 150 frames."""
     config = resolve(DatasetConfig, "dataset", "perilune_render", "small", None, SETTINGS)
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
-        source = render_job(Job.planned(config, "detect", "small"), Path(folder) / "source", bar, Here)
+        source = render_job(Job.planned(config, "detect", "small"), Path(folder) / "source", bar, InProcess)
         core = min(os.sched_getaffinity(0))
         for thread in Path("/proc/self/task").iterdir():
             os.sched_setaffinity(int(thread.name), {core})

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.figures import write_figures
 from perilune_render.config.dataset import DatasetConfig
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_shared.config.resolve import resolve
@@ -73,7 +73,7 @@ def main(n_frames: int) -> None:
     config = resolve(DatasetConfig, "dataset", "perilune_render", "tiny", None, chosen)
     measured = Measured()
     with tempfile.TemporaryDirectory() as folder:
-        render_job(Job.planned(config, "detect", "tiny"), Path(folder) / "made", measured, Here)
+        render_job(Job.planned(config, "detect", "tiny"), Path(folder) / "made", measured, InProcess)
     frames, mib = np.array(list(measured.mib)), np.array(list(measured.mib.values()))
     first = mib[(frames >= WARM_UP) & (frames <= 100 * PER_SCENE)].mean()
     last = mib[frames > n_frames - 100 * PER_SCENE].mean()

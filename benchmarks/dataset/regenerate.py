@@ -12,7 +12,7 @@ from typing import get_args
 from benchmarks.figures import write_figures
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.dataset.regenerate import State, regenerate, spread
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_shared.config.resolve import resolve
@@ -27,7 +27,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         root = Path(folder)
         os.environ["PERILUNE_CACHE"] = str(root / "cache")
-        dataset = render_job(Job.planned(config, "detect", "small"), root / "made", bar, Here)
+        dataset = render_job(Job.planned(config, "detect", "small"), root / "made", bar, InProcess)
         n = dataset.info.counts.frames
         os.environ["PERILUNE_CACHE"] = str(root / "other cache")
         outcomes = regenerate(dataset, spread(dataset, n), root / "again", bar)

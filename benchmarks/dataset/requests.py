@@ -37,7 +37,7 @@ def counted(cache: str, n_scenes: int, n_trajectories: int, n_frames: int) -> Co
 
     from perilune_render.config.dataset import DatasetConfig
     from perilune_render.jobs import records
-    from perilune_render.jobs.in_process import Here
+    from perilune_render.jobs.in_process import InProcess
     from perilune_render.jobs.job import Job
     from perilune_render.jobs.run import render_job
     from perilune_shared.config.resolve import resolve
@@ -56,7 +56,7 @@ def counted(cache: str, n_scenes: int, n_trajectories: int, n_frames: int) -> Co
     job = Job.planned(resolve(DatasetConfig, "dataset", "perilune_render", "tiny", None, chosen), "detect", "tiny")
     os.environ["PERILUNE_CACHE"] = cache
     try:
-        render_job(job, f"{new_bucket()}/moon", Progress(disable=True), Here)
+        render_job(job, f"{new_bucket()}/moon", Progress(disable=True), InProcess)
     finally:
         AioEndpoint._send = send
     return found

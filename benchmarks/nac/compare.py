@@ -22,7 +22,7 @@ from perilune_render.config.dataset import CameraConfig, DatasetConfig, FlightCo
 from perilune_render.engines.blender.renderer import Renderer
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.radiance import Radiance
-from perilune_render.imaging.sensor import FixedPattern, develop
+from perilune_render.imaging.sensor import FixedPattern, expose, read_out
 from perilune_render.labels.drawing import write_sheet
 from perilune_render.labels.frame_labels import RimCircles, label_frame
 from perilune_render.streams import derived_seed, stream
@@ -119,7 +119,7 @@ def take_frame(
     pose = np.array([0.0, 0.0, altitude_m]), ROTATION_CAMERA_FROM_BODY
     with Renderer(scene, config, camera, sun_direction(azimuth_deg, elevation_deg)) as renderer:
         radiance = renderer.render(*pose)
-    labels = label_frame(RimCircles.of_scene(scene), camera, *pose, radiance, LEAST_PX / 2, 1e4)
+    labels = label_frame(RimCircles.of_scene(scene), camera, *pose, radiance, (LEAST_PX / 2, 1e4))
     e, ratio = labels.ellipses, scene.rims.depth_m / scene.craters.diameter_m
     # X_L points west and Y_L south: a rotation by 180 degrees puts north up.
     return Picture(
@@ -135,7 +135,8 @@ def take_frame(
 def _developed(radiance: Radiance, config: DatasetConfig, camera: Camera, seed: int) -> np.ndarray:
     """Grey values, for a camera at rest."""
     pattern = FixedPattern.draw(config.sensor, camera, seed)
-    return develop(radiance, config.sensor, camera, camera, np.zeros(3), pattern, stream(seed, "nac"))
+    exposure = expose(radiance, config.sensor, camera, camera, np.zeros(3))
+    return read_out(exposure, config.sensor, pattern, stream(seed, "nac"))
 
 
 def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, sampling_m: float) -> list[list[Picture]]:

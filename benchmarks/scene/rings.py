@@ -42,7 +42,7 @@ def labels_of(circles: RimCircles, camera: Camera, position_m: Array, rotation_c
     """Labels of 2 to 50 px by the project's rule, without occlusion."""
     shape = (camera.height_px, camera.width_px)
     nothing = Radiance(np.zeros(shape), np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros(shape, bool))
-    return label_frame(circles, camera, position_m, rotation_camera_from_site, nothing, 2.0, 50.0)
+    return label_frame(circles, camera, position_m, rotation_camera_from_site, nothing, (2.0, 50.0))
 
 
 def rows_of(ellipses: Ellipses, rows: np.ndarray) -> Ellipses:

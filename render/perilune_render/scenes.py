@@ -21,7 +21,7 @@ from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import view_of
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.provenance.recipe import config_of
-from perilune_render.server.world import View, World, open_world, world_over
+from perilune_render.server.simulation import SimulatedScene, View, open_simulation, simulation_over
 from perilune_shared.config.errors import nearest
 from perilune_shared.config.resolve import PRESETS, resolve
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
@@ -134,15 +134,15 @@ class Scene:
                 raise UserError("Scene", "seed and settings", "given", "none: a dataset has its own")
             dataset = source if isinstance(source, Dataset) else open_single(source)
             self.name = str(dataset.store)
-            self._world = _world_of(dataset, sun_azimuth_deg, sun_elevation_deg, engine)
+            self._simulated = _simulation_of(dataset, sun_azimuth_deg, sun_elevation_deg, engine)
         else:
             self.name = str(source)
-            self._world = open_world(_config_of(source, every))
+            self._simulated = open_simulation(_config_of(source, every))
 
     @property
     def config(self) -> DatasetConfig:
         """The settings."""
-        return self._world.config
+        return self._simulated.config
 
     @property
     def camera(self) -> Camera:
@@ -152,7 +152,7 @@ class Scene:
     @property
     def craters(self) -> pd.DataFrame:
         """The craters of the ground, one row each, with the columns of the table `craters`."""
-        return ground_tables("scene", self._world.scene)["craters"].to_pandas()
+        return ground_tables("scene", self._simulated.scene)["craters"].to_pandas()
 
     @overload
     def render(self, poses: Pose) -> RenderedFrame: ...
@@ -168,20 +168,20 @@ class Scene:
         return frames[0] if isinstance(poses, Pose) else frames
 
     def _render(self, pose: Pose, index: int) -> RenderedFrame:
-        world, stated = self._world, self.config.scene or SceneConfig()
+        simulated, stated = self._simulated, self.config.scene or SceneConfig()
         sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
         view = View(pose.position_m, pose.rotation_camera_from_site, self.camera, sun)
-        frame = world.frame(view, trajectory_seed(world.scene.seed, 0), index, pose.velocity_mps)
-        labels = world.labels(view, frame)
+        frame = simulated.frame(view, trajectory_seed(simulated.scene.seed, 0), index, pose.velocity_mps)
+        labels = simulated.labels(view, frame)
         rows = label_table("frame", labels).to_pandas().drop(columns="frame_id")
-        place = np.searchsorted(world.scene.crater_id, labels.crater_id)
-        rows["depth_m"] = world.scene.rims.depth_m[place]
-        rows["diameter_m"] = world.scene.craters.diameter_m[place]
+        rim = np.searchsorted(simulated.scene.crater_id, labels.crater_id)
+        rows["depth_m"] = simulated.scene.rims.depth_m[rim]
+        rows["diameter_m"] = simulated.scene.craters.diameter_m[rim]
         return RenderedFrame(frame.image, frame.radiance.depth_m, rows, pose)
 
     def close(self) -> None:
         """Release the engine; the end of a program does so too."""
-        self._world.close()
+        self._simulated.close()
 
     def __enter__(self) -> "Scene":
         return self
@@ -190,7 +190,7 @@ class Scene:
         self.close()
 
     def __repr__(self) -> str:
-        stated, scene = self.config.scene or SceneConfig(), self._world.scene
+        stated, scene = self.config.scene or SceneConfig(), self._simulated.scene
         about = (
             f"{len(scene.craters)} craters on {scene.grid.extent_m / 1000:.1f} km of ground, Sun at elevation "
             f"{stated.sun_elevation_deg:g} and azimuth {stated.sun_azimuth_deg:g} degrees, {self.camera.width_px} x "
@@ -202,7 +202,7 @@ class Scene:
 def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
     """The settings of a terrain, a preset, a file of settings or an elevation model. Raises UserError on another."""
     name, path = str(source), Path(source)
-    preset, file, own, dem = _BASE, None, TERRAINS.get(name, ()), None
+    preset, file, settings_of_name, dem = _BASE, None, TERRAINS.get(name, ()), None
     if name in PRESETS:
         preset = name
     elif path.suffix.lower() in _CONFIGURATIONS:
@@ -214,7 +214,7 @@ def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
         expected = f"{known}, a YAML file, an elevation model, or the folder of a dataset"
         raise UserError("Scene", "source", name, expected)
     try:
-        config = resolve(DatasetConfig, "dataset", "perilune_render", preset, file, (*own, *settings))
+        config = resolve(DatasetConfig, "dataset", "perilune_render", preset, file, (*settings_of_name, *settings))
     except UserError as error:
         if error.where != "--set":
             raise
@@ -227,9 +227,9 @@ def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
     return config
 
 
-def _world_of(
+def _simulation_of(
     dataset: Dataset, sun_azimuth_deg: float | None, sun_elevation_deg: float | None, engine: EngineName
-) -> World:
+) -> SimulatedScene:
     """The first scene of a dataset, with its ground and settings; the Sun is its own unless another is given."""
     info, where = dataset.info, dataset.store.at("dataset.json")
     if len(info.recipes) != 1:
@@ -254,4 +254,4 @@ def _world_of(
             raise UserError("Scene", name, sun[name], f"{least} to {most}, the elevation above 0")
     lit = (config.scene or SceneConfig()).model_copy(update=sun)
     render = config.render.model_copy(update={"engine": engine})
-    return world_over(config.model_copy(update={"scene": lit, "render": render}), view, first["seed"])
+    return simulation_over(config.model_copy(update={"scene": lit, "render": render}), view, first["seed"])

@@ -7,13 +7,13 @@ _ROOT, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processor_quota() -> float | None:
-    """Least processor quota, in cores, of this process's cgroup and of those above it; None if there is none."""
+    """Least processor quota, in cores, of this process's cgroup and its parents; None without a quota."""
     quotas = [used / period for used, period in _pairs("cpu") if used > 0 and period > 0]
     return min(quotas, default=None)
 
 
 def memory_left_bytes() -> float | None:
-    """Least memory, in bytes, that this process's cgroup and those above it may still use; None without a limit."""
+    """Least memory, in bytes, that this process's cgroup and its parents may still use; None without a limit."""
     left = [float(limit - used) for limit, used in _pairs("memory") if limit >= 0]
     return min(left, default=None)
 
@@ -26,7 +26,7 @@ _FILES = {
 
 
 def _pairs(controller: str) -> Iterator[tuple[int, int]]:
-    """Both numbers of each cgroup that states them; "max", no limit, is none, nor is a file that cannot be read."""
+    """Both numbers of each cgroup that states them. Skips "max" (no limit) and files that cannot be read."""
     for folder in _folders(controller):
         for names in _FILES[controller]:
             try:

@@ -54,12 +54,12 @@ class ServedFrame:
     image: np.ndarray
     """Grey values, DN (h, w) uint8, or uint16 above 8 bits."""
     depth_m: np.ndarray | None
-    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not asked for. With a
+    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not requested. With a
     distorting lens it is in the pixels of the pinhole that covers the view."""
     normal: np.ndarray | None
-    """Unit normals, O_L (h, w, 3) float32, in the same pixels; None if not asked for."""
+    """Unit normals, O_L (h, w, 3) float32, in the same pixels; None if not requested."""
     labels: dict[str, np.ndarray] | None
-    """Columns of the table `labels` (N,); None if not asked for."""
+    """Columns of the table `labels` (N,); None if not requested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class ServedScene:
     sun_elevation_deg: float
     """Elevation of the Sun unless a request states another, degrees."""
     n_scenes: int = 1
-    """Number of scenes, `perilune-render serve --scenes`; the other fields are those of scene 0."""
+    """Number of scenes, `perilune-render serve --scenes`; the other fields describe scene 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,7 @@ class SceneClient:
         """
         head, _ = self._ask({"request": "health"})
         try:
-            return {str(name): str(place) for name, place in head["interfaces"].items()}
+            return {str(name): str(address) for name, address in head["interfaces"].items()}
         except (KeyError, AttributeError):
             raise UserError(self.address, "interfaces", "none", "a reply of `perilune-render serve`") from None
 
@@ -215,8 +215,8 @@ class SceneClient:
         self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True, scene: int = 0
     ) -> Array:
         """Heights (N,) of the surface at places (N,) of O_L, metres; NaN off the ground."""
-        places = [[float(value) for value in values] for values in (x_m, y_m)]
-        request = {"request": "heights", "x_m": places[0], "y_m": places[1], "boulders": boulders}
+        coordinates = [[float(value) for value in values] for values in (x_m, y_m)]
+        request = {"request": "heights", "x_m": coordinates[0], "y_m": coordinates[1], "boulders": boulders}
         return self._ask(request | _of(scene))[1]["height_m"]
 
     def _ask(self, request: dict[str, Any], wait: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -259,10 +259,12 @@ class SceneClient:
             arrays = head.get("arrays", [])
             if len(arrays) != len(parts):
                 raise ValueError(f"{len(parts)} arrays")
-            found = {one["name"]: _array(one, part) for one, part in zip(arrays, parts, strict=True)}
+            arrays_by_name = {
+                description["name"]: _array(description, part) for description, part in zip(arrays, parts, strict=True)
+            }
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(self.address, "reply", error, "one of `perilune-render serve`") from None
-        return head, found
+        return head, arrays_by_name
 
 
 def _of(scene: int) -> dict[str, int]:

@@ -22,7 +22,7 @@ _ANGLES = np.linspace(0, 2 * np.pi, 65)
 def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, int, int]] | None = None) -> "Image":
     """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits; `colours` has one for each, by default cyan.
 
-    The columns of an ellipse are those of labels: centre x and y, semi-axes a and b, pixels, and the direction of a,
+    An ellipse has the columns of labels: centre x and y, semi-axes a and b, pixels, and the direction of a,
     radians. A 16-bit image is scaled so that its largest value is white.
     """
     from PIL import Image, ImageDraw
@@ -37,7 +37,7 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
     picture = Image.fromarray(grey).resize(size, how).convert("RGB")
     draw = ImageDraw.Draw(picture)
     rows = np.asarray(ellipses, np.float64).reshape(-1, 5)
-    for place, (x, y, a, b, theta) in enumerate(rows):
+    for index, (x, y, a, b, theta) in enumerate(rows):
         along, across = a * np.cos(_ANGLES), b * np.sin(_ANGLES)
         points = np.stack(
             [
@@ -48,7 +48,7 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
         )
         # Pillow's origin is the centre of the first pixel, the one of labels its outer corner.
         drawn = points * factor - 0.5
-        draw.line([(float(u), float(v)) for u, v in drawn], fill=CYAN if colours is None else colours[place], width=1)
+        draw.line([(float(u), float(v)) for u, v in drawn], fill=CYAN if colours is None else colours[index], width=1)
     return picture
 
 

@@ -20,7 +20,7 @@ from perilune_shared.dataset.index import FOLDER, index_rows, write_index
 from perilune_shared.dataset.info_file import INFO_NAME, with_own_hash, write_info
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
 from perilune_shared.dataset.names import WHOLE_TABLE
-from perilune_shared.dataset.parts import Written, write_part
+from perilune_shared.dataset.parts import WrittenFile, write_part
 from perilune_shared.dataset.schema import OPTIONAL_TABLES, SCHEMA_VERSION, TABLES
 from perilune_shared.geometry import frames
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
@@ -221,7 +221,7 @@ def seal(root: Path) -> None:
     if content["complete"]:
         paths = [item.path for item in store.list() if is_plain(item.path) and item.path not in (INFO_NAME, LOCK_NAME)]
         plain = [path for path in paths if (root / path).is_file() and not (root / path).is_symlink()]
-        rows = index_rows(Written(path, (root / path).stat().st_size, store.sha256(path)) for path in plain)
+        rows = index_rows(WrittenFile(path, (root / path).stat().st_size, store.sha256(path)) for path in plain)
         content["index"] = [part.model_dump() for part in write_index(store, rows)]
     info.write_bytes(with_own_hash(json.dumps(content, indent=2).encode()))
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from perilune_shared.cli import main as cli
+from perilune_shared.cli.main import app
 from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.packed import SHARDS, packed_rows, shard_name
@@ -101,7 +101,7 @@ def command(root: Path, name: str, capsys: pytest.CaptureFixture, monkeypatch: p
     capsys.readouterr()
     code = 0
     try:
-        run_command_line(cli.app)
+        run_command_line(app)
     except SystemExit as stop:
         code = stop.code
     out, err = capsys.readouterr()

@@ -16,7 +16,7 @@ from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.level_ground import averaged, on_level
-from perilune_render.terrain.levels import check_levels, cut_levels, level_index
+from perilune_render.terrain.levels import checked_grid, cut_levels, level_index
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
@@ -90,7 +90,7 @@ def test_every_frame_sees_half_a_pixel_or_finer_ground_on_its_level(sigma_deg):
 @pytest.mark.parametrize("most", [50_000, 250_000, 600_000])
 def test_too_many_vertices_for_any_level_are_refused_and_a_spacing_is_named_that_fits(most):
     with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs [67]..,... vertices") as refusal:
-        check_levels(config_with(terrain={"max_vertices": most}).terrain, VIEW)
+        checked_grid(config_with(terrain={"max_vertices": most}).terrain, VIEW)
     named = float(re.search(r"at least ([0-9.]+),", refusal.value.expected)[1])
     wider = config_with(terrain={"max_vertices": most, "spacing_px": named})
     assert all(level.grid.n_vertices <= most for level in cut_levels(wider.terrain, VIEW, 0))
@@ -102,13 +102,13 @@ def test_too_many_vertices_for_any_level_are_refused_and_a_spacing_is_named_that
 def test_a_mesh_that_no_spacing_makes_small_enough_names_none():
     own = dataclasses.replace(VIEW, seen=None)
     with pytest.raises(UserError, match=r"expected a larger dataset.terrain.max_vertices, fewer or wider pixels"):
-        check_levels(config_with(terrain={"max_vertices": 10_000}).terrain, own)
+        checked_grid(config_with(terrain={"max_vertices": 10_000}).terrain, own)
 
 
 def test_a_users_own_view_allows_one_mesh_only():
     own = ViewEnvelope(VIEW.height_m, VIEW.reach_m, VIEW.focal_px)
     with pytest.raises(UserError, match=r"got 0.5 needs 4,...,... vertices"):
-        check_levels(config_with(terrain={"max_vertices": 1_500_000}).terrain, own)
+        checked_grid(config_with(terrain={"max_vertices": 1_500_000}).terrain, own)
 
 
 def test_the_approach_is_the_azimuth_of_the_start():

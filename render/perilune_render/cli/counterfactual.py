@@ -8,7 +8,7 @@ import typer
 
 import perilune_shared as ps
 from perilune_render.cli.dataset import JobOptions, finished_or_exit
-from perilune_render.config.counterfactual import CounterfactualConfig
+from perilune_render.config.derived import CounterfactualConfig
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.progress import say
 from perilune_shared.console.terminal import answer

@@ -245,9 +245,9 @@ def _print_failures(error: "RenderingFailed") -> None:
 def _executor(options: JobOptions, early: "Worker | None") -> "MakeExecutor":
     if options.workers == 0:
         # Imports Blender, which takes seconds.
-        from perilune_render.jobs.in_process import Here
+        from perilune_render.jobs.in_process import InProcess
 
-        return Here
+        return InProcess
     if options.executor == "ray":
         try:
             from perilune_render.jobs.ray_actors import RayActors

@@ -11,7 +11,7 @@ from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
 
 if TYPE_CHECKING:
-    from perilune_render.server.world import World
+    from perilune_render.server.simulation import SimulatedScene
     from perilune_shared.geometry.frames import Array
 
 _PORT = 10363
@@ -63,22 +63,23 @@ def serve(
     if camera is not None:
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
+    from perilune_render.server.connection import Connection, Limits
     from perilune_render.server.grounds import Grounds
     from perilune_render.server.native.serve import Native, native_address
     from perilune_render.server.pangu.serve import greets, serve_pangu
     from perilune_render.server.pangu.session import Conventions, Session
-    from perilune_render.server.serve import Connection, Interface, Limits, Server
-    from perilune_render.server.world import open_world
+    from perilune_render.server.serve import Interface, Server
+    from perilune_render.server.simulation import open_simulation
 
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
-    with open_world(config) as world, Grounds(world, scenes, say) as grounds:
+    with open_simulation(config) as simulated, Grounds(simulated, scenes, say) as grounds:
         say("rendering a first frame")
-        world.prepare()
-        start = _start(world)
+        simulated.prepare()
+        start = _start(simulated)
 
         async def handle(connection: Connection) -> None:
-            await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
+            await serve_pangu(connection, lambda: Session(simulated, *start, conventions), server.stop)
 
         pangu = Interface("PANGU", host, port, handle, greets, limits)
         native = Native(grounds, limits, say, [pangu])
@@ -110,14 +111,14 @@ def serve(
         server.run()
 
 
-def _start(world: "World") -> tuple[int, int, float, "Array", int]:
+def _start(simulated: "SimulatedScene") -> tuple[int, int, float, "Array", int]:
     """Width and height, pixels, field of view, radians, Sun and random seed of a new client of PANGU's protocol."""
     import numpy as np
 
     from perilune_render.poses.plan import trajectory_seed
     from perilune_shared.geometry.frames import sun_direction
 
-    camera, stated = world.config.camera, world.config.scene or SceneConfig()
+    camera, stated = simulated.config.camera, simulated.config.scene or SceneConfig()
     sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
     field_of_view_rad = float(np.radians(camera.horizontal_fov_deg))
-    return camera.width_px, camera.height_px, field_of_view_rad, sun, trajectory_seed(world.scene.seed, 0)
+    return camera.width_px, camera.height_px, field_of_view_rad, sun, trajectory_seed(simulated.scene.seed, 0)

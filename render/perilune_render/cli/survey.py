@@ -7,7 +7,7 @@ import typer
 
 import perilune_shared as ps
 from perilune_render.cli.dataset import JobOptions, finished_or_exit
-from perilune_render.config.survey import SurveyConfig
+from perilune_render.config.derived import SurveyConfig
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.terminal import answer
 from perilune_shared.errors import UserError

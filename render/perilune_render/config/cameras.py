@@ -44,7 +44,7 @@ class CameraConfig(Section):
     focal_length_px: Pixels | None = None
     """Focal length, pixels; null computes it from horizontal_fov_deg."""
     focal_length_y_px: Pixels | None = None
-    """Focal length divided by the pixel height, where pixels are not square; null is that of x."""
+    """Focal length divided by the pixel height, where pixels are not square; null takes the focal length of x."""
     principal_x_px: _Point | None = None
     """Principal point, from the left edge, pixels; null is the image centre."""
     principal_y_px: _Point | None = None

@@ -5,10 +5,9 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from perilune_render.config.cameras import CameraConfig, CameraName, MountedCameraConfig
-from perilune_render.config.counterfactual import CounterfactualConfig
+from perilune_render.config.derived import CounterfactualConfig, SurveyConfig
 from perilune_render.config.outputs import FlashLidarConfig, HazardConfig
 from perilune_render.config.scene import SceneConfig
-from perilune_render.config.survey import SurveyConfig
 from perilune_render.config.terrain import TerrainConfig
 from perilune_render.config.values import (
     Altitude,
@@ -32,7 +31,8 @@ MOST_TRAJECTORIES, MOST_FRAMES = 200_000, 10_000_000
 MOST_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
 _LEAST_LIMIT = 3.0
-"""Smallest limit of that acceleration, in standard deviations on an axis: about half of all draws keep it."""
+"""Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis; about half of all draws keep
+it."""
 
 
 class FlightConfig(Section):
@@ -55,7 +55,7 @@ class FlightConfig(Section):
     correlation_time_s: Seconds = 3.0
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
     attitude_correlation_time_s: Seconds | None = None
-    """Correlation time of the perturbation of the attitude, seconds; null is correlation_time_s."""
+    """Correlation time of the perturbation of the attitude, seconds; null takes correlation_time_s."""
     max_perturbation_mps2: Annotated[float, Field(gt=0, le=1000)] | None = None
     """Largest acceleration by the perturbation of the position, metres per second squared; null for no limit."""
 
@@ -89,7 +89,7 @@ class InstrumentsConfig(Section):
     inertial_rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
     """Inertial measurements per second."""
     range_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Measurements of the laser altimeter per second; 0 for none. Given poses have one at the time of each frame."""
+    """Measurements of the laser altimeter per second; 0 for none. Given poses have one at each frame's time."""
     range_sigma_m: Deviation = 0.2
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0005
@@ -125,7 +125,7 @@ class KindConfig(Section):
     val_share: Share = 0.1
     """Share of the units of the split that are in the validation split."""
     test_share: Share = 0.1
-    """Share of the units of the split that are in the test split; with 1 there is no other split."""
+    """Share of the units of the split that are in the test split; 1 makes a test set without other splits."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()
@@ -218,10 +218,10 @@ class SensorConfig(Section):
     motion_blur: bool = True
     """Whether the camera's motion during the exposure blurs the frame."""
     blur_poses: Annotated[int, Field(ge=1, le=256)] = 1
-    """Number of poses during the exposure that are rendered and averaged: exact blur, at so many times the cost. With 1
-    one rendering is blurred by the motion of each pixel in the image."""
+    """Number of poses during the exposure that are rendered and averaged: exact blur, at this multiple of the cost.
+    With 1 a single rendering is blurred along the motion of each pixel."""
     row_time_s: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Time from the exposure of a row to that of the next (rolling shutter), seconds; 0 exposes all rows at once."""
+    """Time between the exposures of two neighbouring rows (rolling shutter), seconds; 0 exposes all rows at once."""
 
     @model_validator(mode="after")
     def _above_black(self) -> "SensorConfig":

@@ -14,7 +14,7 @@ _ROUNDING = 1e-9
 
 
 class HazardConfig(Section):
-    """A map of each scene, for a lander of one size: slope, roughness, boulders, shadow, and where it is safe."""
+    """A map of each scene for a lander of one size: slope, roughness, boulders, shadow, and safe places."""
 
     footprint_m: Length = 10.0
     """Diameter of the lander's footprint, metres."""
@@ -51,7 +51,7 @@ class HazardConfig(Section):
 
 
 class FlashLidarConfig(Section):
-    """A flash lidar that looks along the camera's axis and ranges all its pixels at the time of each frame."""
+    """A flash lidar along the camera's axis. It measures the ranges of all its pixels at the time of each frame."""
 
     width_px: Annotated[int, Field(ge=1, le=1024)] = 128
     """Image width, pixels."""
@@ -68,7 +68,7 @@ class FlashLidarConfig(Section):
     max_range_m: Length = 2000.0
     """Largest range that is measured, metres."""
     threshold_range_m: Length = 1500.0
-    """Distance at which ground of mean albedo, seen along its normal, returns the least energy that is detected,
+    """Distance at which ground of mean albedo, seen along its normal, returns the smallest detectable energy,
     metres."""
     energy_sigma_share: Annotated[float, Field(ge=0, le=1)] = 0.1
     """Standard deviation of the returned energy, share of the energy."""

@@ -11,13 +11,13 @@ HIGHEST_M = 20_000.0
 
 
 class ViewConfig(Section):
-    """How far from the site cameras see ground, from one height."""
+    """How far from the site cameras at one height see ground."""
 
     height_m: Annotated[float, Field(gt=0, le=2e6)]
     """Height of a camera above the ground, metres."""
     reach_m: Annotated[float, Field(gt=0, le=2e6)]
     """Largest |x| or |y| from the site of the ground that cameras at this height or below show, metres; with `horizon`,
-    of these cameras themselves."""
+    largest |x| or |y| of the cameras."""
 
 
 class SceneConfig(Section):
@@ -28,8 +28,8 @@ class SceneConfig(Section):
     sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
     """Elevation of the Sun above the ground plane, degrees; a column of the poses overrides it."""
     views: tuple[ViewConfig, ...] = ()
-    """Views that the ground is made for, from the lowest to the highest: they set its extent and the vertex spacing at
-    each distance from the site. Without views they are taken from the poses."""
+    """Views for which the ground is made, from the lowest to the highest. They set its extent and the vertex spacing at
+    each distance from the site. By default they follow from the poses."""
     horizon: bool = False
     """Whether views may show the sky. The ground is then curved and extends to the horizon of a camera at the last
     view's height; `reach_m` of a view limits where its cameras are."""

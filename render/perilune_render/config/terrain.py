@@ -45,7 +45,7 @@ class BouldersConfig(Section):
     density: Annotated[float, Field(ge=0, le=1000)] = 0.1
     """Boulder density on the plain, as a multiple of the published size-frequency law."""
     field_density: Annotated[float, Field(ge=0, le=100_000)] = 100.0
-    """Boulder density at the rim of a newly formed crater, as a multiple of that on the plain."""
+    """Boulder density at the rim of a newly formed crater, as a multiple of the density on the plain."""
     min_diameter_spacings: Annotated[float, Field(ge=0.3, le=1000)] = 0.7
     """Diameter of the smallest boulder, local vertex spacings."""
     max_diameter_m: Annotated[float, Field(gt=0, le=1000)] = 5.0
@@ -76,23 +76,23 @@ METRES_PER_UNIT = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937, "
 """Units of heights."""
 HeightUnit = Literal["m", "km", "ft", "us-ft", "cm", "mm"]
 SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
-"""Settings of the site in an elevation model: one pair of them, or none."""
+"""Settings of the site in an elevation model, of which one pair or none is set."""
 FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "vrt_files", "allow_unseen")
-"""Settings that tell what an elevation model's file leaves open."""
+"""Settings for what the file of an elevation model does not state."""
 
 
 RimSource = Literal["catalogue", "measured"]
 
 
 class CatalogueColumnsConfig(Section):
-    """Columns of a crater catalogue; null for all of them recognises the columns of known catalogues."""
+    """Columns of a crater catalogue. If all are null, the columns of known catalogues are recognised."""
 
     longitude_deg: str | None = None
     """Column of the longitude, east positive, degrees."""
     latitude_deg: str | None = None
     """Column of the latitude, degrees."""
     diameter_m: str | None = None
-    """Column of the diameter, metres; one size is stated."""
+    """Column of the diameter, metres; exactly one of the four sizes is stated."""
     diameter_km: str | None = None
     """Column of the diameter, kilometres."""
     radius_m: str | None = None
@@ -128,19 +128,19 @@ class ElevationConfig(Section):
     site_row_px: _Place | None = None
     """Row of the landing site, pixels from the top edge of the model."""
     height_unit: HeightUnit | None = None
-    """Unit of the model's heights; null for the one that its file states, or metres."""
+    """Unit of the model's heights; null takes the unit stated in its file, or metres."""
     band: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """Band of the model that has the heights, from 1; null if it has only one band, or one described as heights."""
+    """Band of the heights, from 1; null takes the only band, or the one that is described as heights."""
     nodata: Annotated[float, Field(ge=-1e39, le=1e39)] | None = None
-    """Value of pixels without a height, before scale and offset, in addition to the one that the file declares."""
+    """Value of pixels without a height, before scale and offset, in addition to the value that the file declares."""
     crs: (
         Annotated[str, Field(max_length=5000, pattern=r"^(?i:(EPSG|ESRI|IAU|IAU_\d{4}):\d+$|\+proj=|[A-Z_]+\[)")] | None
     ) = None
     """Coordinate reference system of the model, in place of the one in its file: IAU_2015:30135, +proj=..., or WKT."""
     vrt_files: Annotated[list[str], Field(min_length=1, max_length=10_000)] | None = None
-    """The model is a VRT, GDAL's text that joins rasters; it may refer to these files, paths from its folder."""
+    """Files that a model in VRT (GDAL's text that joins rasters) may refer to, as paths from its folder."""
     allow_unseen: bool = False
-    """Accept a model that has no height within the ground in view."""
+    """Whether to accept a model without a height in the ground in view."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
     """Columns of the catalogue."""
     rims: RimSource = "measured"
@@ -177,7 +177,7 @@ class TerrainConfig(Section):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing, in pixels: relative to the smallest ground size that a pixel has at each place."""
+    """Vertex spacing, as a multiple of the smallest ground size of a pixel at each place."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
     """Largest number of ground vertices of one mesh (about 450 bytes of memory each). If the ground needs more, each
     trajectory is rendered with several meshes, each for a band of altitudes; such ground may have ten times as many

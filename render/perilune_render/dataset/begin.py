@@ -1,4 +1,4 @@
-"""Begin a dataset that is rendered or developed, or resume it; who may write to it."""
+"""Begin or resume a dataset that is rendered or developed, and exclude other writers."""
 
 import contextlib
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
 
 
 def camera_records(mounted: MountedCamera) -> tuple[CameraRecord, CameraRecord]:
-    """What dataset.json records of a camera: the camera of the frames and that of the EXRs, with the mounting."""
+    """What dataset.json records of a camera: the camera of the frames, the camera of the EXRs, and the mounting."""
     x, y, z = mounted.position_in_body_m.tolist()
     mounting = mounted.rotation_camera_from_body, (x, y, z)
     return CameraRecord.of(mounted.camera, *mounting), CameraRecord.of(mounted.exr_camera, *mounting)
@@ -91,12 +91,12 @@ def is_begun(store: Store) -> bool:
 
 
 def _is_own(name: str) -> bool:
-    """Whether a name is of a file that may be there before dataset.json is."""
+    """Whether a file of this name may exist before dataset.json."""
     return name == FOLDER or name.startswith(LOCK_NAME) or TEMPORARY_FILE.fullmatch(name) is not None
 
 
 def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
-    """Write the dataset.json of a new dataset, or read that of an existing one with the same settings.
+    """Write the dataset.json of a new dataset, or read the dataset.json of an existing one with the same settings.
 
     Raises UserError if the address holds anything else.
     """
@@ -122,13 +122,13 @@ def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
 
 
 def open_finished(store: Store) -> Dataset:
-    """Open a complete dataset; remove what a run that was killed left below work/."""
+    """Open a complete dataset; remove files of a killed run below work/."""
     remove_work(store)
     return open_dataset(store)
 
 
 def check_code(recipe: Recipe, *, with_dem: bool) -> None:
-    """Raises UserError if code or libraries of this process are not those of a recipe."""
+    """Raise UserError if this process has other code or libraries than a recipe."""
     found = all_versions(
         with_dem=with_dem,
         engine=recipe.config.get("render", {}).get("engine", "cycles"),
@@ -146,7 +146,7 @@ def _compared(recipe: Recipe, name: str) -> object:
 
 
 def _without_releases(versions: dict[str, str]) -> dict[str, str]:
-    """Versions without perilune's release numbers, since hashes identify its code."""
+    """Versions without perilune's release numbers: hashes identify its code."""
     return {name: version for name, version in versions.items() if not name.startswith("perilune")}
 
 

@@ -66,7 +66,7 @@ class Renderings:
             return read_radiance(path, (self.camera.width_px, self.camera.height_px))
 
     def render_rows(self, poses: RowPoses, seed: int, approach_deg: int = 0) -> Radiance:
-        """Read the rendering of a random seed, whose rows have their own poses already."""
+        """Read the rendering of a random seed; its rows already have their own poses."""
         return self.render(*poses.pose_at(0.0), seed, approach_deg)
 
 
@@ -221,13 +221,13 @@ def _develop_trajectory(source: Dataset, out: Store, frame_source: FrameSource, 
         frame_id, frame = row["frame_id"], frame_source.take(recorded_shot(row, seed))
         written.append(dict(write_frame(out, frame_id, frame_source, frame, exr=False)))
         if known is None:
-            found = frame_source.labels(frame)
-            written[-1]["n_craters_above_max_radius"] = found.n_above
-            labels.append(tables.label_table(frame_id, found))
+            developed = frame_source.labels(frame)
+            written[-1]["n_craters_above_max_radius"] = developed.n_above
+            labels.append(tables.label_table(frame_id, developed))
         else:
-            own = known.filter(pc.equal(known["frame_id"], frame_id))
-            found = frame_source.with_contrast(Labels.from_table(own.to_pandas()), frame)
-            labels.append(with_column(own, "contrast", found.contrast))
+            of_frame = known.filter(pc.equal(known["frame_id"], frame_id))
+            developed = frame_source.with_contrast(Labels.from_table(of_frame.to_pandas()), frame)
+            labels.append(with_column(of_frame, "contrast", developed.contrast))
     rows = tables.developed_frame_table(frames, frame_source.camera, written)
     keys = {"scene_id": scene_id, "trajectory_id": trajectory_id}
     measurements = {name: source.table(name, **keys) for name in OPTIONAL_TABLES if source.parts(name)}

@@ -9,22 +9,29 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+import cv2
+import numpy as np
 import pyarrow as pa
 
 from perilune_render.dataset import work
-from perilune_render.dataset.overview import overview_png
+from perilune_render.labels.drawing import draw_labels, enlarge, padded, sheet_png
+from perilune_render.labels.frame_labels import Labels
 from perilune_shared.dataset.index import index_rows, scene_file_rows, seal
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.parts import Written
+from perilune_shared.dataset.parts import WrittenFile
 from perilune_shared.dataset.whole_tables import WholeTables
+from perilune_shared.labels.selection import selected
+from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_shared.storage.store import Store
 
 _OVERVIEW = "overview.png"
+_SHEET_FRAMES, _FRAMES_PER_CAMERA, _COLUMNS = 12, 3, 6
+"""Of the overview: frames, frames of each camera if there are several, and pictures in a row."""
 _AHEAD = 32
 """Number of reads in flight, since each request to an object store takes tens of milliseconds."""
-_Given = TypeVar("_Given")
-_Found = TypeVar("_Found")
+_Name = TypeVar("_Name")
+_Rows = TypeVar("_Rows")
 
 
 def finish(store: Store, info: DatasetInfo, scenes: Iterable[tuple[str, list[str]]]) -> Dataset:
@@ -39,14 +46,14 @@ def finish(store: Store, info: DatasetInfo, scenes: Iterable[tuple[str, list[str
             whole.add(table, part)
         files.append(scene_file_rows(rows["scenes"]))
         names = (f"{scene_id}.{trajectory_id}" for trajectory_id in trajectory_ids)
-        found = [each for _, each in _read_ahead(lambda name: work.trajectory_rows(store, name), names)]
+        finished = [each for _, each in _read_ahead(lambda name: work.trajectory_rows(store, name), names)]
         for table in work.OF_TRAJECTORY:
-            whole.add(table, pa.concat_tables([part[table] for part, _ in found]))
-        files += [own for _, own in found]
+            whole.add(table, pa.concat_tables([part[table] for part, _ in finished]))
+        files += [index for _, index in finished]
     written = whole.finish()
     picture = overview_png(Dataset(store, info))
     store.replace(_OVERVIEW, picture)
-    rows = pa.concat_tables([index_rows([*written, Written.of(_OVERVIEW, picture)]), *files])
+    rows = pa.concat_tables([index_rows([*written, WrittenFile.of(_OVERVIEW, picture)]), *files])
     seal(store, info.model_copy(update={"counts": whole.counts, "complete": True}), rows)
     remove_work(store)
     return open_dataset(store)
@@ -57,9 +64,9 @@ def remove_work(store: Store) -> None:
     store.delete_below(work.FOLDER)
 
 
-def _read_ahead(read: Callable[[_Given], _Found], given: Iterable[_Given]) -> Iterator[tuple[_Given, _Found]]:
+def _read_ahead(read: Callable[[_Name], _Rows], given: Iterable[_Name]) -> Iterator[tuple[_Name, _Rows]]:
     """Yield what `read` returns for each of `given`, in order; a few calls run at the same time."""
-    waiting: deque[tuple[_Given, Future[_Found]]] = deque()
+    waiting: deque[tuple[_Name, Future[_Rows]]] = deque()
     with ThreadPoolExecutor(_AHEAD) as readers:
         for each in given:
             waiting.append((each, readers.submit(read, each)))
@@ -68,3 +75,32 @@ def _read_ahead(read: Callable[[_Given], _Found], given: Iterable[_Given]) -> It
                 yield first, future.result()
         for first, future in waiting:
             yield first, future.result()
+
+
+def overview_png(dataset: Dataset) -> bytes:
+    """One picture of frames from the whole dataset, each also with its labels, visible ones in green.
+
+    Several cameras have a row each.
+    """
+    frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path", "camera"]).to_pandas()
+    if dataset.info.cameras is None:
+        chosen = [_spread(len(frames), _SHEET_FRAMES)]
+    else:
+        rows = [np.flatnonzero(frames["camera"] == name) for name in dataset.info.cameras]
+        chosen = [taken[_spread(len(taken), _FRAMES_PER_CAMERA)] for taken in rows]
+    pictures = []
+    for frame in frames.iloc[np.concatenate(chosen)].itertuples():
+        image = cv2.imdecode(np.frombuffer(dataset.store.read(frame.png_path), np.uint8), cv2.IMREAD_GRAYSCALE)
+        labels = dataset.table("labels", scene_id=frame.scene_id, trajectory_id=frame.trajectory_id).to_pandas()
+        craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=frame.scene_id).to_pandas()
+        labelled = labels[labels["frame_id"] == frame.frame_id].merge(craters, on="crater_id")
+        drawn = draw_labels(image, Labels.from_table(labelled), selected(labelled, SELECTIONS["visible"]))
+        pictures += [enlarge(image, 2), drawn]
+    if dataset.info.cameras is not None:
+        pictures = padded(pictures, [2 * len(taken) for taken in chosen], _COLUMNS)
+    return sheet_png(pictures, _COLUMNS)
+
+
+def _spread(n: int, n_chosen: int) -> np.ndarray:
+    """At most `n_chosen` indices, evenly spread over n."""
+    return np.unique(np.linspace(0, n - 1, n_chosen).astype(int)) if n else np.empty(0, int)

@@ -7,22 +7,22 @@ import numpy as np
 
 from perilune_render.engines.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import exr_bytes
-from perilune_render.outputs.of_scene import Beside
+from perilune_render.outputs.of_scene import FrameOutputs
 from perilune_shared.dataset.names import ImageKind, SceneFileKind, frame_path
 from perilune_shared.storage.store import Address, open_store
 
-NOTHING_BESIDE = Beside()
+NO_OUTPUTS = FrameOutputs()
 
 
 def write_frame(
-    out: Address, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool, beside: Beside = NOTHING_BESIDE
+    out: Address, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool, outputs: FrameOutputs = NO_OUTPUTS
 ) -> dict[str, str | int]:
     """Write a frame's PNG, with `exr` its EXR, and the file of its flash lidar if there is one.
 
     Returns the columns png_*, exr_* and lidar_* of the manifest. Does not wait until the files are on the disk.
     """
     store, columns = open_store(out), dict[str, str | int]()
-    for kind, content in frame_contents(source, frame, exr=exr, beside=beside).items():
+    for kind, content in frame_contents(source, frame, exr=exr, outputs=outputs).items():
         path = frame_path(frame_id, kind)
         store.replace(path, content, durable=False)
         columns |= file_columns(kind, path, content)
@@ -30,14 +30,14 @@ def write_frame(
 
 
 def frame_contents(
-    source: FrameSource, frame: Frame, *, exr: bool, beside: Beside = NOTHING_BESIDE
+    source: FrameSource, frame: Frame, *, exr: bool, outputs: FrameOutputs = NO_OUTPUTS
 ) -> dict[ImageKind, bytes]:
     """The content of a frame's PNG, with `exr` of its EXR, and of its flash lidar if there is one."""
     contents: dict[ImageKind, bytes] = {"png": png_bytes(frame.image, source.sensor.bits)}
     if exr:
-        contents["exr"] = exr_bytes(frame.radiance, source.crater_index(frame), beside.channels)
-    if beside.lidar is not None:
-        contents["lidar"] = beside.lidar
+        contents["exr"] = exr_bytes(frame.radiance, source.crater_index(frame), outputs.channels)
+    if outputs.lidar is not None:
+        contents["lidar"] = outputs.lidar
     return contents
 
 

@@ -63,27 +63,28 @@ def plan_from_manifest(
     recorded = Recorded.of(manifest, [scene.scene_id for scene in scenes], config.kind(recipe.kind).flight, rig)
     rig = _rig_of_frames(manifest, rig)
     of_scene = [row["scene_id"] for row in recorded.rows]
-    places = {
+    ranges = {
         scene.scene_id: range(bisect_left(of_scene, scene.scene_id), bisect_right(of_scene, scene.scene_id))
         for scene in scenes
     }
-    plan = Plan(rig, view, tuple(scenes), recorded, places)
+    plan = Plan(rig, view, tuple(scenes), recorded, ranges)
     begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)
 
 
 def _rig_of_frames(manifest: Dataset, rig: Rig) -> Rig:
-    """The cameras of a rig that a manifest has frames of. Raises UserError if it records others."""
+    """The cameras of a rig for which a manifest has frames. Raises UserError if it records others."""
     info, where = manifest.info, manifest.store.at("dataset.json")
     names = set(manifest.table("frames", ["camera"])["camera"].unique().to_pylist())
     if not names <= rig.keys():
-        raise UserError(where, "cameras", sorted(map(str, names)), f"those of its recipe, {sorted(map(str, rig))}")
-    own = {name: each for name, each in rig.items() if name in names}
-    for name, each in own.items():
+        expected = f"the cameras of its recipe, {sorted(map(str, rig))}"
+        raise UserError(where, "cameras", sorted(map(str, names)), expected)
+    used = {name: each for name, each in rig.items() if name in names}
+    for name, each in used.items():
         if (recorded := info.camera_of(name)) != camera_records(each)[0]:
-            raise UserError(where, "camera", recorded, f"that of its recipe, {camera_records(each)[0]}")
-    return own or rig
+            raise UserError(where, "camera", recorded, f"the camera of its recipe, {camera_records(each)[0]}")
+    return used or rig
 
 
 def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
@@ -130,9 +131,9 @@ class Recorded(Sequence[TrajectoryPlan]):
         if trajectories.num_rows and not frames.num_rows:
             expected = "its frames: write the whole manifest with `perilune-render plan --manifest ... --out FOLDER`"
             raise UserError(manifest.store.at("manifest/frames"), "frames", "none: they were left out", expected)
-        place = pc.fill_null(pc.index_in(of_frames, names), -1).to_numpy()
-        order = np.lexsort((frames["frame_index"].to_numpy(), place))[np.count_nonzero(place < 0) :]
-        first = np.concatenate([[0], np.cumsum(np.bincount(place[order], minlength=len(names)))])
+        position = pc.fill_null(pc.index_in(of_frames, names), -1).to_numpy()
+        order = np.lexsort((frames["frame_index"].to_numpy(), position))[np.count_nonzero(position < 0) :]
+        first = np.concatenate([[0], np.cumsum(np.bincount(position[order], minlength=len(names)))])
         columns = {name: _values(frames[name])[order] for name in _OF_FRAMES}
         turn = [frames[name] for name in ANGULAR_VELOCITY]
         if any(each.null_count < len(each) for each in turn):
@@ -142,13 +143,13 @@ class Recorded(Sequence[TrajectoryPlan]):
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __getitem__(self, place: Any) -> Any:
-        """The trajectory at an index, or a tuple of those in a slice."""
-        if isinstance(place, slice):
-            return tuple(self[k] for k in range(*place.indices(len(self))))
-        place = range(len(self))[place]
-        row, own = self.rows[place], slice(self.first[place], self.first[place + 1])
-        columns = {name: values[own] for name, values in self.columns.items()}
+    def __getitem__(self, number: Any) -> Any:
+        """The trajectory at an index, or the trajectories of a slice as a tuple."""
+        if isinstance(number, slice):
+            return tuple(self[k] for k in range(*number.indices(len(self))))
+        number = range(len(self))[number]
+        row, frames = self.rows[number], slice(self.first[number], self.first[number + 1])
+        columns = {name: values[frames] for name, values in self.columns.items()}
         cameras = columns.pop("camera")
         camera = cameras[0] if len(cameras) and isinstance(cameras[0], str) else None
         flight = partial(_flight, row, columns, self.settings, self.rig.get(camera))
@@ -169,7 +170,7 @@ def _flight(
 ) -> Flight:
     """The flight of a row of the table `trajectories` and the columns of its frames.
 
-    Its motion is that of the recorded seed, unless a position differs: then it was not drawn, or with other settings.
+    Its motion follows from the recorded seed, unless a position differs: then it was not drawn, or with other settings.
     """
     position, velocity, acceleration = (
         tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
@@ -191,7 +192,7 @@ def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamer
 
 
 def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
-    """Numbers of frames with equal hashes, of frames with a hash in the manifest, and of scenes with other ground."""
+    """Numbers of frames with equal hashes, frames with a hash in the manifest, and scenes with other ground."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))
         for d in (manifest, made)

@@ -25,12 +25,12 @@ def real_ground_share(
     if not hit.any() or not scene.real.any():
         return 0.0
     seen = camera.rays(camera.pixel_centres()[hit]) * depth_m[hit][:, None]
-    place = seen @ rotation_camera_from_site + position_m
-    return float((value_at(scene.real, scene.grid, place[:, 0], place[:, 1]) > 0.5).mean())
+    ground = seen @ rotation_camera_from_site + position_m
+    return float((value_at(scene.real, scene.grid, ground[:, 0], ground[:, 1]) > 0.5).mean())
 
 
 def outline_m(model: ElevationModel) -> Array:
-    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres; without those off the map."""
+    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres; points off the map omitted."""
     rows, columns = model.height_m.shape
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns

@@ -4,7 +4,7 @@ On every processor with AVX2 and FMA a frame is identical byte for byte. On othe
 the ground and so change single pixels: frames are then compared within a tolerance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines.frame_source import FrameSource
 from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.pose_checks import Poses, check_poses
-from perilune_render.flight.rig import rig_of
+from perilune_render.flight.rig import Rig, rig_of
 from perilune_render.flight.view import view_of
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import local_exr, read_exr
@@ -68,7 +68,7 @@ class Outcome:
     lidar: State | None
     """The same comparison for the flash lidar; None if the frame has none."""
     same_ground: bool
-    """Whether the content hash of craters and boulders equals that of the scene's row."""
+    """Whether the content hash of craters and boulders equals the hash in the scene's row."""
     png_path: str
     """Address of the new PNG."""
 
@@ -105,10 +105,11 @@ def regenerate(
     outcomes = []
     with nullcontext() if store.folder is None else locked(store.folder):
         for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
-            own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id").to_pylist()
-            if own:
+            rows = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id").to_pylist()
+            if rows:
                 progress.update(task, note=f"{scene['scene_id']}: generating ground")
-                outcomes += _of_scene(dataset, scene, own, store, dem, catalogue, lambda: progress.advance(task))
+                sources = _Sources(dem, catalogue)
+                outcomes += _of_scene(dataset, scene, rows, store, sources, lambda: progress.advance(task))
     return outcomes
 
 
@@ -118,55 +119,55 @@ def spread(dataset: Dataset, n_frames: int) -> list[str]:
     return [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(n_frames, len(ids))).round().astype(int))]
 
 
+@dataclass(frozen=True, slots=True)
+class _Sources:
+    """The user's copies of the files that a recipe names."""
+
+    dem: Path | None
+    """Elevation model; None if the recipe names none."""
+    catalogue: Path | None
+    """Crater catalogue; None if the recipe names none."""
+
+
 def _of_scene(
-    dataset: Dataset, scene: dict, rows: list[dict], out: Store, dem: Path | None, catalogue: Path | None, advance
+    dataset: Dataset, scene: dict, rows: list[dict], out: Store, sources: _Sources, advance: Callable[[], object]
 ) -> list[Outcome]:
+    """Regenerate the frames `rows` of a scene into `out`; `advance` is called after each."""
     where = dataset.store.at("dataset.json")
     recipe = dataset.info.recipes.get(scene["recipe"])
     if recipe is None:
         raise UserError(where, "recipes", f"no {scene['recipe']}", f"the recipe of {scene['scene_id']}")
-    columns = ["trajectory_id", "seed", "nominal_position_m"]
-    recorded = dataset.table("trajectories", columns, scene_id=scene["scene_id"]).to_pylist()
-    trajectories = {row["trajectory_id"]: row for row in recorded}
-    for row in rows:
-        if row["trajectory_id"] not in trajectories:
-            raise UserError(dataset.store, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
-    config = config_of(recipe, where, dem, catalogue)
+    trajectories = _trajectories(dataset, scene["scene_id"], rows)
+    config = config_of(recipe, where, sources.dem, sources.catalogue)
     ground_config = _ground_config(recipe, config, where)
     rig, exr_rig = rig_of(config), rig_of(ground_config)
-    view = view_of(ground_config, exr_rig, recipe.kind)
-    for row in rows:
-        if row["camera"] not in rig:
-            raise UserError(where, "cameras", row["camera"], f"one of its recipe, {', '.join(map(str, rig))}")
-        if rig[row["camera"]].camera != dataset.camera_of(row):
-            found = dataset.camera_of(row)
-            raise UserError(where, "camera", found, f"that of its recipe, {rig[row['camera']].camera}")
     check_installed(ground_config.render.engine)
+    _check_cameras(dataset, rows, rig)
     with interrupts_held():
-        ground = cached_scene(ground_config, view, scene["seed"])
+        ground = cached_scene(ground_config, view_of(ground_config, exr_rig, recipe.kind), scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
-    of_camera = {name: own for name in rig if (own := [row for row in rows if row["camera"] == name])}
-    for name, own in of_camera.items():
-        poses = (np.array([row[column] for row in own]) for column in ("position_m", "rotation_wxyz"))
-        ids = [row["frame_id"] for row in own]
+    of_camera = {name: taken for name in rig if (taken := [row for row in rows if row["camera"] == name])}
+    for name, taken in of_camera.items():
+        poses = (np.array([row[column] for row in taken]) for column in ("position_m", "rotation_wxyz"))
+        ids = [row["frame_id"] for row in taken]
         check_poses(Poses(ids, *poses), exr_rig[name].exr_camera, ground, dataset.store)
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     outcomes, dark = [], []
     circles, sun = RimCircles.of_scene(ground), np.array(rows[0]["sun_direction"])
     outputs = SceneOutputs.of(ground, _wanted(config, rows), sun)
-    for name, own in of_camera.items():
+    for name, taken in of_camera.items():
         with open_engine(ground, ground_config, exr_rig[name].exr_camera, sun, outputs.surface) as engine:
             source = FrameSource.of(engine, config, rig[name].camera, circles, name)
-            for row in own:
+            for row in taken:
                 frame_id, trajectory = row["frame_id"], trajectories[row["trajectory_id"]]
                 approach = approach_deg(trajectory["nominal_position_m"])
                 frame = source.take(recorded_shot(row, trajectory["seed"], approach))
                 # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
                 has_exr = row["exr_path"] is not None
-                beside = outputs.beside(frame, source.places_m)
-                new = write_frame(out, frame_id, source, frame, exr=has_exr, beside=beside)
+                extra = outputs.of_frame(frame, source.places_m)
+                new = write_frame(out, frame_id, source, frame, exr=has_exr, outputs=extra)
                 png = _compared(dataset, row, "png", out, new)
                 exr = _compared(dataset, row, "exr", out, new) if has_exr else None
                 lidar = _compared(dataset, row, "lidar", out, new) if row["lidar_path"] is not None else None
@@ -178,8 +179,31 @@ def _of_scene(
     return outcomes
 
 
+def _trajectories(dataset: Dataset, scene_id: str, rows: list[dict]) -> dict[str, dict]:
+    """Rows of the trajectories of a scene by their ids. Raises UserError if a frame of `rows` has none."""
+    columns = ["trajectory_id", "seed", "nominal_position_m"]
+    recorded = dataset.table("trajectories", columns, scene_id=scene_id).to_pylist()
+    trajectories = {row["trajectory_id"]: row for row in recorded}
+    for row in rows:
+        if row["trajectory_id"] not in trajectories:
+            expected = f"the trajectory of {row['frame_id']}"
+            raise UserError(dataset.store, "trajectories", f"no {row['trajectory_id']}", expected)
+    return trajectories
+
+
+def _check_cameras(dataset: Dataset, rows: list[dict], rig: Rig) -> None:
+    """Raise UserError if the recorded camera of a frame is not its recipe's."""
+    where = dataset.store.at("dataset.json")
+    for row in rows:
+        if row["camera"] not in rig:
+            raise UserError(where, "cameras", row["camera"], f"one of its recipe, {', '.join(map(str, rig))}")
+        recorded, expected = dataset.camera_of(row), rig[row["camera"]].camera
+        if recorded != expected:
+            raise UserError(where, "camera", recorded, f"the camera of its recipe, {expected}")
+
+
 def _wanted(config: DatasetConfig, rows: list[dict]) -> DatasetConfig:
-    """The settings without outputs that the rows of a scene's frames do not have."""
+    """The settings, without the outputs that no frame of `rows` has."""
     has_exrs, has_lidar = (any(row[f"{kind}_path"] is not None for row in rows) for kind in ("exr", "lidar"))
     channels = config.hazard is not None and config.hazard.frame_channels and has_exrs
     hazard, lidar = config.hazard if channels else None, config.flash_lidar if has_lidar else None
@@ -232,11 +256,11 @@ def png_outlier_share(first: bytes, second: bytes) -> float:
             return 1.0
     except ValueError:
         return 1.0
-    one, two = (cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) for png in (first, second))
-    if one is None or two is None or one.shape != two.shape or one.dtype != two.dtype:
+    old, new = (cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) for png in (first, second))
+    if old is None or new is None or old.shape != new.shape or old.dtype != new.dtype:
         return 1.0
-    scale = 255 / np.iinfo(one.dtype).max
-    return float((np.abs(one.astype(float) - two) * scale > GREY_TOLERANCE).mean())
+    scale = 255 / np.iinfo(old.dtype).max
+    return float((np.abs(old.astype(float) - new) * scale > GREY_TOLERANCE).mean())
 
 
 def exr_outlier_share(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
@@ -244,7 +268,7 @@ def exr_outlier_share(first: dict[str, np.ndarray], second: dict[str, np.ndarray
     if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
         return 1.0
     shares = []
-    for name, one in first.items():
-        close = np.isclose(one, second[name], rtol=RELATIVE_TOLERANCE, atol=RELATIVE_TOLERANCE, equal_nan=True)
+    for name, channel in first.items():
+        close = np.isclose(channel, second[name], rtol=RELATIVE_TOLERANCE, atol=RELATIVE_TOLERANCE, equal_nan=True)
         shares.append(1 - float(close.mean()))
     return max(shares, default=1.0)

@@ -11,18 +11,18 @@ from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.frames import matrix_from_quaternion
 
 
-def planned_shot(trajectory: TrajectoryPlan, place: int) -> Shot:
-    """The shot of the frame at index `place` of a planned trajectory's frames."""
+def planned_shot(trajectory: TrajectoryPlan, index: int) -> Shot:
+    """The shot of a planned trajectory's frame, by its index in the trajectory."""
     flight = trajectory.flight
     turn = flight.angular_velocity_radps
     return Shot(
-        flight.position_m[place],
-        flight.rotation_camera_from_site[place],
-        flight.velocity_mps[place],
+        flight.position_m[index],
+        flight.rotation_camera_from_site[index],
+        flight.velocity_mps[index],
         camera_seed(trajectory.seed, trajectory.camera),
-        trajectory.frame_index[place],
+        trajectory.frame_index[index],
         flight.nominal.approach_deg,
-        np.zeros(3) if turn is None else turn[place],
+        np.zeros(3) if turn is None else turn[index],
     )
 
 

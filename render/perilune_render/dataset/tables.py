@@ -5,8 +5,7 @@ import pyarrow as pa
 from numpy.typing import ArrayLike
 
 from perilune_render.config.dataset import DatasetConfig, InstrumentsConfig
-from perilune_render.flight.altimeter import measure_ranges, measure_ranges_of_frames
-from perilune_render.flight.inertial import measured, true_increments
+from perilune_render.flight.instruments import measure_ranges, measure_ranges_of_frames, measured, true_increments
 from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
 from perilune_render.labels.frame_labels import Labels
 from perilune_render.terrain.craters.population import ORIGINS
@@ -130,7 +129,7 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory; `files`: columns of files and measurements of each frame."""
+    """Part of the table `frames` for one trajectory; `files` has each frame's columns of files and measurements."""
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
@@ -155,9 +154,10 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
 def measurement_tables(
     trajectory: TrajectoryPlan, scene: Scene, config: InstrumentsConfig, *, at_frames: bool
 ) -> dict[str, pa.Table]:
-    """Parts of the tables `inertial` and `ranges` for one trajectory: those that have rows.
+    """Parts of the tables `inertial` and `ranges` for one trajectory, without empty parts.
 
-    If the motion between the frames is not known, there are none, or with `at_frames` a range for each frame.
+    Without a known motion between the frames there are no measurements; with `at_frames` there is a range for each
+    frame.
     """
     motion = trajectory.flight.motion
 
@@ -193,7 +193,7 @@ def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) ->
 
 
 def label_table(frame_id: str, labels: Labels) -> pa.Table:
-    """Rows of the table `labels` for one frame, without the columns that repeat those of the frame."""
+    """Rows of the table `labels` for one frame, without the columns that repeat columns of the frame."""
     e, boxes = labels.ellipses, labels.ellipses.bounding_boxes()
     return _columns(
         "labels",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pyarrow as pa
 
@@ -20,12 +20,24 @@ from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.terrain.scene import Scene
 from perilune_shared.storage.store import Store
 
-NO_OUTPUTS = SceneOutputs()
+
+@dataclass(frozen=True, slots=True)
+class SceneSetting:
+    """What all trajectories of a scene share."""
+
+    scene: Scene
+    """Ground, craters and boulders."""
+    config: DatasetConfig
+    """Settings of the dataset."""
+    instruments: InstrumentsConfig
+    """Instruments on the lander."""
+    outputs: SceneOutputs = field(default_factory=SceneOutputs)
+    """Outputs beside the frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """What remains of a frame once its files are written."""
+    """Rows of a frame whose files are written."""
 
     row: dict[str, str | int | float | None]
     """Columns of its files and measurements in the table `frames`."""
@@ -39,53 +51,45 @@ def render_trajectory(
     out: Store,
     source: FrameSource,
     trajectory: TrajectoryPlan,
-    scene: Scene,
-    config: DatasetConfig,
-    instruments: InstrumentsConfig,
+    of_scene: SceneSetting,
     advance: Callable[[], object] = lambda: None,
-    outputs: SceneOutputs = NO_OUTPUTS,
 ) -> list[str]:
-    """Render and write one trajectory of `scene` into the dataset at `out`; returns the ids of its dark frames.
+    """Render and write one trajectory into the dataset at `out`; returns the ids of its dark frames.
 
-    `source` renders the scene, `outputs` makes what there is beside the frames. A second thread develops, labels and
-    writes each frame while the next one is rendered. `advance` is called after each frame, in order. The same arguments
-    give the same bytes; a trajectory whose rendering was interrupted is rendered from its start.
+    `source` renders the scene. A second thread develops, labels and writes each frame while the next one is rendered.
+    `advance` is called after each frame, in order. The same arguments give the same bytes; a trajectory whose rendering
+    was interrupted is rendered from its start.
     """
     frames: list[_Written] = []
-    for frame in _frames(out, source, trajectory, scene, config, outputs):
+    for frame in _frames(out, source, trajectory, of_scene):
         frames.append(frame)
         advance()
     rows = tables.frame_table(trajectory, source.camera, source.engine.sun, [frame.row for frame in frames])
     labels = [frame.labels for frame in frames]
-    measured = tables.measurement_tables(trajectory, scene, instruments, at_frames=config.scene is not None)
+    given = of_scene.config.scene is not None
+    measured = tables.measurement_tables(trajectory, of_scene.scene, of_scene.instruments, at_frames=given)
     commit(out, labels, rows, measured)
-    return [trajectory.frame_id(place) for place, frame in enumerate(frames) if frame.is_dark]
+    return [trajectory.frame_id(index) for index, frame in enumerate(frames) if frame.is_dark]
 
 
-def _frames(
-    out: Store,
-    source: FrameSource,
-    trajectory: TrajectoryPlan,
-    scene: Scene,
-    config: DatasetConfig,
-    outputs: SceneOutputs,
-) -> Iterator[_Written]:
+def _frames(out: Store, source: FrameSource, trajectory: TrajectoryPlan, of_scene: SceneSetting) -> Iterator[_Written]:
     """Render and write the frames of a trajectory, in order; rendering is one frame ahead of writing."""
 
-    def written(place: int, shot: Shot, radiance: Radiance) -> _Written:
+    def written(index: int, shot: Shot, radiance: Radiance) -> _Written:
         frame = source.develop(shot, radiance)
-        beside = outputs.beside(frame, source.places_m)
-        files = write_frame(out, trajectory.frame_id(place), source, frame, exr=config.render.exr, beside=beside)
-        return _labelled(trajectory.frame_id(place), files, source, frame, scene)
+        outputs = of_scene.outputs.of_frame(frame, source.places_m)
+        frame_id = trajectory.frame_id(index)
+        files = write_frame(out, frame_id, source, frame, exr=of_scene.config.render.exr, outputs=outputs)
+        return _labelled(frame_id, files, source, frame, of_scene.scene)
 
     with ThreadPoolExecutor(1, "develop") as developer:
         last: Future[_Written] | None = None
-        for place in range(len(trajectory.splits)):
-            shot = planned_shot(trajectory, place)
+        for index in range(len(trajectory.splits)):
+            shot = planned_shot(trajectory, index)
             radiance = source.render(shot)
             if last is not None:
                 yield last.result()
-            last = developer.submit(written, place, shot, radiance)
+            last = developer.submit(written, index, shot, radiance)
         if last is not None:
             yield last.result()
 
@@ -93,6 +97,6 @@ def _frames(
 def _labelled(frame_id: str, files: dict[str, str | int], source: FrameSource, frame: Frame, scene: Scene) -> _Written:
     """Label a frame whose files are written; `files` are their columns."""
     share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
-    found = source.labels(frame)
-    row = {**files, "real_ground_share": share, "n_craters_above_max_radius": found.n_above}
-    return _Written(row, tables.label_table(frame_id, found), is_dark(frame.radiance))
+    labels = source.labels(frame)
+    row = {**files, "real_ground_share": share, "n_craters_above_max_radius": labels.n_above}
+    return _Written(row, tables.label_table(frame_id, labels), is_dark(frame.radiance))

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from perilune_shared.dataset.index import INDEX, frame_rows, index_rows
 from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.names import stem_of
-from perilune_shared.dataset.parts import Part, Written
+from perilune_shared.dataset.parts import Part, WrittenFile
 from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, stored
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Store
@@ -38,7 +38,8 @@ def committed(store: Store) -> set[str]:
 def commit(store: Store, labels: list[pa.Table], frames: pa.Table, measurements: Mapping[str, pa.Table]) -> None:
     """Write the rows of a trajectory whose files are written, then its commit.
 
-    `labels` holds the labels of each frame, `frames` the rows of all frames, `measurements` those of optional tables.
+    `labels` holds the labels of each frame, `frames` the rows of all frames, `measurements` the rows of optional
+    tables.
     """
     name = ".".join(frames[key][0].as_py() for key in ("scene_id", "trajectory_id"))
     tables = {"frames": frames, "labels": with_frame_columns(pa.concat_tables(labels), frames), **measurements}
@@ -74,9 +75,9 @@ def scene_rows(store: Store, scene_id: str) -> dict[str, pa.Table]:
 
 
 def trajectory_rows(store: Store, name: str) -> tuple[dict[str, pa.Table], pa.Table]:
-    """The rows of a finished trajectory by table, and those of its frames' files in the index.
+    """The rows of a finished trajectory by table, and the rows of its frames' files in the index.
 
-    Raises UserError if its rows are not those of its commit.
+    Raises UserError if its rows differ from its commit.
     """
     committed = Part(store, _path("index", name), "index", INDEX).read()
     n_tables = sum(path.startswith(f"{FOLDER}/") for path in committed["path"].to_pylist())
@@ -100,11 +101,11 @@ def _path(table: str, name: str) -> str:
     return f"{FOLDER}/{table}/{name}.parquet"
 
 
-def _write(store: Store, table: str, name: str, rows: pa.Table) -> Written:
+def _write(store: Store, table: str, name: str, rows: pa.Table) -> WrittenFile:
     """Write rows of a table; does not wait until they are on the disk."""
     content = _parquet(stored(table, rows))
     store.replace(_path(table, name), content, durable=False)
-    return Written.of(_path(table, name), content)
+    return WrittenFile.of(_path(table, name), content)
 
 
 def _parquet(rows: pa.Table) -> bytes:

@@ -18,7 +18,7 @@ from perilune_render.flight.sub_poses import Pose, RowPoses, moved, row_times_s,
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import seen_by
 from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out, time_of_exposure_s
-from perilune_render.labels.frame_labels import Labels, RimCircles, Shown, crater_index, label_frame, with_contrast
+from perilune_render.labels.frame_labels import GreyAndSun, Labels, RimCircles, crater_index, label_frame, with_contrast
 from perilune_render.streams import camera_seed, derived_seed, stream
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
@@ -27,7 +27,7 @@ from perilune_shared.geometry.rolling_shutter import Moving
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Pose, velocity and random seed of one frame. The pose is that of the middle of its middle row's exposure."""
+    """Pose, velocity and random seed of one frame. The pose refers to the middle of the exposure of the middle row."""
 
     position_m: Array
     """Position of the camera, O_L, metres (3,)."""
@@ -119,9 +119,9 @@ class FrameSource:
     def of(
         cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles, name: str | None = None
     ) -> "FrameSource":
-        """The source with a configuration's sensor and label limits; the configuration's seed draws the fixed pattern.
+        """The source with a configuration's sensor and label limits. Its seed determines the fixed pattern.
 
-        `name` is that of the camera, one of several on a body: each has a fixed pattern of its own. Raises ValueError
+        `name` is the name of the camera if there are several: each has its own fixed pattern. Raises ValueError
         if the engine's camera does not cover the view of `camera`.
         """
         if not engine.camera.covers(camera):
@@ -189,11 +189,11 @@ class FrameSource:
         seen = seen_by(frame.radiance, self.camera, self.engine.camera)
         limits = self.bounds.bounds_px(self.camera.width_px)
         circles = self._seen_circles(frame.shot)
-        return self.with_contrast(label_frame(circles, self.camera, *frame.shot.pose, seen, *limits), frame)
+        return self.with_contrast(label_frame(circles, self.camera, *frame.shot.pose, seen, limits), frame)
 
     def with_contrast(self, labels: Labels, frame: Frame) -> Labels:
         """Labels of a frame with their contrast in its exposure."""
-        shown = Shown(*expected(frame.exposure, self.sensor), self.engine.sun)
+        shown = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
         return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, shown)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
@@ -202,7 +202,7 @@ class FrameSource:
         return crater_index(circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
 
     def _seen_circles(self, shot: Shot) -> RimCircles:
-        """The rims moved to where the pose of the shot sees them as the row of each one's centre does."""
+        """The rims, moved so that the shot's pose sees each as the pose of the row of its centre does."""
         if not self._rolls(shot):
             return self.circles
         moving = Moving(*(each[None] for each in (*shot.pose, shot.velocity_mps, shot.angular_velocity_radps)))

@@ -42,7 +42,7 @@ def open_engine(
 
 
 def load_engine(name: str) -> None:
-    """Import the libraries of an engine before there is a scene. `open_engine` reports one that is missing."""
+    """Import the libraries of an engine before a scene exists. `open_engine` reports a missing library."""
     with contextlib.suppress(ImportError):
         if name == "heightfield":
             import perilune_render.engines.heightfield.engine

@@ -42,48 +42,48 @@ _N_SIZES, _N_DEPTHS = 3, 2
 
 
 def part_of(plan: Plan, split: str, n_frames: int, sun_azimuth_offset_deg: float = 0.0) -> Plan:
-    """At most `n_frames` frames of each trajectory, evenly spaced over those of one split, under a turned Sun.
+    """At most `n_frames` frames of each trajectory, evenly spaced over the frames of one split, under a turned Sun.
 
-    Frames keep their ids, poses and random seeds. Trajectories and scenes without frames in the split are left out.
+    Frames keep their ids, poses and random seeds. Trajectories and scenes without frames in the split are omitted.
     Raises UserError if no frame is in the split.
     """
     trajectories: list[TrajectoryPlan] = []
-    places: dict[str, range] = {}
+    ranges: dict[str, range] = {}
     for scene in plan.scenes:
         first = len(trajectories)
         trajectories += [part for each in plan.of_scene(scene.scene_id) if (part := _part(each, split, n_frames))]
         if len(trajectories) > first:
-            places[scene.scene_id] = range(first, len(trajectories))
-    if not places:
+            ranges[scene.scene_id] = range(first, len(trajectories))
+    if not ranges:
         raise UserError("--split", "frames", f"none in {split}", "a split that has frames")
     scenes = tuple(
         replace(scene, sun_azimuth_deg=(scene.sun_azimuth_deg + sun_azimuth_offset_deg) % 360)
         for scene in plan.scenes
-        if scene.scene_id in places
+        if scene.scene_id in ranges
     )
-    return replace(plan, scenes=scenes, trajectories=tuple(trajectories), places=places)
+    return replace(plan, scenes=scenes, trajectories=tuple(trajectories), ranges=ranges)
 
 
 def _part(trajectory: TrajectoryPlan, split: str, n_frames: int) -> TrajectoryPlan | None:
-    """Some frames of a trajectory, or None if none is in the split."""
-    own = np.flatnonzero(np.array(trajectory.splits) == split)
-    if not len(own):
+    """Some frames of a trajectory, or None if no frame is in the split."""
+    in_split = np.flatnonzero(np.array(trajectory.splits) == split)
+    if not len(in_split):
         return None
-    chosen = own[np.unique(np.linspace(0, len(own) - 1, min(n_frames, len(own))).round().astype(int))]
-    index = tuple(trajectory.frame_index[place] for place in chosen)
+    chosen = in_split[np.unique(np.linspace(0, len(in_split) - 1, min(n_frames, len(in_split))).round().astype(int))]
+    index = tuple(trajectory.frame_index[number] for number in chosen)
     splits = (split,) * len(chosen)
     return replace(trajectory, frame_index=index, splits=splits, draw_flight=partial(_flight, trajectory, chosen))
 
 
-def _flight(trajectory: TrajectoryPlan, places: np.ndarray) -> Flight:
+def _flight(trajectory: TrajectoryPlan, indices: np.ndarray) -> Flight:
     """The flight of a trajectory with the poses of some of its frames."""
     whole = trajectory.flight
     return replace(
         whole,
-        time_s=whole.time_s[places],
-        position_m=whole.position_m[places],
-        velocity_mps=whole.velocity_mps[places],
-        rotation_wxyz=whole.rotation_wxyz[places],
+        time_s=whole.time_s[indices],
+        position_m=whole.position_m[indices],
+        velocity_mps=whole.velocity_mps[indices],
+        rotation_wxyz=whole.rotation_wxyz[indices],
     )
 
 
@@ -95,14 +95,14 @@ def craters_to_remove(manifest: Dataset, plan: Plan, per_scene: int, seed: int) 
     `seed`. The reaches of two craters do not overlap. Craters of an elevation model are never removed. Raises UserError
     if the manifest has no labels.
     """
-    found = [pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in REMOVED_COLUMNS.items()})]
+    removed = [pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in REMOVED_COLUMNS.items()})]
     if per_scene > 0:
         candidates = _candidates(manifest, plan)
         for scene in plan.scenes:
-            own = candidates[candidates["scene_id"] == scene.scene_id].assign(seed=scene.seed)
-            rows = choose_apart(own, per_scene, stream(seed, "counterfactual", scene.seed))
-            found.append(own.iloc[np.sort(rows)][list(REMOVED_COLUMNS)])
-    return pd.concat(found[1:] or found, ignore_index=True).astype(REMOVED_COLUMNS)
+            in_scene = candidates[candidates["scene_id"] == scene.scene_id].assign(seed=scene.seed)
+            rows = choose_apart(in_scene, per_scene, stream(seed, "counterfactual", scene.seed))
+            removed.append(in_scene.iloc[np.sort(rows)][list(REMOVED_COLUMNS)])
+    return pd.concat(removed[1:] or removed, ignore_index=True).astype(REMOVED_COLUMNS)
 
 
 def _candidates(manifest: Dataset, plan: Plan) -> pd.DataFrame:
@@ -111,7 +111,7 @@ def _candidates(manifest: Dataset, plan: Plan) -> pd.DataFrame:
     if not len(labels):
         expected = "a rendered dataset or its manifest, or --craters-per-scene 0"
         raise UserError(manifest.store, "labels", "none, as in a plan", expected)
-    planned = {each.frame_id(place) for each in plan.trajectories for place in range(len(each.splits))}
+    planned = {each.frame_id(index) for each in plan.trajectories for index in range(len(each.splits))}
     labels = labels[selected(labels, SELECTIONS["visible"]) & labels["frame_id"].isin(planned)]
     keys = ["scene_id", "crater_id"]
     seen = labels.groupby(keys).agg(
@@ -141,9 +141,9 @@ def choose_apart(candidates: pd.DataFrame, n: int, rng: np.random.Generator) -> 
     x, y, reach = (candidates[name].to_numpy() for name in ("x_m", "y_m", "reach_m"))
     chosen: list[int] = []
     while any(waiting) and len(chosen) < n:
-        for own in waiting:
-            while own and len(chosen) < n:
-                k = own.pop()
+        for group in waiting:
+            while group and len(chosen) < n:
+                k = group.pop()
                 if (np.hypot(x[chosen] - x[k], y[chosen] - y[k]) >= reach[chosen] + reach[k]).all():
                     chosen.append(k)
                     break
@@ -154,8 +154,8 @@ def _classes(diameter_m: np.ndarray, depth_ratio: np.ndarray) -> np.ndarray:
     """Class (N,) of each crater: equally many of each class of diameter, and in it of each class of depth ratio."""
     classes = _N_DEPTHS * _ranked(diameter_m, _N_SIZES)
     for size in np.unique(classes):
-        own = classes == size
-        classes[own] += _ranked(depth_ratio[own], _N_DEPTHS)
+        in_class = classes == size
+        classes[in_class] += _ranked(depth_ratio[in_class], _N_DEPTHS)
     return classes
 
 

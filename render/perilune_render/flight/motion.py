@@ -3,18 +3,54 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from perilune_render.config.dataset import FlightConfig
-from perilune_render.flight.smooth_process import SmoothProcess
 from perilune_render.streams import stream
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
+_N_WAVES = 256
+"""Random waves of each smooth process."""
 _MOST_DRAWS = 1000
 _STEP = 2 * np.pi / 20
 """Step at which the acceleration of a draw is checked, radians of its fastest wave."""
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothProcess:
+    """A draw of K independent stationary processes of unit variance with the kernel exp(-dt^2 / (2 tau^2)).
+
+    It is a sum of random waves (random Fourier features, Rahimi & Recht 2007), 256 for each process. Unlike samples
+    from a Cholesky factor it is smooth at any frame rate, and its derivatives are exact. With the finite number of
+    waves the variance of one draw is within about 5 % of the kernel's.
+    """
+
+    omega_radps: Array
+    """Angular frequencies of the waves (K, 256), radians per second."""
+    amplitude: Array
+    """Amplitudes of cosines and sines (2, K, 256)."""
+
+    @classmethod
+    def draw(cls, correlation_time_s: ArrayLike, rng: np.random.Generator) -> "SmoothProcess":
+        """Draw processes with the correlation times tau (K,), seconds."""
+        tau = np.asarray(correlation_time_s, np.float64)[:, None]
+        omega = rng.normal(size=(len(tau), _N_WAVES)) / tau
+        return cls(omega, rng.normal(size=(2, len(tau), _N_WAVES)) / np.sqrt(_N_WAVES))
+
+    def part(self, axes: slice) -> "SmoothProcess":
+        """Some of the processes."""
+        return SmoothProcess(self.omega_radps[axes], self.amplitude[:, axes])
+
+    def at(self, time_s: Array) -> tuple[Array, Array, Array]:
+        """Values (N, K), first derivatives, per second, and second derivatives, per second squared, at times (N,)."""
+        angle = np.asarray(time_s)[:, None, None] * self.omega_radps
+        cos, sin = np.cos(angle), np.sin(angle)
+        waves = self.amplitude[0] * cos + self.amplitude[1] * sin
+        rate = (self.omega_radps * (self.amplitude[1] * cos - self.amplitude[0] * sin)).sum(axis=2)
+        return waves.sum(axis=2), rate, -(self.omega_radps**2 * waves).sum(axis=2)
 
 
 @dataclass(frozen=True, slots=True)

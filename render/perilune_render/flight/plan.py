@@ -70,9 +70,9 @@ class TrajectoryPlan:
         """True motion of the camera, drawn when it is first used."""
         return self.draw_flight()
 
-    def frame_id(self, place: int) -> str:
-        """Id, unique in the dataset, of the frame at index `place` of `frame_index`."""
-        return frame_id_of(self.scene_id, self.trajectory_id, self.frame_index[place])
+    def frame_id(self, index: int) -> str:
+        """Id, unique in the dataset, of the frame at an index of `frame_index`."""
+        return frame_id_of(self.scene_id, self.trajectory_id, self.frame_index[index])
 
     @property
     def split(self) -> str | None:
@@ -92,7 +92,7 @@ class Plan:
     """All scenes."""
     trajectories: Sequence[TrajectoryPlan]
     """All trajectories, in the order of their scenes. A drawn plan makes a trajectory anew at each access."""
-    places: Mapping[str, range]
+    ranges: Mapping[str, range]
     """Indices in `trajectories` of the trajectories of each scene, by its id."""
 
     @property
@@ -112,7 +112,7 @@ class Plan:
 
     def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
         """The trajectories of one scene; none if the plan has no such scene."""
-        return [self.trajectories[place] for place in self.places.get(scene_id, ())]
+        return [self.trajectories[index] for index in self.ranges.get(scene_id, ())]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +133,12 @@ class _Drawn(Sequence[TrajectoryPlan]):
     def __len__(self) -> int:
         return len(self.scenes) * len(self.rig) * self.settings.trajectories_per_scene
 
-    def __getitem__(self, place: Any) -> Any:
-        """The trajectory at an index, or a tuple of those in a slice."""
-        if isinstance(place, slice):
-            return tuple(self[k] for k in range(*place.indices(len(self))))
+    def __getitem__(self, index: Any) -> Any:
+        """The trajectory at an index, or the trajectories of a slice as a tuple."""
+        if isinstance(index, slice):
+            return tuple(self[k] for k in range(*index.indices(len(self))))
         # All descents of one camera come first: an engine is opened once for each camera of a scene.
-        nth, t = divmod(range(len(self))[place], self.settings.trajectories_per_scene)
+        nth, t = divmod(range(len(self))[index], self.settings.trajectories_per_scene)
         s, c = divmod(nth, len(self.rig))
         scene, n_frames = self.scenes[s], self.settings.n_frames
         seed = derived_seed(scene.seed, self.kind, "trajectory", t)
@@ -181,9 +181,9 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
     ground = "shared" if config.shared_terrain else kind
     scenes = [drawn_scene(config, settings.sun, ground, s) for s in range(settings.n_scenes)]
     n = settings.trajectories_per_scene * len(rig)
-    places = {scene.scene_id: range(s * n, (s + 1) * n) for s, scene in enumerate(scenes)}
+    ranges = {scene.scene_id: range(s * n, (s + 1) * n) for s, scene in enumerate(scenes)}
     view = rig_envelope(rig, config.ground_flight(kind))
-    return Plan(rig, view, tuple(scenes), _Drawn(settings, kind, tuple(scenes), rig, splits), places)
+    return Plan(rig, view, tuple(scenes), _Drawn(settings, kind, tuple(scenes), rig, splits), ranges)
 
 
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:

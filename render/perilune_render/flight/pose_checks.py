@@ -21,9 +21,9 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 LEAST_CLEARANCE_M = 1.0
 """Smallest height of the camera above the ground or the boulder below it, metres."""
 LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
-"""Largest velocity, metres per second, five times that of escape, and largest angular velocity, radians per second."""
+"""Largest velocity, metres per second (five times the escape velocity), and angular velocity, radians per second."""
 _CHECKED_FRAMES = 20_000
-"""Number of frames that `check_plan` checks, about: a few seconds' work."""
+"""Approximate number of frames that `check_plan` checks, which takes a few seconds."""
 _POINTS_PER_SIDE = 8
 _UNIT_TOLERANCE = 1e-6
 
@@ -33,7 +33,7 @@ class Poses:
     """Poses of the camera in N frames of one scene."""
 
     frame_id: Sequence[str]
-    """Ids of the frames (N,), for messages; with the place in the user's file if the poses are from one."""
+    """Ids of the frames (N,), for messages; with the line or row in the user's file, if there is one."""
     position_m: Array
     """Position of the camera, O_L, metres (N, 3)."""
     rotation_wxyz: Array
@@ -41,7 +41,7 @@ class Poses:
 
     @classmethod
     def planned(cls, trajectories: Sequence[TrajectoryPlan]) -> "Poses":
-        """Poses of all frames of these trajectories, all of one scene."""
+        """Poses of all frames of trajectories over one scene."""
         return cls(
             [_named(t, i) for t in trajectories for i in range(len(t.splits))],
             np.concatenate([t.flight.position_m for t in trajectories]),
@@ -49,18 +49,18 @@ class Poses:
         )
 
 
-def _named(trajectory: TrajectoryPlan, place: int) -> str:
-    """Id of a frame, with the place of its pose in the user's file."""
-    frame_id = trajectory.frame_id(place)
-    return frame_id if trajectory.origin is None else f"{frame_id}, {trajectory.origin(place)}"
+def _named(trajectory: TrajectoryPlan, index: int) -> str:
+    """Id of a frame, with the line or row of its pose in the user's file."""
+    frame_id = trajectory.frame_id(index)
+    return frame_id if trajectory.origin is None else f"{frame_id}, {trajectory.origin(index)}"
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
     """Make the checks that need no terrain heights: the Sun is up, poses are over the mesh, ground is in view.
 
-    Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks those of each other scene
-    when its ground is known. Raises UserError with `where` (the configuration or the manifest) and the first scene or
-    frame that fails.
+    Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks the poses of each other
+    scene when its ground is known. Raises UserError with `where` (the configuration or the manifest) and the first
+    scene or frame that fails.
     """
     for scene in plan.scenes:
         if not 0 < scene.sun_elevation_deg <= 90:
@@ -78,9 +78,9 @@ def check_plan(plan: Plan, grid: Grid, where: object) -> None:
 def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene: Scene, where: object) -> None:
     """Check the poses of all frames of planned trajectories of one scene, as `check_poses`."""
     for name, mounted in plan.rig.items():
-        own = [trajectory for trajectory in trajectories if trajectory.camera == name]
-        if own:
-            check_poses(Poses.planned(own), mounted.exr_camera, scene, where)
+        of_camera = [trajectory for trajectory in trajectories if trajectory.camera == name]
+        if of_camera:
+            check_poses(Poses.planned(of_camera), mounted.exr_camera, scene, where)
 
 
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
@@ -212,10 +212,12 @@ def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Arra
     """Height, x and y (N, S) where downward rays (N, S, 3) leave the square of half side `half_m`, metres."""
     start = position_m[:, None, :2]
     with np.errstate(divide="ignore"):
-        way = np.where(rays[..., :2] != 0, (half_m - np.sign(rays[..., :2]) * start) / np.abs(rays[..., :2]), np.inf)
-    way = np.minimum(way.min(axis=-1), 1e12)
-    place = start + way[..., None] * rays[..., :2]
-    return position_m[:, None, 2] + way * rays[..., 2], place[..., 0], place[..., 1]
+        distance = np.where(
+            rays[..., :2] != 0, (half_m - np.sign(rays[..., :2]) * start) / np.abs(rays[..., :2]), np.inf
+        )
+    distance = np.minimum(distance.min(axis=-1), 1e12)
+    border = start + distance[..., None] * rays[..., :2]
+    return position_m[:, None, 2] + distance * rays[..., 2], border[..., 0], border[..., 1]
 
 
 def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, expected) -> None:

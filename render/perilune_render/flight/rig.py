@@ -1,7 +1,7 @@
 """The rig: the cameras on the body, and the poses of each along a trajectory of the body.
 
-The body's pose is given as that of a camera with the default mounting: at the body's origin, looking along -Z_B. This
-is the camera of a lander with a single one.
+The body's pose is given as the pose of a camera with the default mounting: at the body's origin, looking along -Z_B.
+This is the camera of a lander with a single one.
 """
 
 from collections.abc import Mapping
@@ -106,8 +106,8 @@ def rig_of(config: DatasetConfig) -> dict[str | None, MountedCamera]:
     rig: dict[str | None, MountedCamera] = {}
     for name, settings in config.cameras.items():
         camera, mounting = camera_of(settings, f"dataset.cameras.{name}"), settings.mounting
-        place = np.array(mounting.position_in_body_m)
-        rig[name] = MountedCamera(camera, camera.covering_pinhole(), _rotation(mounting), place)
+        position = np.array(mounting.position_in_body_m)
+        rig[name] = MountedCamera(camera, camera.covering_pinhole(), _rotation(mounting), position)
     return rig
 
 

@@ -38,13 +38,13 @@ class RowPoses:
     def bands(self, n_bands: int) -> list[tuple[np.ndarray, Pose]]:
         """Pixels (h, w) bool of each of `n_bands` bands of neighbouring rows, with the pose in the middle of each."""
         band = np.arange(len(self.time_s)) * n_bands // len(self.time_s)
-        own = band[self.row]
-        return [(own == k, self.pose_at(float(self.time_s[band == k].mean()))) for k in range(n_bands)]
+        of_pixel = band[self.row]
+        return [(of_pixel == k, self.pose_at(float(self.time_s[band == k].mean()))) for k in range(n_bands)]
 
     def motion_px(self, depth_m: np.ndarray, camera: Camera) -> float:
         """Largest motion in the image of the engine's `camera` while all rows are read out, pixels.
 
-        depth_m (h, w) is that of the middle pose.
+        depth_m (h, w) is the depth at the middle pose.
         """
         position, rotation = self.pose_at(0.0)
         depth = np.where(np.isfinite(depth_m), depth_m, _SKY_M)[..., None]

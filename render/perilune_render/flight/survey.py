@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from perilune_render.config.dataset import DatasetConfig
-from perilune_render.config.survey import SurveyConfig
+from perilune_render.config.derived import SurveyConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan
 from perilune_render.flight.rig import mounted
 from perilune_render.flight.trajectories import Flight
@@ -28,9 +28,9 @@ _CAMERA_FROM_SITE_LEVEL = np.diag([1.0, -1.0, -1.0])
 def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
     """The survey of the scenes of a plan, by `config.survey`: one trajectory of two frames over each.
 
-    The ground is that of the descents, byte for byte. The camera is at y = 0, first at negative x (east) and then at
-    positive x (west), and looks towards the site. Raises UserError if the ground is made of several meshes, or if the
-    camera would be too large or not above the ground.
+    The ground equals the ground of the descents byte for byte. The camera is at y = 0, first at negative x (east) and
+    then at positive x (west), and looks towards the site. Raises UserError if the ground is made of several meshes, or
+    if the camera would be too large or not above the ground.
     """
     survey = config.survey
     if survey is None:
@@ -43,8 +43,8 @@ def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
     camera = survey_camera(survey, float(descents.view.reach_m[-1]))
     scenes = tuple(_lit(scene, survey) for scene in descents.scenes)
     trajectories = tuple(_pair(descents, scene.scene_id, survey) for scene in scenes)
-    places = {scene.scene_id: range(place, place + 1) for place, scene in enumerate(scenes)}
-    return replace(descents, rig={None: mounted(camera)}, scenes=scenes, trajectories=trajectories, places=places)
+    ranges = {scene.scene_id: range(index, index + 1) for index, scene in enumerate(scenes)}
+    return replace(descents, rig={None: mounted(camera)}, scenes=scenes, trajectories=trajectories, ranges=ranges)
 
 
 def survey_camera(survey: SurveyConfig, reach_m: float) -> Camera:

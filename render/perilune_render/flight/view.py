@@ -150,7 +150,7 @@ def nominal_distance_m(flight: FlightConfig, altitude_m: Array) -> Array:
 def half_view_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
     """Largest distance |dx| or |dy| from below the camera that a frame at this altitude shows of level ground, metres.
 
-    The camera's axes are parallel to those of O_L except for small rotations, so a frame covers a square along the
+    The camera's axes are parallel to the axes of O_L except for small rotations, so a frame covers a square along the
     axes. Includes three standard deviations of tilt and rotation.
     """
     turn = min(3 * np.radians(flight.attitude_sigma_deg), np.pi / 4)

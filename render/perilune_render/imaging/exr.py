@@ -64,7 +64,7 @@ def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np
 
 
 def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | None) -> None:
-    """Raises UserError if an EXR file is too large to read, or has several parts or subsampled channels."""
+    """Raise UserError if an EXR file is too large to read, or has several parts or subsampled channels."""
     if len(image.parts) != 1:
         raise UserError(path, "parts", len(image.parts), "one")
     header = image.parts[0].header

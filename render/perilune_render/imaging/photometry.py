@@ -1,9 +1,9 @@
 """Reflectance laws of the lunar surface, written once for NumPy arrays and for Blender's shader.
 
 Theory: a law gives the reflectance factor as a function of mu0 = cos incidence, mu = cos emission and the cosine of the
-phase angle. The reflectance factor is the radiance over that of a perfectly diffusing plate under the same light.
-Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the plate lit from the zenith. The phase
-angle equals i + e in the principal plane only.
+phase angle. The reflectance factor is the radiance divided by the radiance of a perfectly diffusing plate under the
+same light. Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the plate lit from the zenith.
+The phase angle equals i + e in the principal plane only.
 
 `perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law; a test compares the bits.
 

@@ -60,5 +60,5 @@ def refined(camera: Camera, n: int) -> Camera:
 @lru_cache(maxsize=4)
 def _places(camera: Camera, source: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Column and row (h, w) float32 in `source` of each pixel centre, 0 at the first pixel's centre as in OpenCV."""
-    place = source.project(camera.rays(camera.pixel_centres())) - 0.5
-    return place[..., 0].astype(np.float32), place[..., 1].astype(np.float32)
+    pixel = source.project(camera.rays(camera.pixel_centres())) - 0.5
+    return pixel[..., 0].astype(np.float32), pixel[..., 1].astype(np.float32)

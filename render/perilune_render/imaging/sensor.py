@@ -1,6 +1,6 @@
 """Sensor model, from radiance factor to grey values, by EMVA 1288 (release 4.0, linear).
 
-Symbols: mu_p is the number of photons and eta mu_p that of electrons in a pixel during the exposure time t, here
+Symbols: mu_p is the number of photons and eta mu_p the number of electrons in a pixel during the exposure time t, here
 responsivity x t x I/F. mu_d and sigma_d are the mean and standard deviation of the dark signal, electrons. K is the
 gain, grey values (DN) per electron. mu_y and sigma_y^2 are the temporal mean and variance of the grey value:
 
@@ -31,8 +31,6 @@ _LEAST_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
 _FAINT_E = 100.0
 """Signal above which a rounded Gaussian approximates Poisson noise, ten times faster, electrons."""
-
-
 HOT_PIXEL_S = 0.002
 """Exposure time to which `hot_pixel_e` refers, seconds; the signal is proportional to the exposure time."""
 
@@ -70,19 +68,6 @@ class Exposure:
     """Exposure time, seconds."""
 
 
-def develop(
-    radiance: Radiance,
-    config: SensorConfig,
-    camera: Camera,
-    exr_camera: Camera,
-    velocity_camera_mps: Array,
-    pattern: FixedPattern,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Grey image (h, w) of `camera`, DN from 0 to 2^bits - 1: `expose`, then `read_out`."""
-    return read_out(expose(radiance, config, camera, exr_camera, velocity_camera_mps), config, pattern, rng)
-
-
 def expose(
     radiance: Radiance,
     config: SensorConfig,
@@ -100,12 +85,12 @@ def expose(
     exposure_s = exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
     if radiance.blurred is not None:
         return Exposure(_on_sensor(radiance.blurred, config, camera, exr_camera), exposure_s)
-    way_m = np.asarray(velocity_camera_mps) * exposure_s
+    move_m = np.asarray(velocity_camera_mps) * exposure_s
     turn_rad = np.zeros(3) if angular_velocity_radps is None else angular_velocity_radps * exposure_s
-    fastest_px = _fastest_px(radiance.depth_m, camera, exr_camera, way_m, turn_rad)
+    fastest_px = _fastest_px(radiance.depth_m, camera, exr_camera, move_m, turn_rad)
     if config.motion_blur and fastest_px >= _LEAST_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
-        light = _blurred(light, motion_px(depth_m, camera, way_m, turn_rad))
+        light = _blurred(light, motion_px(depth_m, camera, move_m, turn_rad))
     return Exposure(light, exposure_s)
 
 
@@ -161,9 +146,9 @@ def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rn
 def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation (h, w) float32 of each grey value, DN, over temporal noise and fixed patterns.
 
-    The variance is sigma_y^2 as above plus those of PRNU and DSNU, which act as noise in a single frame. Hot pixels are
-    left out. Where the sensor clips (in the brightest pixels, and in shadows with a black level of 0) the standard
-    deviation is that without clipping, which is too large.
+    The variance is sigma_y^2 as above plus the variances of PRNU and DSNU, which act as noise in a single frame. Hot
+    pixels are omitted. Clipping is ignored: where the sensor clips (in the brightest pixels, and in shadows with a
+    black level of 0) the standard deviation is too large.
     """
     largest = 2**config.bits - 1
     per_e = config.gain * largest / config.full_well_e
@@ -176,7 +161,7 @@ def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.n
 
 
 def _on_ground(light: np.ndarray, depth_m: np.ndarray, camera: Camera, exr_camera: Camera) -> np.ndarray:
-    """The values of an image (h, w) without those of the sky, whose depth is infinite; all of it if all is sky."""
+    """The pixels of an image (h, w) that show ground, which has a finite depth; all pixels if none does."""
     hit = np.isfinite(depth_m)
     if hit.all() or not hit.any():
         return light
@@ -199,16 +184,16 @@ def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
 
 
 def motion_px(
-    depth_m: np.ndarray, camera: Camera, way_camera_m: Array, turn_rad: Array | tuple[float, ...] = (0.0, 0.0, 0.0)
+    depth_m: np.ndarray, camera: Camera, move_camera_m: Array, turn_rad: Array | tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
     """Motion in the image, pixels (h, w, 2) float32, of the ground at a depth (h, w) along the axis, metres.
 
-    The camera moves by `way_camera_m` (3,) in its own axes O_C and turns by the rotation vector `turn_rad` (3,) there.
+    The camera moves by `move_camera_m` (3,) in its own axes O_C and turns by the rotation vector `turn_rad` (3,) there.
     To first order in turn and in the ratio of motion to depth; where nothing is hit only the rotation counts.
     """
     rays = _rays(camera)
-    way = np.asarray(way_camera_m, np.float32)
-    move = (rays * way[2] - way[:2]) / depth_m[..., None]
+    step = np.asarray(move_camera_m, np.float32)
+    move = (rays * step[2] - step[:2]) / depth_m[..., None]
     if np.any(turn_rad):
         move += _turned(rays, np.asarray(turn_rad, np.float32))
     if not any(camera.distortion):
@@ -227,12 +212,12 @@ def _turned(rays: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
     return np.stack([x * along - b + c * y, y * along + a - c * x], axis=-1)
 
 
-def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera_m: Array, turn_rad: Array) -> float:
+def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, move_camera_m: Array, turn_rad: Array) -> float:
     """Approximate upper bound on the motion of any pixel of `camera`, pixels; `pinhole` covers its view."""
     corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
     widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
     nearest_m = max(float(depth_m.min()), 1e-9)
-    share = np.linalg.norm(way_camera_m) / nearest_m + np.linalg.norm(turn_rad) * widest
+    share = np.linalg.norm(move_camera_m) / nearest_m + np.linalg.norm(turn_rad) * widest
     return float(share * widest * max(camera.fx_px, camera.fy_px) * _STRETCH)
 
 
@@ -252,6 +237,6 @@ def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
     mean = np.zeros_like(light)
     for time, weight in zip(times / 2, weights / 2, strict=True):
-        place = column - np.float32(time) * motion[..., 0], row - np.float32(time) * motion[..., 1]
-        mean += np.float32(weight) * cv2.remap(light, *place, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        source_px = column - np.float32(time) * motion[..., 0], row - np.float32(time) * motion[..., 1]
+        mean += np.float32(weight) * cv2.remap(light, *source_px, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     return np.maximum(mean, 0)

@@ -13,10 +13,9 @@ import pyarrow.parquet as pq
 
 from perilune_render.flight.plan import TrajectoryPlan
 from perilune_render.flight.trajectories import Flight
-from perilune_render.jobs import steps
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
-from perilune_render.jobs.run import MakeExecutor, RenderingFailed
+from perilune_render.jobs.run import MakeExecutor, RenderingFailed, check, finish, prepare, unfinished
 from perilune_render.jobs.work_list import WorkList
 from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.index import INDEX
@@ -29,7 +28,7 @@ _N_FRAMES = 10
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What is left to render, and what it will take."""
+    """Work that is left, and its estimated time and size."""
 
     n_frames: int
     """Number of frames that are still to be rendered."""
@@ -42,53 +41,53 @@ class Estimate:
 class _Times(Report):
     """Records when trajectories begin and end and when their frames are rendered, seconds."""
 
-    def __init__(self, job: Job, places: list[int], progress: Progress):
-        super().__init__(job, places, progress)
+    def __init__(self, job: Job, indices: list[int], progress: Progress):
+        super().__init__(job, indices, progress)
         self.begin: dict[int, float] = {}
         self.frames: dict[int, list[float]] = {}
         self.end: dict[int, float] = {}
 
-    def started(self, place: int) -> None:
-        self.begin[place], self.frames[place] = time.perf_counter(), []
+    def started(self, index: int) -> None:
+        self.begin[index], self.frames[index] = time.perf_counter(), []
 
-    def frame(self, place: int) -> None:
-        super().frame(place)
-        self.frames[place].append(time.perf_counter())
+    def frame(self, index: int) -> None:
+        super().frame(index)
+        self.frames[index].append(time.perf_counter())
 
-    def done(self, place: int, dark: Sequence[str]) -> None:
-        super().done(place, dark)
-        self.end[place] = time.perf_counter()
+    def done(self, index: int, dark: Sequence[str]) -> None:
+        super().done(index, dark)
+        self.end[index] = time.perf_counter()
 
 
 def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecutor, n_workers: int) -> Estimate:
     """Estimate the rest of a job at an address, with an executor of `n_workers` processes.
 
     Renders ten frames for each process at the same time, from its own scene if there are as many. Writes nothing to
-    the address. Raises UserError as `steps.check` and if a pose does not fit the ground, RenderingFailed if frames
+    the address. Raises UserError as `check` and if a pose does not fit the ground, RenderingFailed if frames
     cannot be rendered.
     """
     out = open_store(address)
-    steps.check(job)
-    left = steps.unfinished(job, out)
+    check(job)
+    left = unfinished(job, out)
     if not left:
         return Estimate(0, 0.0, 0.0)
     sample = _sample(job, left, max(n_workers, 1))
-    places = list(range(len(sample.plan.trajectories)))
+    indices = list(range(len(sample.plan.trajectories)))
     with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
         begin, scratch = time.perf_counter(), open_store(folder)
-        with executor(sample, scratch) as own:
-            info = steps.prepare(sample, scratch, lambda scene_id: None)
-            work, times = WorkList(sample.plan, places), _Times(sample, places, progress)
-            own.render(work, times)
+        with executor(sample, scratch) as renderers:
+            info = prepare(sample, scratch, lambda scene_id: None)
+            work, times = WorkList(sample.plan, indices), _Times(sample, indices, progress)
+            renderers.render(work, times)
         if work.failures:
-            raise RenderingFailed(out, {sample.name(place): error for place, error in work.failures.items()})
+            raise RenderingFailed(out, {sample.name(index): error for index, error in work.failures.items()})
         finish_begin = time.perf_counter()
-        made = steps.finish(sample, scratch, info)
+        made = finish(sample, scratch, info)
         finish_s = time.perf_counter() - finish_begin
         bytes_of = _Bytes.of(made)
-    frame_s = fmean((times.frames[p][-1] - times.frames[p][0]) / max(len(times.frames[p]) - 1, 1) for p in places)
-    scene_s = max(fmean(times.frames[p][0] - times.begin[p] for p in places) - frame_s, 0.0)
-    parts_s = fmean(times.end[p] - times.frames[p][-1] for p in places)
+    frame_s = fmean((times.frames[p][-1] - times.frames[p][0]) / max(len(times.frames[p]) - 1, 1) for p in indices)
+    scene_s = max(fmean(times.frames[p][0] - times.begin[p] for p in indices) - frame_s, 0.0)
+    parts_s = fmean(times.end[p] - times.frames[p][-1] for p in indices)
     n_frames, n_scenes = sum(map(job.n_frames, left)), len({job.plan.trajectories[p].scene_id for p in left})
     n_parallel = min(max(n_workers, 1), len(left))
     work_s = n_frames * frame_s + len(left) * parts_s + max(n_scenes, n_parallel) * scene_s
@@ -100,17 +99,17 @@ def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecu
 def _sample(job: Job, left: list[int], n_trajectories: int) -> Job:
     """A job of `n_trajectories` unfinished trajectories with few frames, of different scenes if possible."""
     first_of: dict[str, int] = {}
-    for place in left:
-        first_of.setdefault(job.plan.trajectories[place].scene_id, place)
-    others = [place for place in left if place not in first_of.values()]
-    chosen = [job.plan.trajectories[place] for place in sorted([*first_of.values(), *others][:n_trajectories])]
+    for number in left:
+        first_of.setdefault(job.plan.trajectories[number].scene_id, number)
+    others = [number for number in left if number not in first_of.values()]
+    chosen = [job.plan.trajectories[number] for number in sorted([*first_of.values(), *others][:n_trajectories])]
     of_scene: dict[str, list[int]] = {trajectory.scene_id: [] for trajectory in chosen}
     for index, trajectory in enumerate(chosen):
         of_scene[trajectory.scene_id].append(index)
     scenes = tuple(scene for scene in job.plan.scenes if scene.scene_id in of_scene)
-    places = {scene_id: range(found[0], found[-1] + 1) for scene_id, found in of_scene.items()}
+    ranges = {scene_id: range(numbers[0], numbers[-1] + 1) for scene_id, numbers in of_scene.items()}
     trajectories = tuple(map(_thinned, chosen))
-    return replace(job, plan=replace(job.plan, scenes=scenes, trajectories=trajectories, places=places))
+    return replace(job, plan=replace(job.plan, scenes=scenes, trajectories=trajectories, ranges=ranges))
 
 
 def _thinned(trajectory: TrajectoryPlan) -> TrajectoryPlan:
@@ -144,7 +143,7 @@ class _Bytes:
 
     @classmethod
     def of(cls, made: Dataset) -> "_Bytes":
-        """Those of a finished sample."""
+        """The mean bytes of a finished sample."""
         images = sum(item.size_bytes for item in made.store.list("frames"))
         index = pa.concat_tables(pq.read_table(pa.BufferReader(made.store.read(part.path))) for part in made.info.index)
         rows = fixed = 0.0

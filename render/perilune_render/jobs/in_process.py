@@ -12,13 +12,13 @@ from perilune_shared.errors import ends_run
 from perilune_shared.storage.store import Store
 
 
-class Here:
+class InProcess:
     """The executor that renders in this process, one trajectory after another."""
 
     def __init__(self, job: Job, out: Store):
         self._renderer = SceneRenderer(job, out)
 
-    def __enter__(self) -> "Here":
+    def __enter__(self) -> "InProcess":
         return self
 
     def __exit__(
@@ -33,15 +33,15 @@ class Here:
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
-        while (place := work.take(self._renderer.scene_id)) is not None:
-            report.started(place)
+        while (index := work.take(self._renderer.scene_id)) is not None:
+            report.started(index)
             try:
-                dark = self._renderer.render(place, partial(report.frame, place), report.note)
+                dark = self._renderer.render(index, partial(report.frame, index), report.note)
             except Exception as error:
                 if ends_run(error):
                     raise
                 text = f"{type(error).__name__}: {error}"
-                report.failed(place, text, work.failed(place, text))
+                report.failed(index, text, work.failed(index, text))
             else:
-                work.done(place)
-                report.done(place, dark)
+                work.done(index)
+                report.done(index, dark)

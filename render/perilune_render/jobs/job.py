@@ -13,7 +13,7 @@ from perilune_shared.threads import usable_cores
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A dataset to render. Trajectories are identified by their place, the index in `plan.trajectories`."""
+    """A dataset to render. Trajectories are identified by their index in `plan.trajectories`."""
 
     plan: Plan
     """Scenes, trajectories and frames."""
@@ -47,13 +47,13 @@ class Job:
         """The plan of a scene."""
         return next(scene for scene in self.plan.scenes if scene.scene_id == scene_id)
 
-    def n_frames(self, place: int) -> int:
+    def n_frames(self, index: int) -> int:
         """Number of frames of a trajectory."""
-        return len(self.plan.trajectories[place].splits)
+        return len(self.plan.trajectories[index].splits)
 
-    def name(self, place: int) -> str:
+    def name(self, index: int) -> str:
         """Name of a trajectory, as scene-0000/trajectory-0000."""
-        return trajectory_name(self.plan.trajectories[place])
+        return trajectory_name(self.plan.trajectories[index])
 
 
 def trajectory_name(trajectory: TrajectoryPlan) -> str:

@@ -76,39 +76,39 @@ class LocalWorkers:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
         while True:
-            n_busy = sum(worker.place is not None for worker in self._workers.values())
+            n_busy = sum(worker.trajectory is not None for worker in self._workers.values())
             if not n_busy and not work.n_waiting:
                 return
             self._start(min(self._n_workers, n_busy + work.n_waiting))
             for worker in list(self._workers.values()):
-                if worker.ready and worker.place is None:
+                if worker.ready and worker.trajectory is None:
                     self._hand_out(worker, work, report)
             for worker in self._heard():
                 self._handle(worker, self._receive(worker), work, report)
 
     def _hand_out(self, worker: Worker, work: WorkList, report: Report) -> None:
-        place = work.take(worker.scene_id)
-        if place is not None:
-            worker.place, worker.scene_id = place, self._job.plan.trajectories[place].scene_id
-            worker.send("render", place)
-            report.started(place)
+        index = work.take(worker.scene_id)
+        if index is not None:
+            worker.trajectory, worker.scene_id = index, self._job.plan.trajectories[index].scene_id
+            worker.send("render", index)
+            report.started(index)
 
     def _handle(self, worker: Worker, message: tuple | None, work: WorkList, report: Report) -> None:
-        place = worker.place
+        index = worker.trajectory
         match message:
             case ("note", text):
                 report.note(text)
-            case ("frame",) if place is not None:
-                report.frame(place)
-            case ("done", dark) if place is not None:
-                work.done(place)
-                report.done(place, dark)
-                worker.place, worker.n_done = None, worker.n_done + 1
+            case ("frame",) if index is not None:
+                report.frame(index)
+            case ("done", dark) if index is not None:
+                work.done(index)
+                report.done(index, dark)
+                worker.trajectory, worker.n_done = None, worker.n_done + 1
                 if worker.n_done >= RECYCLED_AFTER:
                     self._end(worker)
-            case None | ("failed", _) if place is not None:
+            case None | ("failed", _) if index is not None:
                 error = worker.how_ended if message is None else message[1]
-                report.failed(place, error, work.failed(place, error))
+                report.failed(index, error, work.failed(index, error))
                 self._end(worker)
 
     def _heard(self) -> list[Worker]:
@@ -117,7 +117,7 @@ class LocalWorkers:
         return [worker for connection, worker in self._workers.items() if connection in ready]
 
     def _receive(self, worker: Worker) -> tuple[Any, ...] | None:
-        """The next message of a worker; None if it has ended, and is no worker any more. Raises its final error."""
+        """The next message of a worker; None if it has ended, which also removes it. Raises its final error."""
         try:
             message = worker.connection.recv()
             if message == ("started",):
@@ -147,7 +147,7 @@ class LocalWorkers:
 
 
 def for_other_processes(out: Store) -> Store:
-    """A store as other processes can open it, with other working directories. Raises UserError if they cannot."""
+    """A store that processes with other working directories can open too. Raises UserError if they cannot."""
     if out.address.startswith("memory://"):
         raise UserError(out, "--out", "memory of this process", "--workers 0, or an address that workers can open")
     return out if out.folder is None else open_store(out.folder.absolute())
@@ -168,6 +168,6 @@ def default_workers(job: Job, n_threads: int | None) -> int:
 
 
 def _free_bytes() -> float:
-    """Memory that new processes may use, bytes: free on the machine, or left to the container or batch job if less."""
+    """Memory that new processes may use, bytes: free on the machine or, if less, in the container or batch job."""
     free, left = float(psutil.virtual_memory().available), memory_left_bytes()
     return free if left is None else min(free, left)

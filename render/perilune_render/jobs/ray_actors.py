@@ -29,16 +29,16 @@ class _Renderer:
     """The actor: a scene renderer in a process of Ray."""
 
     def start(self, job: Job, out: Store) -> None:
-        """Receive the job. Raises UserError if the code of this process is not that of the job."""
+        """Receive the job. Raises UserError if this process has other code than the job."""
         self._renderer = SceneRenderer(job, out)
 
     def grow(self, scene_id: str) -> list[str]:
         """Generate a scene and check that its poses fit it; returns warnings."""
         return self._renderer.check(scene_id)
 
-    def render(self, place: int) -> list[str]:
+    def render(self, index: int) -> list[str]:
         """Render a trajectory; returns the ids of its dark frames."""
-        return self._renderer.render(place, lambda: None, lambda text: None)
+        return self._renderer.render(index, lambda: None, lambda text: None)
 
 
 @dataclass(slots=True, eq=False)
@@ -49,7 +49,7 @@ class _Actor:
     """Ray's handle of the actor."""
     ready: bool = False
     """Whether it runs."""
-    place: int | None = None
+    trajectory: int | None = None
     """The trajectory that it renders."""
     scene_id: str | None = None
     """The scene that it keeps."""
@@ -60,9 +60,9 @@ class _Actor:
 class RayActors:
     """The executor that renders with Ray, in `n_workers` actors, by default as many as the cluster has cores for.
 
-    Each has the configured number of threads, or one if that is 0; Ray reserves a core for each thread.
-    `address` is that of a running cluster; None starts Ray on this machine for the duration of the block. A local
-    folder `out` must be at the same path on all machines.
+    Each has the configured number of threads, or one if that is 0; Ray reserves a core for each thread. `address` is
+    the address of a running cluster; None starts Ray on this machine for the duration of the block. A local folder
+    `out` must be at the same path on all machines.
     """
 
     def __init__(self, job: Job, out: Store, n_workers: int | None, address: str | None):
@@ -125,56 +125,56 @@ class RayActors:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
         while True:
-            busy = [actor for actor in self._actors if actor.place is not None]
+            busy = [actor for actor in self._actors if actor.trajectory is not None]
             if not busy and not work.n_waiting:
                 return
             self._start(min(self._n_workers or 1, len(busy) + work.n_waiting))
             for actor in self._actors:
-                if actor.ready and actor.place is None:
+                if actor.ready and actor.trajectory is None:
                     self._hand_out(actor, work, report)
             (finished,), _ = ray.wait(list(self._pending), num_returns=1)
             self._handle(self._pending.pop(finished), finished, work, report)
 
     def _hand_out(self, actor: _Actor, work: WorkList, report: Report) -> None:
-        place = work.take(actor.scene_id)
-        if place is not None:
-            actor.place, actor.scene_id = place, self._job.plan.trajectories[place].scene_id
-            self._pending[actor.handle.render.remote(place)] = actor
-            report.started(place)
+        index = work.take(actor.scene_id)
+        if index is not None:
+            actor.trajectory, actor.scene_id = index, self._job.plan.trajectories[index].scene_id
+            self._pending[actor.handle.render.remote(index)] = actor
+            report.started(index)
             report.note(actor.scene_id)
 
     def _handle(self, actor: _Actor, finished: Any, work: WorkList, report: Report) -> None:
-        place = actor.place
+        index = actor.trajectory
         try:
             dark = ray.get(finished)
         except RayActorError as error:
-            if place is None:
+            if index is None:
                 self._lose_start(actor, error)
                 return
             self._actors.remove(actor)
             text = f"a process of Ray was lost ({type(error).__name__})"
-            report.failed(place, text, work.failed(place, text))
+            report.failed(index, text, work.failed(index, text))
             return
         except RayTaskError as error:
-            if place is None or ends_run(error.cause):
+            if index is None or ends_run(error.cause):
                 raise error.cause from None
             text = f"{type(error.cause).__name__}: {error.cause}"
-            report.failed(place, text, work.failed(place, text))
-            actor.place = None
+            report.failed(index, text, work.failed(index, text))
+            actor.trajectory = None
             return
-        actor.ready, actor.place, self._lost_starts = True, None, 0
-        if place is not None:
-            for _ in range(self._job.n_frames(place)):
-                report.frame(place)
-            work.done(place)
-            report.done(place, dark)
+        actor.ready, actor.trajectory, self._lost_starts = True, None, 0
+        if index is not None:
+            for _ in range(self._job.n_frames(index)):
+                report.frame(index)
+            work.done(index)
+            report.done(index, dark)
             actor.n_done += 1
             if actor.n_done >= RECYCLED_AFTER:
                 self._actors.remove(actor)
                 ray.kill(actor.handle)
 
     def _lose_start(self, actor: _Actor, error: RayActorError) -> None:
-        """Remove an actor that was lost before it rendered. Raises UserError if too many were, one after another."""
+        """Remove an actor that was lost before it rendered. Raises UserError if too many were lost in succession."""
         self._actors.remove(actor)
         self._lost_starts += 1
         if self._lost_starts > LOST_STARTS * (self._n_workers or 1):

@@ -28,12 +28,12 @@ _FAILURE = frozenset({"trajectory", "error"})
 
 
 def write_plan(store: Store, plan: dict[str, Any]) -> None:
-    """Record the `trajectories` and `frames` of a job, and the identity of its `plan`."""
+    """Record the numbers of `trajectories` and `frames` of a job, and the hash of its `plan`."""
     store.replace(f"{FOLDER}/plan.json", json.dumps(plan).encode())
 
 
 def read_plan(store: Store) -> dict[str, Any] | None:
-    """The record of a job (`write_plan`); None if there is none."""
+    """The record of a job (`write_plan`); None without one."""
     return _read(store, f"{FOLDER}/plan.json") if store.exists(f"{FOLDER}/plan.json") else None
 
 

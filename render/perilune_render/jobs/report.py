@@ -10,46 +10,46 @@ from perilune_shared.errors import one_line, shortened
 
 
 class Report:
-    """Reports on the rendering of some trajectories of a job, given by their places."""
+    """Reports on the rendering of some trajectories of a job, given by their indices in the plan."""
 
-    def __init__(self, job: Job, places: Sequence[int], progress: Progress):
+    def __init__(self, job: Job, indices: Sequence[int], progress: Progress):
         self._job, self._progress = job, progress
-        todo = set(places)
-        finished = sum(job.n_frames(place) for place in range(len(job.plan.trajectories)) if place not in todo)
+        todo = set(indices)
+        finished = sum(job.n_frames(index) for index in range(len(job.plan.trajectories)) if index not in todo)
         n_frames = finished + sum(map(job.n_frames, todo))
         self._task = progress.add_task(f"{job.info.kind} frames", total=n_frames, unit="frames", note="")
         progress.advance(self._task, finished)
-        self._left = Counter(job.plan.trajectories[place].scene_id for place in todo)
+        self._left = Counter(job.plan.trajectories[index].scene_id for index in todo)
         self._rendered: Counter[str] = Counter()
         self._dark: defaultdict[str, list[str]] = defaultdict(list)
         self._frames: Counter[int] = Counter()
 
-    def started(self, place: int) -> None:
+    def started(self, index: int) -> None:
         """Note that a process begins a trajectory."""
 
-    def frame(self, place: int) -> None:
+    def frame(self, index: int) -> None:
         """Count a rendered frame of a trajectory."""
-        self._frames[place] += 1
+        self._frames[index] += 1
         self._progress.advance(self._task)
 
     def note(self, text: str) -> None:
         """Show a text on the current step."""
         self._progress.update(self._task, note=text)
 
-    def done(self, place: int, dark: Sequence[str]) -> None:
+    def done(self, index: int, dark: Sequence[str]) -> None:
         """Count a finished trajectory with the ids of its dark frames; after the last of a scene, warn of these."""
-        scene_id = self._job.plan.trajectories[place].scene_id
+        scene_id = self._job.plan.trajectories[index].scene_id
         self._dark[scene_id] += dark
-        self._rendered[scene_id] += self._job.n_frames(place)
+        self._rendered[scene_id] += self._job.n_frames(index)
         self._close(scene_id)
 
-    def failed(self, place: int, error: str, attempts_left: int) -> None:
+    def failed(self, index: int, error: str, attempts_left: int) -> None:
         """Report a failed attempt."""
-        self._progress.advance(self._task, -self._frames.pop(place, 0))
+        self._progress.advance(self._task, -self._frames.pop(index, 0))
         again = f"; trying again ({attempts_left} left)" if attempts_left else ""
-        say(f"warning: {self._job.name(place)}: {shortened(one_line(error), 500)}{again}")
+        say(f"warning: {self._job.name(index)}: {shortened(one_line(error), 500)}{again}")
         if not attempts_left:
-            self._close(self._job.plan.trajectories[place].scene_id)
+            self._close(self._job.plan.trajectories[index].scene_id)
 
     def _close(self, scene_id: str) -> None:
         self._left[scene_id] -= 1

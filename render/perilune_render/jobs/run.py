@@ -1,20 +1,40 @@
-"""Run a job: the three steps, with any executor."""
+"""Run a job in three steps, with any executor: prepare, render each trajectory, finish.
 
-from collections.abc import Callable
+`SceneRenderer` renders a trajectory, which is finished once its commit is written (`dataset/work.py`).
+
+A dataset is resumed only with the plan that it was begun with. One hash identifies a plan: two manifests with the same
+settings may differ in scenes, trajectories, frames and splits.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol
 
-from perilune_render.dataset.begin import is_begun, open_finished, writing
-from perilune_render.jobs import records, steps
+import numpy as np
+
+from perilune_render.dataset.begin import begin_or_resume, is_begun, is_complete, open_finished, writing
+from perilune_render.dataset.finish import finish as finish_dataset
+from perilune_render.dataset.from_manifest import Recorded
+from perilune_render.dataset.work import committed
+from perilune_render.flight.plan import Plan, TrajectoryPlan
+from perilune_render.flight.pose_checks import check_plan
+from perilune_render.jobs import records
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
+from perilune_render.outputs.hazard import check_hazard
+from perilune_render.terrain.scene import check_ground
 from perilune_shared.console.progress import Progress
-from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
 from perilune_shared.storage.locks import remove_temporary_files
 from perilune_shared.storage.store import Address, Store, open_store
+
+_EXPECTED = "the plan or manifest that the dataset was started with"
 
 
 class Executor(Protocol):
@@ -36,8 +56,8 @@ class Shard:
     count: int
     """Number of shards."""
 
-    def places(self, n_trajectories: int) -> range:
-        """Places of its trajectories. Consecutive, so that few scenes are in several shards."""
+    def indices(self, n_trajectories: int) -> range:
+        """Indices of its trajectories in the plan. Consecutive, so that few scenes are in several shards."""
         first, after = ((k * n_trajectories) // self.count for k in (self.number - 1, self.number))
         return range(first, after)
 
@@ -62,17 +82,17 @@ def render_job(job: Job, address: Address, progress: Progress, executor: MakeExe
     Raises RenderingFailed at the end if trajectories failed repeatedly.
     """
     out = open_store(address)
-    steps.check(job)
+    check(job)
     with writing(out):
-        with executor(job, out) as own:
-            info = steps.prepare(job, out, own.check_scene)
+        with executor(job, out) as renderers:
+            info = prepare(job, out, renderers.check_scene)
             if info.complete:
                 return open_finished(out)
             records.remove_running(out)
-            _render(job, out, steps.unfinished(job, out), own, progress)
+            _render(job, out, unfinished(job, out), renderers, progress)
         if out.folder is not None:
             remove_temporary_files(out.folder)  # of workers that were killed
-        return steps.finish(job, out, info)
+        return finish(job, out, info)
 
 
 def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, executor: MakeExecutor) -> int:
@@ -82,13 +102,13 @@ def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, e
     Raises the errors of `render_job`.
     """
     out = open_store(address)
-    steps.check(job)
-    with executor(job, out) as own:
-        info = steps.prepare(job, out, own.check_scene)
-        chosen = set(shard.places(len(job.plan.trajectories)))
-        places = [place for place in steps.unfinished(job, out) if place in chosen and not info.complete]
-        _render(job, out, places, own, progress)
-    return len(places)
+    check(job)
+    with executor(job, out) as renderers:
+        info = prepare(job, out, renderers.check_scene)
+        chosen = set(shard.indices(len(job.plan.trajectories)))
+        indices = [index for index in unfinished(job, out) if index in chosen and not info.complete]
+        _render(job, out, indices, renderers, progress)
+    return len(indices)
 
 
 def finish_job(job: Job, address: Address) -> Dataset:
@@ -97,17 +117,115 @@ def finish_job(job: Job, address: Address) -> Dataset:
     if not is_begun(out):
         raise UserError(out, "--finish", "no dataset", "the address of the rendered shards")
     with writing(out):
-        info = steps.prepare(job, out, lambda scene_id: None)
-        return open_finished(out) if info.complete else steps.finish(job, out, info)
+        info = prepare(job, out, lambda scene_id: None)
+        return open_finished(out) if info.complete else finish(job, out, info)
 
 
-def _render(job: Job, out: Store, places: list[int], executor: Executor, progress: Progress) -> None:
-    """Render some trajectories, given by their places. Raises RenderingFailed at the end if some failed."""
-    work = WorkList(job.plan, places)
-    records.remove_failures(out, map(job.name, places))
-    executor.render(work, Report(job, places, progress))
+def _render(job: Job, out: Store, indices: list[int], executor: Executor, progress: Progress) -> None:
+    """Render some trajectories, given by their indices. Raises RenderingFailed at the end if some failed."""
+    work = WorkList(job.plan, indices)
+    records.remove_failures(out, map(job.name, indices))
+    executor.render(work, Report(job, indices, progress))
     if work.failures:
-        errors = {job.name(place): error for place, error in sorted(work.failures.items())}
+        errors = {job.name(index): error for index, error in sorted(work.failures.items())}
         for name, error in errors.items():
             records.write_failure(out, name, error)
         raise RenderingFailed(out, errors)
+
+
+def check(job: Job) -> None:
+    """Make the checks of a job that need no terrain heights and write nothing. Raises UserError."""
+    grid = check_ground(job.config, job.plan.view)
+    check_plan(job.plan, grid, job.where)
+    if job.config.hazard is not None:
+        check_hazard(job.config.hazard, grid)
+
+
+def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> DatasetInfo:
+    """Begin the dataset at `out`, or check that it belongs to the job; returns its dataset.json.
+
+    Before a dataset is begun, `check_scene` generates its first scene and checks all poses over it. Raises UserError if
+    a pose does not fit the ground, or if `out` holds something else or a dataset of other settings, code or plan.
+    """
+    if not is_begun(out) and job.plan.scenes:
+        check_scene(job.plan.scenes[0].scene_id)
+    info = begin_or_resume(out, job.info)
+    if info.complete:
+        _check_finished(out, job.plan)
+    else:
+        _begin_plan(out, job)
+    return info
+
+
+def unfinished(job: Job, out: Store) -> list[int]:
+    """Indices of the trajectories that are still to be rendered, in the order of the plan."""
+    if is_complete(out):
+        return []
+    finished = committed(out)
+    return [
+        index
+        for index, trajectory in enumerate(job.plan.trajectories)
+        if f"{trajectory.scene_id}.{trajectory.trajectory_id}" not in finished
+    ]
+
+
+def finish(job: Job, out: Store, info: DatasetInfo) -> Dataset:
+    """Merge the trajectories into a complete dataset. Raises UserError if some are still to be rendered."""
+    left = unfinished(job, out)
+    if left:
+        found = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"
+        raise UserError(out, "trajectories", found, "all rendered: run the shards that hold them again")
+    scenes = (
+        (scene.scene_id, [trajectory.trajectory_id for trajectory in job.plan.of_scene(scene.scene_id)])
+        for scene in job.plan.scenes
+        if job.plan.ranges.get(scene.scene_id)
+    )
+    return finish_dataset(out, info, scenes)
+
+
+def _begin_plan(store: Store, job: Job) -> None:
+    """Record size and hash of a job's plan in the dataset that it begins, or compare them with the record.
+
+    Raises UserError if the dataset was begun with another plan.
+    """
+    indices = range(len(job.plan.trajectories))
+    sizes = {"trajectories": len(indices), "frames": sum(map(job.n_frames, indices))}
+    plan = {**sizes, "plan": _hash(_ordered(job.plan), positions=_is_recorded(job.plan))}
+    if records.read_plan(store) is None:
+        records.write_plan(store, plan)
+    elif records.read_plan(store) != plan:
+        raise UserError(store.at(f"{records.FOLDER}/plan.json"), "plan", "the plan of another dataset", _EXPECTED)
+
+
+def _check_finished(store: Store, plan: Plan) -> None:
+    """Raise UserError if a finished dataset has another plan."""
+    finished = open_dataset(store)
+    recorded = Recorded.of(finished, finished.scene_ids())
+    positions = _is_recorded(plan)
+    if _hash(recorded, positions=positions) != _hash(_ordered(plan), positions=positions):
+        raise UserError(store, "trajectories", "trajectories of another plan", _EXPECTED)
+
+
+def _is_recorded(plan: Plan) -> bool:
+    return len(plan.trajectories) > 0 and not plan.trajectories[0].is_drawn
+
+
+def _ordered(plan: Plan) -> Iterator[TrajectoryPlan]:
+    """The trajectories of a plan, ordered by scene and name as in a manifest."""
+    for scene_id in sorted(plan.ranges):
+        yield from sorted(plan.of_scene(scene_id), key=lambda trajectory: trajectory.trajectory_id)
+
+
+def _hash(trajectories: Iterable[TrajectoryPlan], *, positions: bool) -> str:
+    """SHA-256 of trajectories, hexadecimal; with `positions`, also of the position of each frame.
+
+    The positions of a drawn flight follow from seed, settings and code, which the recipe contains.
+    """
+    digest = hashlib.sha256()
+    for each in trajectories:
+        named = [each.scene_id, each.trajectory_id, each.seed, ",".join(each.splits)]
+        digest.update(json.dumps(named).encode())
+        digest.update(np.asarray(each.frame_index, np.int64).tobytes())
+        if positions:
+            digest.update(np.ascontiguousarray(each.flight.position_m, np.float64).tobytes())
+    return digest.hexdigest()

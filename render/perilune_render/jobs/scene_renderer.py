@@ -7,7 +7,7 @@ from types import TracebackType
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import check_code
 from perilune_render.dataset.frame_files import file_columns
-from perilune_render.dataset.trajectory import render_trajectory
+from perilune_render.dataset.trajectory import SceneSetting, render_trajectory
 from perilune_render.dataset.work import FOLDER, write_scene
 from perilune_render.engines.frame_source import FrameSource
 from perilune_render.engines.open_engine import open_engine
@@ -15,7 +15,7 @@ from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.records import RunningRecord
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_render.outputs.hazard_raster import hazard_tiff
+from perilune_render.outputs.hazard import hazard_tiff
 from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.preview.site_horizon import shadow_warnings
 from perilune_render.terrain.cache import cached_scene
@@ -29,7 +29,7 @@ class SceneRenderer:
     """Renders trajectories of a job, one at a time, and keeps the scene of the last one for the next.
 
     Use as a context manager, and only one at a time in a process, since Blender holds only one scene. Raises UserError
-    if the code of this process is not that of the job.
+    if this process has other code than the job.
     """
 
     def __init__(self, job: Job, out: Store):
@@ -66,23 +66,23 @@ class SceneRenderer:
         scene, job = self.grow(scene_id), self._job
         return [] if job.config.scene is None else shadow_warnings(scene, job.plan.scenes)
 
-    def render(self, place: int, advance: Callable[[], object], note: Callable[[str], object]) -> list[str]:
+    def render(self, index: int, advance: Callable[[], object], note: Callable[[str], object]) -> list[str]:
         """Render a trajectory and write its files, labels and frames; returns the ids of its dark frames.
 
         `advance` is called after each frame, `note` with a text on the current step.
         """
-        trajectory = self._job.plan.trajectories[place]
+        trajectory = self._job.plan.trajectories[index]
 
         def counted() -> None:
             self._record.frame()
             advance()
 
         try:
-            self._record.begin(self._job.name(place))
+            self._record.begin(self._job.name(index))
             scene, source, outputs = self._open(trajectory.scene_id, trajectory.camera, note)
             config = self._job.config
-            instruments = config.kind(self._job.info.kind).instruments
-            return render_trajectory(self._out, source, trajectory, scene, config, instruments, counted, outputs)
+            of_scene = SceneSetting(scene, config, config.kind(self._job.info.kind).instruments, outputs)
+            return render_trajectory(self._out, source, trajectory, of_scene, counted)
         except BaseException:
             self.close()  # Blender's scene may be half changed
             raise

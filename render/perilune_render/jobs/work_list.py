@@ -10,13 +10,13 @@ N_ATTEMPTS = 4
 
 
 class WorkList:
-    """Hands out trajectories by their place in the plan, so that each process changes scenes rarely."""
+    """Hands out trajectories by their index in the plan, so that each process changes scenes rarely."""
 
-    def __init__(self, plan: Plan, places: Iterable[int]):
+    def __init__(self, plan: Plan, indices: Iterable[int]):
         self._scene = [trajectory.scene_id for trajectory in plan.trajectories]
         self._waiting: dict[str, deque[int]] = {}
-        for place in places:
-            self._waiting.setdefault(self._scene[place], deque()).append(place)
+        for index in indices:
+            self._waiting.setdefault(self._scene[index], deque()).append(index)
         self._untouched = deque(self._waiting)
         self._running: Counter[str] = Counter()
         self._attempts: Counter[int] = Counter()
@@ -25,13 +25,13 @@ class WorkList:
 
     @property
     def n_waiting(self) -> int:
-        """Number of trajectories that nobody renders at the moment."""
+        """Number of trajectories that are not being rendered."""
         return sum(map(len, self._waiting.values()))
 
     def take(self, scene_id: str | None) -> int | None:
-        """The next trajectory for a process that keeps the scene `scene_id`; None if none is waiting.
+        """The next trajectory for a process that keeps the scene `scene_id`; None if no trajectory is waiting.
 
-        The first choice is a trajectory of the same scene, the second a scene that nobody has begun, the third the
+        The first choice is a trajectory of the same scene, the second a scene that no process has begun, the third the
         scene that the fewest processes render.
         """
         if scene_id not in self._waiting:
@@ -43,24 +43,24 @@ class WorkList:
             scene_id = fewest or self._untouched.popleft()
         elif self._untouched and self._untouched[0] == scene_id:
             self._untouched.popleft()
-        places = self._waiting[scene_id]
-        place = places.popleft()
-        if not places:
+        indices = self._waiting[scene_id]
+        index = indices.popleft()
+        if not indices:
             del self._waiting[scene_id]
         self._running[scene_id] += 1
-        self._attempts[place] += 1
-        return place
+        self._attempts[index] += 1
+        return index
 
-    def done(self, place: int) -> None:
+    def done(self, index: int) -> None:
         """Record that a trajectory is finished."""
-        self._running[self._scene[place]] -= 1
+        self._running[self._scene[index]] -= 1
 
-    def failed(self, place: int, error: str) -> int:
+    def failed(self, index: int, error: str) -> int:
         """Record a failed attempt; returns the number of attempts left. With some left, the trajectory waits again."""
-        self._running[self._scene[place]] -= 1
-        left = N_ATTEMPTS - self._attempts[place]
+        self._running[self._scene[index]] -= 1
+        left = N_ATTEMPTS - self._attempts[index]
         if left > 0:
-            self._waiting.setdefault(self._scene[place], deque()).append(place)
+            self._waiting.setdefault(self._scene[index], deque()).append(index)
         else:
-            self.failures[place] = error
+            self.failures[index] = error
         return left

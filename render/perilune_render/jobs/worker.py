@@ -36,7 +36,7 @@ class Worker:
     connection: Connection
     ready: bool = False
     """Whether it has received the job."""
-    place: int | None = None
+    trajectory: int | None = None
     """The trajectory that it renders."""
     scene_id: str | None = None
     """The scene that it keeps."""
@@ -68,7 +68,7 @@ class Worker:
 
 def start_worker(scratch: str, engine: str) -> Worker:
     """Start a worker, which writes its temporary files into the folder `scratch`."""
-    own, theirs = Pipe()
+    ours, theirs = Pipe()
     arguments = [str(theirs.fileno()), str(os.getpid()), scratch, engine]
     with theirs:
         process = subprocess.Popen(
@@ -80,7 +80,7 @@ def start_worker(scratch: str, engine: str) -> Worker:
             # Ctrl-C goes to this process alone, which then ends its workers.
             process_group=0,
         )
-    return Worker(process, own)
+    return Worker(process, ours)
 
 
 @contextlib.contextmanager

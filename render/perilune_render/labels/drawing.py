@@ -40,8 +40,8 @@ def padded(pictures: list[np.ndarray], in_row: list[int], columns: int) -> list[
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     sheet, rest = [], iter(pictures)
     for n in in_row:
-        own = [next(rest) for _ in range(n)] + [np.full((1, 1), _DARK, np.uint8)] * (-n % columns)
-        for picture in own:
+        row = [next(rest) for _ in range(n)] + [np.full((1, 1), _DARK, np.uint8)] * (-n % columns)
+        for picture in row:
             more = (0, height - picture.shape[0], 0, width - picture.shape[1])
             sheet.append(cv2.copyMakeBorder(picture, *more, cv2.BORDER_CONSTANT, value=(_DARK,) * 3))
     return sheet

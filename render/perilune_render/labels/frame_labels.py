@@ -6,7 +6,15 @@ import numpy as np
 import pandas as pd
 
 from perilune_render.imaging.radiance import Radiance
-from perilune_render.labels.pixels import Rims, centred_in, contrasts, rim_shares, smallest_crater, sunlit_fractions
+from perilune_render.labels.pixels import (
+    Circles,
+    Rims,
+    centred_in,
+    contrasts,
+    rim_shares,
+    smallest_crater,
+    sunlit_fractions,
+)
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
@@ -51,7 +59,7 @@ class Labels:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class GreyAndSun:
     """Mean and noise of a frame's grey values (`perilune_render.imaging.sensor.expected`), and the Sun."""
 
     grey: np.ndarray
@@ -99,24 +107,23 @@ def label_frame(
     position_m: Array,
     rotation_camera_from_site: Array,
     radiance: Radiance,
-    min_radius_px: float,
-    max_radius_px: float,
+    radii_px: tuple[float, float],
 ) -> Labels:
-    """Labels by the paper's rule: centre in the frame, radius sqrt(a b) within the bounds in pixels.
+    """Labels by the paper's rule: centre in the frame, radius sqrt(a b) from radii_px[0] to radii_px[1].
 
-    Visibility is measured in the rendered depth. `radiance` is in the pixels of `camera`
+    `position_m` (3,) is in O_L. Visibility is measured in the rendered depth. `radiance` is in the pixels of `camera`
     (`perilune_render.imaging.resampling.seen_by`). The contrast also depends on the sensor and is NaN here:
     `with_contrast` measures it.
     """
-    pose = position_m, rotation_camera_from_site
+    pose, (min_radius_px, max_radius_px) = (position_m, rotation_camera_from_site), radii_px
     if any(camera.distortion):
         in_camera = _in_camera(circles.centre_m, *pose)
         rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
         candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
         in_camera = in_camera[candidate]
     else:
-        shape = circles.centre_m, circles.normal, circles.radius_m
-        candidate, in_camera = centred_in(camera, *pose, *shape, min_radius_px)
+        in_site = Circles(circles.centre_m, circles.normal, circles.radius_m)
+        candidate, in_camera = centred_in(camera, *pose, in_site, min_radius_px)
     ellipses = project_circles(
         camera,
         in_camera,
@@ -153,13 +160,13 @@ def with_contrast(
     camera: Camera,
     position_m: Array,
     rotation_camera_from_site: Array,
-    shown: Shown,
+    image: GreyAndSun,
 ) -> Labels:
     """The labels with their contrast in the image of `camera` (`perilune_render.labels.pixels.contrasts`)."""
     rows = np.searchsorted(circles.crater_id, labels.crater_id)
     centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
-    matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, shown.sun, rows)
-    return replace(labels, contrast=contrasts(centre, matrices, shown.grey, shown.noise))
+    matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, image.sun, rows)
+    return replace(labels, contrast=contrasts(centre, matrices, image.grey, image.noise))
 
 
 def _image_from_rim(
@@ -222,7 +229,7 @@ def crater_index(
     centres, radii = in_camera[candidate], circles.radius_m[candidate]
     normals = circles.normal[candidate] @ rotation_camera_from_site.T
     boxes = project_circles(camera, centres, normals, radii).bounding_boxes()
-    image = smallest_crater(circles.crater_id[candidate], centres, normals, radii, boxes, camera, depth_m)
+    image = smallest_crater(circles.crater_id[candidate], Circles(centres, normals, radii), boxes, camera, depth_m)
     if depth_m is not None:
         image[~np.isfinite(depth_m)] = -1
     return image

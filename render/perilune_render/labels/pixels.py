@@ -14,34 +14,52 @@ REACH = 1.5
 """Radius of the disc in which contrast is measured, rim radii."""
 _N_FITTED = 4
 _SLACK = 0.99
-"""Of the least radius of selected craters: covers rounding, their ellipses are computed after."""
+"""Factor on the least radius of selected craters. Their ellipses are computed later, with other rounding."""
+
+
+class Circles(NamedTuple):
+    """N circles, as an argument of compiled functions."""
+
+    centre_m: Array
+    """Centres, metres (N, 3)."""
+    normal: Array
+    """Unit normals of their planes (N, 3)."""
+    radius_m: Array
+    """Radii, metres (N,)."""
+
+
+class _Pinhole(NamedTuple):
+    """A camera without distortion, as an argument of compiled functions: all in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+def _pinhole(camera: Camera) -> _Pinhole:
+    return _Pinhole(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px)
 
 
 def centred_in(
-    camera: Camera,
-    position_m: Array,
-    rotation_camera_from_site: Array,
-    centre_m: Array,
-    normal: Array,
-    radius_m: Array,
-    least_px: float,
+    camera: Camera, position_m: Array, rotation_camera_from_site: Array, circles: Circles, least_px: float
 ) -> tuple[np.ndarray, Array]:
-    """Circles of N craters in O_L that are centred in an image without distortion and may reach a radius sqrt(a b).
+    """Circles in O_L that are centred in an image without distortion and may reach a radius sqrt(a b) of `least_px`.
 
-    `centre_m` and `normal` are (N, 3), `radius_m` is (N,). A few smaller ones are selected too. Returns their indices
-    (M,) and their centres in O_C (M, 3). The places are those of `camera_from_site`, `Camera.project` and
-    `Camera.inside`, to the bit, in one loop: a scene has far more craters than an image.
+    A few smaller ones are selected too. Returns their indices (M,) and their centres in O_C (M, 3), metres. The centres
+    and pixels equal those of `camera_from_site`, `Camera.project` and `Camera.inside` to the bit. One loop computes
+    them, since a scene has far more craters than an image.
     """
-    pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
-    size = camera.width_px, camera.height_px
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
-    return _centred_in(centre_m, normal, radius_m, *pose, pinhole, size, least_px)
+    return _centred_in(circles, *pose, _pinhole(camera), least_px)
 
 
 @njit(error_model="numpy")
-def _centred_in(centre, normal, radius, position, rotation, pinhole, size, least):
-    (fx, fy, cx, cy), (width, height) = pinhole, size
-    rows, places = np.empty(len(centre), np.int64), np.empty((len(centre), 3))
+def _centred_in(circles, position, rotation, pinhole, least):
+    (centre, normal, radius), (fx, fy, cx, cy, width, height) = circles, pinhole
+    rows, in_camera = np.empty(len(centre), np.int64), np.empty((len(centre), 3))
     count = 0
     for k in range(len(centre)):
         dx, dy, dz = centre[k, 0] - position[0], centre[k, 1] - position[1], centre[k, 2] - position[2]
@@ -56,9 +74,9 @@ def _centred_in(centre, normal, radius, position, rotation, pinhole, size, least
                 n_z = normal[k, 0] * rotation[2, 0] + normal[k, 1] * rotation[2, 1] + normal[k, 2] * rotation[2, 2]
                 depth_2 = z * z - radius[k] ** 2 * (1 - n_z * n_z)
                 if (fx * fy * radius[k] ** 2 * along) ** 2 >= (_SLACK * least) ** 4 * depth_2**3:
-                    rows[count], places[count, 0], places[count, 1], places[count, 2] = k, x, y, z
+                    rows[count], in_camera[count, 0], in_camera[count, 1], in_camera[count, 2] = k, x, y, z
                     count += 1
-    return rows[:count].copy(), places[:count].copy()
+    return rows[:count].copy(), in_camera[:count].copy()
 
 
 class Rims(NamedTuple):
@@ -83,16 +101,15 @@ def rim_shares(
 ) -> Array:
     """Share (N,) of the points of rims that an image without distortion shows, given its depth (h, w), metres.
 
-    The same as `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the bit, in one loop.
+    One loop computes the same as `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the bit.
     """
-    pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
-    return _rim_shares(rims, *pose, pinhole, depth)
+    return _rim_shares(rims, *pose, _pinhole(camera), depth)
 
 
 @njit()
 def _rim_shares(rims, position, rotation, pinhole, depth):
-    (fx, fy, cx, cy), (height, width) = pinhole, depth.shape
+    fx, fy, cx, cy, width, height = pinhole
     shares = np.empty(len(rims.radius_m))
     for k in range(len(shares)):
         centre, p, q, radius = rims.centre_m[k], rims.p[k], rims.q[k], rims.radius_m[k]
@@ -110,8 +127,8 @@ def _rim_shares(rims, position, rotation, pinhole, depth):
                 y = dx * rotation[1, 0] + dy * rotation[1, 1] + dz * rotation[1, 2]
                 u, v = fx * (x / z) + cx, fy * (y / z) + cy
                 if 0 <= u < width and 0 <= v < height:
-                    found = depth[int(v), int(u)]
-                    shown += np.isfinite(found) and z <= found + slack
+                    ground_z = depth[int(v), int(u)]
+                    shown += np.isfinite(ground_z) and z <= ground_z + slack
         shares[k] = shown / len(rims.cos)
     return shares
 
@@ -121,13 +138,13 @@ def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
 
     0 if an ellipse contains no pixel centre.
     """
-    shape = ellipses.a_px, ellipses.b_px, ellipses.theta_rad
-    return _lit(ellipses.cx_px, ellipses.cy_px, *shape, ellipses.bounding_boxes(), sunlit)
+    shapes = ellipses.cx_px, ellipses.cy_px, ellipses.a_px, ellipses.b_px, ellipses.theta_rad
+    return _lit(shapes, ellipses.bounding_boxes(), sunlit)
 
 
 @njit()
-def _lit(cx, cy, a, b, theta, boxes, sunlit):
-    height, width = sunlit.shape
+def _lit(shapes, boxes, sunlit):
+    (cx, cy, a, b, theta), (height, width) = shapes, sunlit.shape
     share = np.zeros(len(cx))
     for k in range(len(cx)):
         cos, sin = np.cos(theta[k]), np.sin(theta[k])
@@ -153,8 +170,8 @@ def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: 
 
     Within REACH radii, grey is fitted by least squares as a plane plus c times the shading of a bowl,
     -s exp(-(r / 0.8)^4), with r the distance from the centre and s its component towards the Sun: the wall that faces
-    the Sun is bright. The result is c over its standard error, where a pixel's variance is the sum of that of the noise
-    and that of the fit's residuals. It is negative for a bump, about 0 for flat ground, and 0 if too few pixels are in
+    the Sun is bright. The result is c over its standard error, where a pixel's variance is the sum of the variances of
+    noise and of the fit's residuals. It is negative for a bump, about 0 for flat ground, and 0 if too few pixels are in
     the image.
     """
     matrices = np.ascontiguousarray(image_from_rim, np.float64)
@@ -188,12 +205,12 @@ def _shading(centre, matrices, grey, noise):
                     continue
                 values[0], values[1], values[2] = 1.0, s, t
                 values[3] = -s * np.exp(-((square / 0.64) ** 2))
-                own = grey[row, column] - level
+                value = grey[row, column] - level
                 for i in range(_N_FITTED):
-                    right[i] += values[i] * own
+                    right[i] += values[i] * value
                     for j in range(i + 1):
                         normal[i, j] += values[i] * values[j]
-                squares += own * own
+                squares += value * value
                 variance += noise[row, column] ** 2
                 count += 1
         if count <= _N_FITTED:
@@ -225,31 +242,23 @@ def _over_its_error(normal, right, squares, variance, count):
 
 
 def smallest_crater(
-    crater_id: np.ndarray,
-    centre_m: Array,
-    normal: Array,
-    radius_m: Array,
-    boxes_px: Array,
-    camera: Camera,
-    depth_m: np.ndarray | None,
+    crater_id: np.ndarray, circles: Circles, boxes_px: Array, camera: Camera, depth_m: np.ndarray | None
 ) -> np.ndarray:
     """Index image (h, w) float32: the id of the last of N craters whose visible interior holds each pixel's centre.
 
-    The craters are in O_C, largest first: centres (N, 3) and radii (N,) in metres, unit normals (N, 3), bounding boxes
-    of the rims' images (N, 4), pixels. `camera` has no distortion. depth_m (h, w), metres along the axis, hides
-    interiors; None hides nothing. Pixels without a crater are -1.
+    `circles` are the rims in O_C, largest first, `boxes_px` (N, 4) the bounding boxes of their images. `camera` has no
+    distortion. depth_m (h, w), metres along the axis, hides interiors; None hides nothing. Pixels without a crater
+    are -1.
     """
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)
     depth = np.full((1, 1), np.inf) if depth_m is None else depth_m
-    pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
-    _fill(image, crater_id, centre_m, normal, radius_m, boxes_px, pinhole, depth)
+    _fill(image, crater_id, circles, boxes_px, _pinhole(camera), depth)
     return image
 
 
 @njit()
-def _fill(image, crater_id, centre, normal, radius, boxes, pinhole, depth):
-    height, width = image.shape
-    fx, fy, cx, cy = pinhole
+def _fill(image, crater_id, circles, boxes, pinhole, depth):
+    (centre, normal, radius), (fx, fy, cx, cy, width, height) = circles, pinhole
     seen = depth.shape == image.shape
     for k in range(len(crater_id)):
         if not np.isfinite(boxes[k]).all():

@@ -1,13 +1,14 @@
 """Hazard map of a scene: slope, roughness, boulders and shadow under the footprint of a lander.
 
-The definitions are those of hazard detection in the ALHAT project (Johnson et al. 2008, IEEE Aerospace Conference,
+The definitions come from hazard detection in the ALHAT project (Johnson et al. 2008, IEEE Aerospace Conference,
 "Analysis of on-board hazard detection and avoidance for safe lunar landing"): a plane is fitted to the heights in a
-footprint; its slope is the slope, and the largest deviation from it is the roughness. Deviations: the map is that of
-the true ground, not of measurements; the plane is the least-squares plane of the ground without boulders, which count
-in the roughness.
+footprint; its slope is the slope, and the largest deviation from it is the roughness. Deviations: the map shows the
+true ground, not measurements; the plane is fitted by least squares to the ground without boulders, which count in the
+roughness.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from perilune_render.engines.heightfield.query import first_hits, heights_m
 from perilune_render.engines.heightfield.surface import Surface
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.boulders import highest_points
+from perilune_render.terrain.export import site_profile
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
@@ -51,14 +53,14 @@ class HazardMap:
         """The FRAME_LAYERS (...) float32 of the pixels at places (...) of O_L; NaN off the map and for NaN."""
         n = len(self.layers["safe"])
         with np.errstate(invalid="ignore"):
-            column, row = (np.floor(place / self.pixel_m + n / 2) for place in (-x_m, y_m))
+            column, row = (np.floor(offset_m / self.pixel_m + n / 2) for offset_m in (-x_m, y_m))
             inside = (column >= 0) & (column < n) & (row >= 0) & (row < n)
         where = np.where(inside, row, 0).astype(np.int64), np.where(inside, column, 0).astype(np.int64)
         return {name: np.where(inside, self.layers[name][where], np.float32(np.nan)) for name in FRAME_LAYERS}
 
 
 def check_hazard(config: HazardConfig, grid: Grid) -> None:
-    """Raises UserError if the footprints of a map do not all lie on the ground of `grid`."""
+    """Raise UserError if the footprints of a map do not all lie on the ground of `grid`."""
     needed = (config.side_px() + 2 * config.margin_px() + 1) * config.pixel_m
     if needed > grid.extent_m:
         most = grid.extent_m - config.footprint_m - config.pixel_m
@@ -88,8 +90,9 @@ def hazard_map(surface: Surface, scene: Scene, sun: Array, config: HazardConfig)
     offset = np.arange(-margin, margin + 1)
     down, right = np.meshgrid(offset, offset, indexing="ij")
     disc = np.hypot(down, right) * config.pixel_m <= config.footprint_m / 2 * (1 + 1e-9)
-    found = _footprints(ground, above, dark, down[disc], right[disc], margin, config.pixel_m)
-    slope, roughness, boulder, shadow = (layer.astype(np.float32) for layer in found)
+    footprint = _Footprint(down[disc], right[disc], margin, config.pixel_m)
+    measured = _footprints(ground, above, dark, footprint)
+    slope, roughness, boulder, shadow = (layer.astype(np.float32) for layer in measured)
     safe = (slope <= config.max_slope_deg) & (roughness <= config.max_roughness_m)
     safe &= (boulder <= config.max_boulder_m) & (shadow <= config.max_shadow_share)
     inner = slice(margin, margin + n)
@@ -113,19 +116,35 @@ def _raise_to_boulders(above: Array, surface: Surface, scene: Scene, pixel_m: fl
         return
     points = highest_points(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed)
     side = len(above)
-    column, row = (np.floor(place / pixel_m + side / 2).astype(np.int64) for place in (-points[:, 0], points[:, 1]))
+    column, row = (
+        np.floor(offset_m / pixel_m + side / 2).astype(np.int64) for offset_m in (-points[:, 0], points[:, 1])
+    )
     inside = (column >= 0) & (column < side) & (row >= 0) & (row < side)
     x, y, z = points[inside].T
     np.maximum.at(above, (row[inside], column[inside]), z - heights_m(surface, x, y, boulders=False))
 
 
+class _Footprint(NamedTuple):
+    """The M pixels under a lander, as offsets from the pixel at its centre, symmetric about 0."""
+
+    down: np.ndarray
+    """Rows southwards (M,)."""
+    right: np.ndarray
+    """Columns eastwards (M,)."""
+    margin: int
+    """Largest offset, pixels."""
+    pixel_m: float
+    """Size of a pixel, metres."""
+
+
 @njit()
-def _footprints(ground, above, dark, down, right, margin, pixel_m):
+def _footprints(ground, above, dark, footprint):
     """Slope, degrees, roughness and largest boulder, metres, and share of shadow of the footprint of each pixel.
 
-    Arrays (side, side) have a margin of `margin` pixels; `down` and `right` (M,) are the offsets of the footprint's
-    pixels, symmetric about 0, so that the sums of the plane's fit have no mixed terms.
+    The arrays (side, side) extend beyond these pixels by the footprint's margin. A footprint is symmetric, so the sums
+    of the plane's fit have no mixed terms.
     """
+    down, right, margin, pixel_m = footprint
     n, m = len(ground) - 2 * margin, len(down)
     slope, roughness, boulder, shadow = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     squares = 0.0
@@ -156,3 +175,18 @@ def _footprints(ground, above, dark, down, right, margin, pixel_m):
             boulder[row, column] = highest
             shadow[row, column] = shade / m
     return slope, roughness, boulder, shadow
+
+
+def hazard_tiff(hazard: HazardMap, latitude_deg: float, longitude_deg: float) -> bytes:
+    """A float32 GeoTIFF with a named band for each layer: north up, azimuthal equidistant about the site."""
+    from rasterio.io import MemoryFile
+
+    n = len(hazard.layers["safe"])
+    profile = site_profile(latitude_deg, longitude_deg, n, hazard.pixel_m, len(LAYERS))
+    with MemoryFile() as memory:
+        with memory.open(**profile, nodata=np.nan) as raster:
+            for band, (name, unit) in enumerate(LAYERS.items(), 1):
+                raster.write(hazard.layers[name], band)
+                raster.set_band_description(band, name)
+                raster.set_band_unit(band, unit)
+        return bytes(memory.getbuffer())

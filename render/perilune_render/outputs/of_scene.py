@@ -16,8 +16,8 @@ from perilune_shared.geometry.frames import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
-    """What there is of a frame beside its rendering."""
+class FrameOutputs:
+    """Outputs of a frame beside its rendering."""
 
     channels: Mapping[str, np.ndarray] = field(default_factory=dict)
     """More channels of the EXR (h, w), in the pixels of the engine's camera."""
@@ -49,12 +49,12 @@ class SceneOutputs:
         hazard = hazard_map(surface, scene, sun, config.hazard)
         return cls(surface, hazard, config.hazard.frame_channels, config.flash_lidar)
 
-    def beside(self, frame: Frame, places_m: Callable[[Frame], Array]) -> Beside:
-        """The outputs beside a frame; `places_m` is that of its frame source."""
+    def of_frame(self, frame: Frame, places_m: Callable[[Frame], Array]) -> FrameOutputs:
+        """The outputs beside a frame; `places_m` is the method of its frame source."""
         channels: Mapping[str, np.ndarray] = {}
         if self.hazard is not None and self.has_channels:
-            places = places_m(frame)
-            channels = self.hazard.at(places[..., 0], places[..., 1])
+            points = places_m(frame)
+            channels = self.hazard.at(points[..., 0], points[..., 1])
         if self.surface is None or self.flash_lidar is None:
-            return Beside(channels)
-        return Beside(channels, flash(self.surface, frame.shot, self.flash_lidar).exr())
+            return FrameOutputs(channels)
+        return FrameOutputs(channels, flash(self.surface, frame.shot, self.flash_lidar).exr())

@@ -11,7 +11,7 @@ Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns 
 manifest. `# rotation: site_from_camera` states the opposite direction; in TUM, EuRoC and KITTI files that is always so.
 `# camera_axes: blender`, or three axes, states other axes of the camera than x right, y down, z forward.
 
-`# site: latitude longitude`, degrees, is optional; poses of another site than that of the scene are refused.
+`# site: latitude longitude`, degrees, is optional; poses of another site than the scene's are refused.
 """
 
 import hashlib
@@ -69,7 +69,7 @@ class GivenPoses:
     """Angular velocity of the camera, O_C, radians per second (N, 3); None if the file has none."""
 
     line: np.ndarray | None = None
-    """Line of each pose in the file, from 1 (N,); None if its poses have no lines but rows, from 0."""
+    """Line of each pose in the file, from 1 (N,); None for a file of rows, counted from 0."""
     attitudes: Attitudes | None = None
     """The attitudes as in the file; None if there is none."""
 
@@ -77,7 +77,7 @@ class GivenPoses:
         return len(self.time_s)
 
     def origin(self, index: int) -> str:
-        """The place of a pose in its file, for messages."""
+        """Line or row of a pose in its file, for messages."""
         return f"row {index}" if self.line is None else f"line {self.line[index]}"
 
     @property
@@ -107,17 +107,17 @@ def read_poses(path: Path, latitude_deg: float, longitude_deg: float, axes: str 
     _check_site(path, stated.get("site"), latitude_deg, longitude_deg)
     if not columns.n_rows:
         raise UserError(path, "poses", 0, "at least one")
-    place = _vectors(table, FRAMES[frame])
+    position = _vectors(table, FRAMES[frame])
     if frame == "selenographic":
-        x, y = site_from_selenographic(place[:, 0], place[:, 1], latitude_deg, longitude_deg)
-        place = np.stack([x, y, place[:, 2]], axis=1)
+        x, y = site_from_selenographic(position[:, 0], position[:, 1], latitude_deg, longitude_deg)
+        position = np.stack([x, y, position[:, 2]], axis=1)
     if frame == "O_W":
-        place = place + _origin(path, stated)
+        position = position + _origin(path, stated)
     _refuse(
         table,
-        (np.abs(place) > _LARGEST_M).any(axis=1),
+        (np.abs(position) > _LARGEST_M).any(axis=1),
         "position",
-        lambda row: f"{np.abs(place[row]).max():.3g} m from the site",
+        lambda row: f"{np.abs(position[row]).max():.3g} m from the site",
         f"at most {_LARGEST_M:.0f} m",
     )
     trajectory = _trajectories(table)
@@ -138,7 +138,7 @@ def read_poses(path: Path, latitude_deg: float, longitude_deg: float, axes: str 
     if turn is not None and not np.array_equal(attitudes.axes, np.eye(3)):
         turn = turn @ attitudes.axes.T
     rotation = attitudes.rotation_wxyz
-    return GivenPoses(time, place, rotation, velocity, sun, trajectory, turn, columns.lines, attitudes)
+    return GivenPoses(time, position, rotation, velocity, sun, trajectory, turn, columns.lines, attitudes)
 
 
 def _refuse(table: PoseTable, wrong: np.ndarray, field: str, found: Callable[[int], str], expected: str) -> None:
@@ -173,7 +173,7 @@ def _motion(table: PoseTable, field: str, names: tuple[str, ...], largest: float
 
 
 def _check_site(path: Path, stated: str | None, latitude_deg: float, longitude_deg: float) -> None:
-    """Raises UserError if a file states another site than that of the scene."""
+    """Raise UserError if a file states another site than the scene's."""
     if stated is None:
         return
     try:

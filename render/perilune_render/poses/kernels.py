@@ -66,7 +66,7 @@ def _named_by(spice: Any, path: Path) -> list[Path]:
 
 
 def _check_regular(where: Path, path: Path, expected: str) -> None:
-    """Raises UserError about `where` for a path that is no regular file."""
+    """Raise UserError about `where` for a path that is no regular file."""
     field = "kernel" if where == path else _LISTED
     prefix = "" if where == path else f"{path}: "
     try:
@@ -113,12 +113,12 @@ def _texts(spice: Any, path: Path, name: str) -> list[str]:
         raise UserError(path, name, "numbers", "texts in quotes")
     if n_parts > _MOST_LISTED:
         raise UserError(path, name, f"{n_parts} texts", f"at most {_MOST_LISTED}")
-    found: list[str] = []
+    texts: list[str] = []
     with contextlib.suppress(spice.exceptions.NotFoundError):
-        while len(found) < n_parts:
-            text, _ = spice.stpool(name, len(found), "+", _MOST_CHARACTERS)
-            found.append(text)
-    return found
+        while len(texts) < n_parts:
+            text, _ = spice.stpool(name, len(texts), "+", _MOST_CHARACTERS)
+            texts.append(text)
+    return texts
 
 
 @contextlib.contextmanager

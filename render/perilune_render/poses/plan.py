@@ -1,4 +1,4 @@
-"""The plan of given poses: one ground, a trajectory for each of the user's, the views that the ground is made for."""
+"""The plan of given poses: one ground, the user's trajectories, and the views for which the ground is made."""
 
 from dataclasses import replace
 from functools import partial
@@ -26,7 +26,7 @@ SAME_SUN_DEG = 0.05
 _MOST_SCENES = 1000
 _N_VIEWS = 24
 _LOWER = 0.9
-"""Ground may rise towards a camera by a tenth of its height: the share of the height that the views allow for."""
+"""Rise of the ground towards a camera for which the views have a margin, share of the camera's height."""
 _WIDER = 1.05
 _SPLIT = "test"
 _N_CHECKED = 1000
@@ -69,21 +69,21 @@ def horizon_views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewCo
         places.append(position)
     position = np.concatenate(places)
     height, away = position[:, 2], np.abs(position[:, :2]).max(axis=1)
-    found = _views(height, np.maximum(_WIDER * away, 0.1 * height))
+    views = _views(height, np.maximum(_WIDER * away, 0.1 * height))
     highest = min(_rounded(height.max(), np.ceil), HIGHEST_M)
-    return (*found, ViewConfig(height_m=highest, reach_m=found[-1].reach_m))
+    return (*views, ViewConfig(height_m=highest, reach_m=views[-1].reach_m))
 
 
 def _views(height_m: Array, reach_m: Array) -> list[ViewConfig]:
     """Views that hold cameras at heights (N,) with reaches (N,), both in metres."""
     edges = np.geomspace(_LOWER * height_m.min(), _LOWER * height_m.max() * 1.001, _N_VIEWS + 1)
-    found: list[ViewConfig] = []
+    views: list[ViewConfig] = []
     for low, high in pairwise(edges):
         farthest = _rounded(reach_m[_LOWER * height_m <= high].max(), np.ceil)
         lowest_m = _rounded(low, np.floor)
-        if not found or (farthest > found[-1].reach_m and lowest_m > found[-1].height_m):
-            found.append(ViewConfig(height_m=lowest_m, reach_m=farthest))
-    return found
+        if not views or (farthest > views[-1].reach_m and lowest_m > views[-1].height_m):
+            views.append(ViewConfig(height_m=lowest_m, reach_m=farthest))
+    return views
 
 
 def _check_above(height_m: Array, poses: GivenPoses, where: object) -> None:
@@ -99,22 +99,24 @@ def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tu
 
 
 def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: bool) -> None:
-    """Refuse attitudes that leave the ground if other readings of the file show it in all frames, and name those.
+    """Refuse attitudes that do not show the ground if another reading of the file shows it in all frames; name it.
 
     Checks up to _N_CHECKED poses. Others that leave the ground are refused later.
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _N_CHECKED)).round().astype(int))
-    place = poses.position_m[chosen]
-    if poses.attitudes is None or (place[:, 2] <= 0).any():
+    position = poses.position_m[chosen]
+    if poses.attitudes is None or (position[:, 2] <= 0).any():
         return
     stated = replace(poses.attitudes, quaternion_wxyz=poses.attitudes.quaternion_wxyz[chosen])
-    shown = _is_ground_shown(place, stated.rotation_wxyz, rig, horizon=horizon)
+    shown = _is_ground_shown(position, stated.rotation_wxyz, rig, horizon=horizon)
     if shown.all():
         return
     single, double = stated.alternatives()
     for readings in (single, [] if shown.any() else double):
         fitting = [
-            what for what, other in readings if _is_ground_shown(place, other.rotation_wxyz, rig, horizon=horizon).all()
+            what
+            for what, other in readings
+            if _is_ground_shown(position, other.rotation_wxyz, rig, horizon=horizon).all()
         ]
         if fitting:
             n = int(chosen[np.argmin(shown)])
@@ -165,8 +167,8 @@ def _reach(poses: GivenPoses, mounted: MountedCamera, name: str | None, where: o
         "a view of the ground alone; state dataset.scene.views for others, or dataset.scene.horizon=true for the sky",
     )
     lowest = -0.1 * height[:, None, None]
-    way = (lowest - position[:, None, 2:]) / rays[..., 2:]
-    reach = _WIDER * np.abs(position[:, None, :2] + way * rays[..., :2]).max(axis=(1, 2))
+    distance = (lowest - position[:, None, 2:]) / rays[..., 2:]
+    reach = _WIDER * np.abs(position[:, None, :2] + distance * rays[..., :2]).max(axis=(1, 2))
     return height, reach
 
 
@@ -195,21 +197,21 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     seed = scene_seed(config)
     scenes = tuple(ScenePlan(f"scene-{k:04d}", seed, *map(float, sun)) for k, sun in enumerate(suns))
     trajectories: list[TrajectoryPlan] = []
-    places: dict[str, range] = {}
-    for k, one in enumerate(scenes):
+    ranges: dict[str, range] = {}
+    for k, lit in enumerate(scenes):
         first = len(trajectories)
         numbers = np.unique(poses.trajectory[lit_by == k]).tolist()
         rows = [np.flatnonzero((poses.trajectory == number) & (lit_by == k)) for number in numbers]
-        bodies = [_trajectory(poses, own, one, number) for own, number in zip(rows, numbers, strict=True)]
+        bodies = [_trajectory(poses, of_body, lit, number) for of_body, number in zip(rows, numbers, strict=True)]
         trajectories += [seen_by(body, name, rig) for name in rig for body in bodies]
-        places[one.scene_id] = range(first, len(trajectories))
+        ranges[lit.scene_id] = range(first, len(trajectories))
     view = scene_view(scene, *(each.exr_camera for each in rig.values()))
-    plan = Plan(rig, view, scenes, tuple(trajectories), places)
+    plan = Plan(rig, view, scenes, tuple(trajectories), ranges)
     return plan, config.model_copy(update={"scene": scene})
 
 
 def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarray]:
-    """Azimuth and elevation of each different Sun, degrees, and the index (N,) of that of each frame."""
+    """Azimuth and elevation of each different Sun, degrees, and for each frame the index (N,) of its Sun."""
     if poses.sun_deg is None:
         return [np.array([scene.sun_azimuth_deg, scene.sun_elevation_deg])], np.zeros(len(poses), int)
     suns: list[Array] = []
@@ -235,7 +237,7 @@ def _is_same_sun(sun: Array, others: Array) -> np.ndarray:
 
 
 def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: int) -> TrajectoryPlan:
-    """The frames `rows` of a user's trajectory; their indices and times are those in the whole trajectory."""
+    """The frames `rows` of a user's trajectory, with their indices and times in the whole trajectory."""
     name = f"trajectory-{number:04d}"
     whole = np.flatnonzero(poses.trajectory == number)
     part, origin = partial(_flight, poses, rows, whole), partial(_origin, poses, rows)
@@ -245,9 +247,9 @@ def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: i
     return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False, origin=origin)
 
 
-def _origin(poses: GivenPoses, rows: np.ndarray, place: int) -> str:
-    """The place in the poses' file of the pose at index `place` of `rows`."""
-    return poses.origin(int(rows[place]))
+def _origin(poses: GivenPoses, rows: np.ndarray, index: int) -> str:
+    """Where the pose at an index of `rows` stands in the file of poses."""
+    return poses.origin(int(rows[index]))
 
 
 def _flight(poses: GivenPoses, rows: np.ndarray, whole: np.ndarray) -> Flight:

@@ -30,7 +30,7 @@ _FIXED_FRAMES = ("MOON_ME", "IAU_MOON")
 """Frames fixed to the Moon in order of preference: the first that the kernels define is used."""
 _MOST_FRAMES = 100_000
 _LOADING_LIMIT_S = 60.0
-"""Maximum time of opening all kernels: a file that was replaced by a pipe after its check would block for ever."""
+"""Longest time to open all kernels, seconds: a file that was replaced by a pipe after its check blocks for ever."""
 _LOADED = "loaded"
 
 
@@ -41,7 +41,7 @@ class SpiceSource:
     kernels: tuple[Path, ...]
     """Kernels and meta-kernels, later ones override earlier ones."""
     spacecraft: str
-    """Name or NAIF id of the spacecraft, or of its camera if the kernels have its place."""
+    """Name or NAIF id of the spacecraft, or of its camera if the kernels have the camera's position."""
     camera_frame: str
     """Name of the camera's frame."""
     camera_axes: str
@@ -82,7 +82,7 @@ class SpicePoses:
 
 
 def rotation_site_from_fixed(latitude_deg: float, longitude_deg: float) -> Array:
-    """The rotation (3, 3) from axes fixed to the Moon (x to 0 N 0 E, z north) to those of O_L at a site."""
+    """The rotation (3, 3) from axes fixed to the Moon (x to 0 N 0 E, z north) to the axes of O_L at a site."""
     (sin_lat, cos_lat), (sin_lon, cos_lon) = ((np.sin(a), np.cos(a)) for a in np.radians([latitude_deg, longitude_deg]))
     west = [sin_lon, -cos_lon, 0.0]
     south = [sin_lat * cos_lon, sin_lat * sin_lon, -cos_lat]
@@ -257,7 +257,7 @@ def _body(spice: Any, name: str) -> str:
 
 
 def _refuse_night(towards: Array, utc: str) -> None:
-    """Raises UserError if the Sun is at or below the site's plane."""
+    """Raise UserError if the Sun is at or below the site's plane."""
     if towards[2] <= 0:
         degrees = np.degrees(np.arcsin(towards[2] / np.linalg.norm(towards)))
         raise UserError(

@@ -18,7 +18,7 @@ from perilune_shared.storage.tables.limits import POSES
 from perilune_shared.storage.tables.read import open_table
 
 SITE_FROM_CAMERA = "site_from_camera"
-"""What a header states of a rotation in this direction; that of every TUM, EuRoC and KITTI file."""
+"""Direction of rotation in a header, and in every TUM, EuRoC and KITTI file."""
 _KEYS = ("frame", "rotation", "origin_m", "site", "camera_axes")
 TIME, POSITION, ROTATION = "time_s", ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
 SELENOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
@@ -37,7 +37,7 @@ _EUROC_BIASES = tuple(f"b_{kind}_RS_S_{axis}" for kind in "wa" for axis in "xyz"
 _SUFFIXES = (".csv", ".parquet", ".tum", ".txt", ".kitti")
 _OTHER_SUFFIXES = {".json": "JSON, as of NeRF or Blender", ".bag": "a ROS bag", ".db3": "a ROS bag", ".mcap": "MCAP"}
 _LARGEST_S = 1e11
-"""Above every clock in seconds; nanoseconds since 1970 are 1e18."""
+"""Largest time that can be in seconds; nanoseconds since 1970 are 1e18."""
 _MATRIX_TOLERANCE = 0.01
 """Largest deviation of a rotation matrix that rounding of its digits explains."""
 _IDENTITY_TOLERANCE = 1e-6
@@ -93,9 +93,9 @@ def read_pose_table(path: Path) -> PoseTable:
                 "TUM",
             )
         frame = stated.get("frame", "")
-        place = SELENOGRAPHIC if frame == "selenographic" else POSITION
-        _check_columns(path, table.names, place)
-        kinds: dict[str, Kind] = dict.fromkeys((TIME, *place, *ROTATION, *VELOCITY, *TURN, *SUN), "number")
+        position = SELENOGRAPHIC if frame == "selenographic" else POSITION
+        _check_columns(path, table.names, position)
+        kinds: dict[str, Kind] = dict.fromkeys((TIME, *position, *ROTATION, *VELOCITY, *TURN, *SUN), "number")
         columns = table.read({**kinds, TRAJECTORY: "text"})
     return PoseTable(_seconds(columns), stated, "CSV" if columns.lines is not None else "Parquet")
 
@@ -122,9 +122,9 @@ def _euroc_header(comments: Sequence[str], n_columns: int) -> list[str] | None:
     return None
 
 
-def _check_columns(path: Path, found: Sequence[str], place: tuple[str, ...]) -> None:
-    """Raises UserError for a column that is missing, unknown, given twice, or without the others of its group."""
-    needed = (TIME, *place, *ROTATION)
+def _check_columns(path: Path, found: Sequence[str], position: tuple[str, ...]) -> None:
+    """Raise UserError for a column that is missing, unknown, given twice, or without the others of its group."""
+    needed = (TIME, *position, *ROTATION)
     known = (*needed, *VELOCITY, *TURN, *SUN, TRAJECTORY)
     if ROTATION[0] not in found:
         for name in found:
@@ -156,7 +156,7 @@ def _renamed(columns: Columns, names: Mapping[str, str]) -> Columns:
 
 
 def _fixed_direction(path: Path, stated: dict[str, str], name: str) -> dict[str, str]:
-    """What a header states, with the direction of rotation of a format. Raises UserError if it states the other one."""
+    """What a header states, with the direction of rotation of a format. Raises UserError if both differ."""
     if stated.get("rotation", SITE_FROM_CAMERA) != SITE_FROM_CAMERA:
         raise UserError(path, "rotation", stated["rotation"], f"{SITE_FROM_CAMERA}, as in every {name} file")
     if stated.get("frame") == "selenographic":
@@ -218,12 +218,12 @@ def _kitti(path: Path, columns: Columns) -> Columns:
 def _kitti_times(path: Path, n_poses: int) -> Array:
     """Times of a KITTI file, from the file NAME.times.txt or times.txt beside it."""
     beside = [path.with_name(f"{path.stem}.times.txt"), path.with_name("times.txt")]
-    found = next((each for each in beside if each.is_file()), None)
-    if found is None:
+    times_file = next((each for each in beside if each.is_file()), None)
+    if times_file is None:
         expected = f"{beside[0].name} or times.txt beside it, a time in seconds for each pose"
         raise UserError(path, "times of a KITTI file", "no such file", expected)
-    with open_table(found, POSES, (TIME,)) as table:
+    with open_table(times_file, POSES, (TIME,)) as table:
         times = table.read({TIME: "number"}).finite(TIME)
     if len(times) != n_poses:
-        raise UserError(found, "times", len(times), f"{n_poses}, one for each pose of {path.name}")
+        raise UserError(times_file, "times", len(times), f"{n_poses}, one for each pose of {path.name}")
     return times

@@ -56,15 +56,15 @@ def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, 
         mounted = plan.rig[trajectory.camera]
         with open_engine(scene, config, mounted.exr_camera, scene_plan.sun) as engine:
             source = FrameSource.of(engine, config, mounted.camera, RimCircles.of_scene(scene), trajectory.camera)
-            own, own_dark = _rows(source, trajectory, scene, model, config, n_frames)
-        pictures += own
+            row, own_dark = _rows(source, trajectory, scene, model, config, n_frames)
+        pictures += row
         dark += own_dark
     warn_of_dark_frames(scene_plan.scene_id, dark, n_frames * len(trajectories), scene_plan.sun_elevation_deg)
     if len(trajectories) > 1:
         pictures = padded(pictures, [n_frames] * 2 * len(trajectories), n_frames)
     tracks = [each.flight.position_m for lit in same_ground for each in plan.of_scene(lit.scene_id)]
-    place = scene.latitude_deg, scene.longitude_deg
-    picture = map_picture(config.name, site_map(scene, model, scene_plan.sun), scene_plan, place, tracks, horizon)
+    site_deg = scene.latitude_deg, scene.longitude_deg
+    picture = map_picture(config.name, site_map(scene, model, scene_plan.sun), scene_plan, site_deg, tracks, horizon)
     write_sheet(path, pictures, n_frames)
     write_bytes(map_path, cv2.imencode(".png", picture)[1].tobytes())
 

@@ -42,7 +42,8 @@ def map_picture(
     _draw_scale(relief, 2 * site_map.half_width_m / _MAP_PX)
     picture = np.full((_MAP_PX + 2 * _EDGE_PX, _MAP_PX + 3 * _EDGE_PX + _LEGEND_PX, 3), _PAPER, np.uint8)
     picture[_EDGE_PX : _EDGE_PX + _MAP_PX, _EDGE_PX : _EDGE_PX + _MAP_PX] = relief
-    _draw_legend(picture, name, site_map, plan, place_deg, len(tracks), horizon)
+    facts = _facts(site_map, plan, place_deg, horizon)
+    _draw_legend(picture, name, facts, site_map, plan.sun_azimuth_deg, len(tracks))
     return picture
 
 
@@ -100,20 +101,13 @@ def _draw_scale(picture: np.ndarray, pixel_m: float) -> None:
     _write(picture, text, (20, base - 10))
 
 
-def _draw_legend(
-    picture: np.ndarray,
-    name: str,
-    site_map: SiteMap,
-    plan: ScenePlan,
-    place_deg: tuple[float, float],
-    n_tracks: int,
-    horizon: SiteHorizon,
-) -> None:
-    left, top = _MAP_PX + 2 * _EDGE_PX, _EDGE_PX + 18
+def _facts(
+    site_map: SiteMap, plan: ScenePlan, place_deg: tuple[float, float], horizon: SiteHorizon
+) -> list[tuple[str, Colour]]:
+    """Lines of the legend about site, Sun and heights, with their colours."""
     height = site_map.height_m[np.isfinite(site_map.height_m)]
     dark = horizon.elevation_deg > plan.sun_elevation_deg
-    _write(picture, name[:26], (left, top), 0.6)
-    lines = [
+    return [
         (plan.scene_id, _FAINT),
         (f"site: latitude {place_deg[0]:.5f} deg", _INK),
         (f"      longitude {place_deg[1]:.5f} deg", _INK),
@@ -123,10 +117,23 @@ def _draw_legend(
         (f"the site lies {'in shadow' if dark else 'in the sun'}", (0, 0, 200) if dark else (0, 130, 0)),
         (f"heights: {height.min():.0f} to {height.max():.0f} m", _INK),
     ]
-    for text, colour in lines:
+
+
+def _draw_legend(
+    picture: np.ndarray,
+    name: str,
+    facts: list[tuple[str, Colour]],
+    site_map: SiteMap,
+    azimuth_deg: float,
+    n_tracks: int,
+) -> None:
+    """Write name and facts, and draw the compass with the Sun's azimuth and the keys of the map."""
+    left, top = _MAP_PX + 2 * _EDGE_PX, _EDGE_PX + 18
+    _write(picture, name[:26], (left, top), 0.6)
+    for text, colour in facts:
         top += 26
         _write(picture, text, (left, top), colour=colour)
-    _draw_compass(picture, (left + 90, top + 110), plan.sun_azimuth_deg)
+    _draw_compass(picture, (left + 90, top + 110), azimuth_deg)
     top += 220
     keys: list[tuple[Colour, str]] = [(_TRACK, f"ground tracks ({n_tracks}), from the dot")]
     if site_map.ground_half_m < 0.99 * site_map.half_width_m:
@@ -150,7 +157,7 @@ def _draw_legend(
 
 
 def _draw_compass(picture: np.ndarray, at: tuple[int, int], azimuth_deg: float) -> None:
-    """North up, and an arrow in which sunlight falls across the map."""
+    """North up, and an arrow along which sunlight falls across the map."""
     cv2.circle(picture, at, 50, _FAINT, 1, cv2.LINE_AA)
     cv2.arrowedLine(picture, (at[0], at[1] + 40), (at[0], at[1] - 40), _INK, 2, cv2.LINE_AA, tipLength=0.2)
     _write(picture, "N", (at[0] - 6, at[1] - 58))

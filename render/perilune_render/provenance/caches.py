@@ -94,15 +94,15 @@ def _kept(name: str, compute: Callable[[], Fingerprint]) -> Fingerprint:
 
     The file is valid for one state of the sources. If it is damaged or cannot be written, fingerprints are computed.
     """
-    place = hashlib.sha256(repr(sorted(FOLDERS.items())).encode()).hexdigest()[:16]
-    path, state = _kernels() / f"hashes-{place}.json", _state_of_sources()
+    folders_key = hashlib.sha256(repr(sorted(FOLDERS.items())).encode()).hexdigest()[:16]
+    path, state = _kernels() / f"hashes-{folders_key}.json", _state_of_sources()
     stored: dict[str, dict] = {}
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["state"] == state:
             stored = dict(content["fingerprints"])
-            found = stored[name]
-            return Fingerprint(str(found["sha256"]), frozenset(found["modules"]), frozenset(found["libraries"]))
+            value = stored[name]
+            return Fingerprint(str(value["sha256"]), frozenset(value["modules"]), frozenset(value["libraries"]))
     computed = compute()
     plain = {"modules": sorted(computed.modules), "libraries": sorted(computed.libraries)}
     content = {"state": state, "fingerprints": {**stored, name: {"sha256": computed.sha256, **plain}}}

@@ -67,7 +67,7 @@ class _Module:
 def fingerprint(*roots: str, folders: dict[str, Path] | None = None) -> Fingerprint:
     """The fingerprint of functions and classes, given as `package.module:name`; `package.module:` is a whole module.
 
-    `folders` gives the folder of each package, by default those of the imported packages.
+    `folders` gives the folder of each package, by default the folders of the imported packages.
     """
     return _fingerprint(roots, tuple(sorted((folders or FOLDERS).items())))
 
@@ -87,7 +87,7 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
 
 def compiled_functions() -> tuple[str, ...]:
     """Every function of perilune_render that numba compiles, as `package.module:name`."""
-    found = []
+    functions = []
     root = FOLDERS["perilune_render"]
     for path in sorted(root.rglob("*.py")):
         text = path.read_text(encoding="utf-8")
@@ -95,8 +95,8 @@ def compiled_functions() -> tuple[str, ...]:
             name = ".".join(("perilune_render", *path.relative_to(root).with_suffix("").parts))
             for function, (*_, node) in _parsed(text).definitions.items():
                 if isinstance(node, ast.FunctionDef) and any("njit" in ast.dump(each) for each in node.decorator_list):
-                    found.append(f"{name}:{function}")
-    return tuple(found)
+                    functions.append(f"{name}:{function}")
+    return tuple(functions)
 
 
 class _Walk:

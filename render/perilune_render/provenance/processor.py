@@ -25,6 +25,6 @@ SETTINGS = {
 }
 """Environment variables and their values."""
 IN_FORCE = "numpy" not in sys.modules or all(os.environ.get(name) == value for name, value in SETTINGS.items())
-"""Whether the settings came before NumPy. If not, results are those of this processor, and recipes say so."""
+"""Whether the settings came before NumPy. If not, results depend on this processor, and recipes say so."""
 
 os.environ.update(SETTINGS)

@@ -40,9 +40,9 @@ def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool =
 def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
-    Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, a site in an
-    elevation model if there is none, what its file states itself, and settings of a catalogue that are not used.
+    Files are recorded by name, without their folder. Settings that change no byte of the dataset are omitted: settings
+    of speed, settings of the other kind unless the kinds share terrain, optional sections that are not set, a site in
+    an elevation model if there is none, what its file states itself, and settings of a catalogue that are not used.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:

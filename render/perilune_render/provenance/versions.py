@@ -42,7 +42,7 @@ LIBRARIES = {
 """Recorded name and distribution of each library that affects results, by import name."""
 RAYS = (*RENDERING[:2], "perilune_render.engines.heightfield.engine:HeightfieldEngine")
 """Code that plans trajectories and renders radiance with the engine `heightfield`."""
-OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune_render.outputs.hazard_raster:")
+OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune_render.outputs.hazard:hazard_tiff")
 """Code that makes hazard maps and images of the flash lidar."""
 _NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING, "outputs": OUTPUTS}
 _RECORDED = {"rays": "renderer"}
@@ -50,12 +50,12 @@ _RECORDED = {"rays": "renderer"}
 
 
 def ground_versions(*, with_dem: bool) -> dict[str, str]:
-    """Versions of what generates the ground. rasterio is listed if there is an elevation model."""
+    """Versions of code and libraries that generate the ground. rasterio is listed if there is an elevation model."""
     return _versions(("generator",), with_dem)
 
 
 def imaging_versions() -> dict[str, str]:
-    """Versions of what makes images and labels from EXRs. Works without Blender."""
+    """Versions of the code and libraries that make images and labels from EXRs. Works without Blender."""
     return _versions(("imaging",), False)
 
 
@@ -95,7 +95,7 @@ def _found(names: tuple[str, ...], with_dem: bool) -> dict[str, str]:
 
 
 def _versions(names: tuple[str, ...], with_dem: bool) -> dict[str, str]:
-    found = dict(_found(names, with_dem))
+    versions = dict(_found(names, with_dem))
     if not processor.IN_FORCE:
-        found["arithmetic"] = "of the processor"
-    return found
+        versions["arithmetic"] = "of the processor"
+    return versions

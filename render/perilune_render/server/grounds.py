@@ -1,4 +1,4 @@
-"""The grounds of a server: scene 0, that of the configuration, and further ones that clients ask for by number.
+"""The scenes of a server: scene 0, which is the scene of the configuration, and others that clients request by number.
 
 Further scenes are generated in a thread of their own, one after another, while frames are rendered. A client has at
 most one scene in that queue. The last used scenes stay in memory.
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.config.scene import SceneConfig
 from perilune_render.flight.plan import ScenePlan, drawn_scene
-from perilune_render.server.world import World
+from perilune_render.server.simulation import SimulatedScene
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.errors import UserError
 
@@ -32,15 +32,15 @@ def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
 
 
 class Grounds:
-    """The worlds of `n_scenes` scenes by number. Only the thread of the worlds may use it. Close it at the end."""
+    """The simulated scenes by number. Only the thread that renders may use it. Close it at the end."""
 
-    def __init__(self, first: World, n_scenes: int = 1, note: Callable[[str], object] = lambda text: None):
+    def __init__(self, first: SimulatedScene, n_scenes: int = 1, note: Callable[[str], object] = lambda text: None):
         self.first, self.n_scenes, self._note = first, n_scenes, note
-        self._kept: dict[int, World] = {}
+        self._kept: dict[int, SimulatedScene] = {}
         self._waiting: dict[int, object] = {}
         self._failed: dict[int, Exception] = {}
         self._asked: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self._made: queue.SimpleQueue[tuple[int, World | Exception]] = queue.SimpleQueue()
+        self._made: queue.SimpleQueue[tuple[int, SimulatedScene | Exception]] = queue.SimpleQueue()
         self._last = first
         if n_scenes > 1:
             # A daemon: the server ends while a scene is being generated.
@@ -53,13 +53,13 @@ class Grounds:
         self.close()
 
     def close(self) -> None:
-        """Release the engines of all worlds."""
-        for world in (self.first, *self._kept.values()):
-            world.close()
+        """Release the engines of all scenes."""
+        for simulated in (self.first, *self._kept.values()):
+            simulated.close()
         self._kept.clear()
 
-    def world(self, number: int, client: object) -> World | None:
-        """The world of a scene; None if it is not in memory: ask again.
+    def simulated(self, number: int, client: object) -> SimulatedScene | None:
+        """The simulated scene of a number; None if it is not in memory: ask again.
 
         It is then being generated or waits for that, unless another scene of the client or MOST_WAITING scenes wait.
         Raises UserError for a number that the server does not have, and the error if the scene could not be generated.
@@ -77,26 +77,26 @@ class Grounds:
             self._asked.put(number)
         return None
 
-    def _used(self, number: int) -> World:
+    def _used(self, number: int) -> SimulatedScene:
         if number > 0:
             self._kept[number] = self._kept.pop(number)  # the last used one is the last
-        world = self._kept.get(number, self.first)
-        if world is not self._last and world.config.render.engine == "cycles":
+        simulated = self._kept.get(number, self.first)
+        if simulated is not self._last and simulated.config.render.engine == "cycles":
             self._last.close()  # Blender has one scene
-        self._last = world
-        return world
+        self._last = simulated
+        return simulated
 
     def _collect(self) -> None:
         """Take over what was generated, and forget the scenes that were not used for longest."""
         while not self._made.empty():
-            number, found = self._made.get()
+            number, result = self._made.get()
             del self._waiting[number]
-            if isinstance(found, Exception):
-                self._failed[number] = found
+            if isinstance(result, Exception):
+                self._failed[number] = result
                 continue
             while len(self._kept) >= MOST_KEPT:
                 self._kept.pop(next(iter(self._kept))).close()
-            self._kept[number] = found
+            self._kept[number] = result
 
     def _generate(self) -> None:
         """The thread that generates scenes."""
@@ -107,13 +107,13 @@ class Grounds:
             except Exception as error:
                 self._made.put((number, error))
 
-    def _grown(self, number: int) -> World:
+    def _grown(self, number: int) -> SimulatedScene:
         config, view = self.first.config, self.first.scene.view
         if view is None:
             raise UserError("request", "scene", number, "0: the ground was made for no views")
         planned = served_scene(config, number)
         sun = {"sun_azimuth_deg": planned.sun_azimuth_deg, "sun_elevation_deg": planned.sun_elevation_deg}
         lit = config.model_copy(update={"scene": (config.scene or SceneConfig()).model_copy(update=sun)})
-        world = World(cached_scene(config, view, planned.seed), lit, self._note)
-        _ = world.content_sha256  # computed here, while frames of other scenes are rendered
-        return world
+        simulated = SimulatedScene(cached_scene(config, view, planned.seed), lit, self._note)
+        _ = simulated.content_sha256  # computed here, while frames of other scenes are rendered
+        return simulated

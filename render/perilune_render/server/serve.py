@@ -1,8 +1,8 @@
-"""The server: many clients, one world. Requests of all clients are answered one after another.
+"""The server: many clients, one thread that renders. It answers the requests of all clients one after another.
 
-The connections of all interfaces are in an event loop of a second thread; the world, which may be Blender, is in the
-first. A connection is read again when its request is answered, so it has at most one request in the queue, and the
-queue is fair. If the second thread ends for any reason but `stop`, `run` raises an error.
+The first thread renders, since Blender must be in it. An event loop in a second thread holds the connections of all
+interfaces. It reads a connection again once its request is answered, so a client has at most one request in the queue,
+and the queue is fair. If the second thread ends for any reason but `stop`, `run` raises an error.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from perilune_render.server.notes import Notes
+from perilune_render.server.connection import Connection, Dropped, Limits
 from perilune_shared.errors import UserError
 
 _STOP_S = 5.0
@@ -29,75 +29,37 @@ _GRACE_S = 1.0
 """Silence before which a client without a request is not dropped in favour of another, seconds."""
 _EXTRA_S = 2.0
 """Time within which a client that is one too many must say its hello and read its error, seconds."""
-Ask = Callable[[Callable[[], Any]], Awaitable[Any]]
-"""Runs a function in the thread of the world and returns its result."""
 
 
-class Dropped(Exception):
-    """Ends a connection; the text says why."""
+class LineQueue:
+    """Passes lines on to a function in a thread of its own, without ever blocking the caller.
 
+    The function may block, for example on a pipe that nobody reads. Other lines then wait; lines beyond `most`
+    are dropped.
+    """
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What one client may ask for."""
+    def __init__(self, note: Callable[[str], object], most: int = 1000):
+        self._note = note
+        self._lines: queue.Queue[str | None] = queue.Queue(most)
+        self._thread = threading.Thread(target=self._pass_on, name="notes", daemon=True)
+        self._thread.start()
 
-    clients: int = 16
-    """Largest number of clients at once."""
-    idle_s: float = 600.0
-    """Time after which a client that sends nothing between two messages is disconnected, seconds."""
-    message_s: float = 30.0
-    """Time within which the hello must come, a begun message be complete, and a reply be read, seconds."""
-    items: int = 100_000
-    """Largest number of items of an array in a message."""
-    item_bytes: int = 4_000_000
-    """Largest size of an array in a message, bytes."""
+    def __call__(self, text: str) -> None:
+        """Pass a line on, or drop it."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put_nowait(text)
 
+    def close(self, wait_s: float) -> None:
+        """Pass on the waiting lines, for at most about `wait_s` seconds."""
+        with contextlib.suppress(queue.Full):
+            self._lines.put(None, timeout=wait_s)
+            self._thread.join(wait_s)
 
-@dataclass(eq=False)
-class Connection:
-    """One client."""
-
-    reader: asyncio.StreamReader
-    writer: asyncio.StreamWriter
-    limits: Limits
-    ask: Ask
-    """Runs a function in the thread of the world."""
-    name: str = ""
-    """Address of the client, for messages."""
-    is_extra: bool = False
-    """Whether the largest number of clients is connected already: this one gets an error."""
-    has_asked: bool = False
-    """Whether it ever sent a whole request."""
-    heard_s: float = field(default_factory=time.monotonic)
-    """When it connected or last sent something, by `time.monotonic`."""
-    _due_s: float = 0.0
-    """When the present message must be complete, by `time.monotonic`."""
-
-    async def hello(self, n_bytes: int) -> bytes:
-        """The bytes that a client sends first. Raises TimeoutError after `limits.message_s`."""
-        self._due_s = time.monotonic() + self.limits.message_s
-        return await self.rest(n_bytes)
-
-    async def first(self, n_bytes: int) -> bytes:
-        """The first bytes of a message. Raises TimeoutError after `limits.idle_s`, and if they come in part only."""
-        async with asyncio.timeout(self.limits.idle_s):
-            begun = await self.reader.readexactly(1)
-        self._due_s = time.monotonic() + self.limits.message_s
-        return begun + await self.rest(n_bytes - 1)
-
-    async def rest(self, n_bytes: int) -> bytes:
-        """More bytes of a message. Raises TimeoutError `limits.message_s` after the message began."""
-        async with asyncio.timeout(self._due_s - time.monotonic()):
-            data = await self.reader.readexactly(n_bytes)
-        self.heard_s = time.monotonic()
-        return data
-
-    async def send(self, data: bytes) -> None:
-        """Send a reply in one write. Raises TimeoutError if the client does not read it in `limits.message_s`."""
-        self.writer.write(data)
-        # Not `wait_for`, which in Python 3.11 loses a cancellation that comes as it ends.
-        async with asyncio.timeout(self.limits.message_s):
-            await self.writer.drain()
+    def _pass_on(self) -> None:
+        while (text := self._lines.get()) is not None:
+            # A closed pipe must end neither this thread nor the server.
+            with contextlib.suppress(Exception):
+                self._note(text)
 
 
 @dataclass(eq=False)
@@ -140,11 +102,11 @@ class Server:
     _failure: BaseException | None = None
     _ending: asyncio.Event = field(default_factory=asyncio.Event)
     _tasks: set = field(default_factory=set)
-    _notes: Notes | None = None
+    _notes: LineQueue | None = None
 
     def begin(self) -> None:
         """Accept clients. Raises UserError if an address cannot be used."""
-        self._notes = Notes(self.note)
+        self._notes = LineQueue(self.note)
         self._thread = threading.Thread(target=self._accept, name="connections", daemon=True)
         self._thread.start()
         self._ready.wait()
@@ -267,7 +229,7 @@ class Server:
         return reason
 
     def _drop_silent(self, interface: Interface) -> bool:
-        """Drop the client that has been silent longest, of those that never sent a request. False if there is none."""
+        """Drop the client that has been silent longest without ever having sent a request. False if there is none."""
         now_s = time.monotonic()
         silent = [each for each in interface.clients if not each.has_asked and now_s - each.heard_s >= _GRACE_S]
         if not silent:
@@ -305,16 +267,16 @@ async def answers(interface: Interface) -> bool:
     if interface.listening is None or not interface.listening.sockets:
         return False
     listening = interface.listening.sockets[0]
-    place = (_own_address(listening), *listening.getsockname()[1:])
-    with socket.socket(listening.family) as own:
-        own.setblocking(False)
+    address = (_own_address(listening), *listening.getsockname()[1:])
+    with socket.socket(listening.family) as probe:
+        probe.setblocking(False)
         # The port must be known before the connection is accepted.
-        own.bind((place[0], 0))
-        port = own.getsockname()[1]
+        probe.bind((address[0], 0))
+        port = probe.getsockname()[1]
         interface.probes.add(port)
         try:
-            await asyncio.get_running_loop().sock_connect(own, place)
-            reader, writer = await asyncio.open_connection(sock=own)
+            await asyncio.get_running_loop().sock_connect(probe, address)
+            reader, writer = await asyncio.open_connection(sock=probe)
             try:
                 return await interface.greets(reader, writer)
             finally:

@@ -4,6 +4,9 @@ Fresh material is brighter than the mature soil around it and darkens with age. 
 comparison with NAC images, since published maturity trends are for much larger craters.
 """
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
 from perilune_render.provenance.kernels import njit
@@ -19,6 +22,35 @@ RAYS_REACH = 9.0
 """Length of the longest ray from the centre, crater radii."""
 RAYED_WEAR = 0.004
 """Wear K/R^2 of a crater at which its rays have vanished."""
+
+
+@dataclass(frozen=True, slots=True)
+class RayLaw:
+    """Which craters of a scene have rays, and how bright these are."""
+
+    n_rayed: int
+    """Number of craters with rays: the largest fresh ones."""
+    strength: float
+    """Factor on the brightening: `light.albedo_variation`."""
+
+
+class _Rays(NamedTuple):
+    """The N rays of one crater."""
+
+    x: float
+    """x of the crater's centre, O_L, metres."""
+    y: float
+    """y of the crater's centre, O_L, metres."""
+    radius: float
+    """Radius of the crater, metres."""
+    direction: Array
+    """Directions of the rays, counter-clockwise from x, rad (N,)."""
+    width: Array
+    """Standard deviation of each ray's brightness across it, rad (N,)."""
+    length: Array
+    """Lengths from the centre, crater radii (N,)."""
+    fresh: float
+    """Relative brightening at the rim."""
 
 
 def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
@@ -38,15 +70,9 @@ def brightness(craters: Craters) -> Array:
 
 
 def add_rays(
-    albedo: Array,
-    grid: Grid,
-    craters: Craters,
-    n_rayed: int,
-    strength: float,
-    seed: int,
-    removed: np.ndarray | None = None,
+    albedo: Array, grid: Grid, craters: Craters, law: RayLaw, seed: int, removed: np.ndarray | None = None
 ) -> None:
-    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest fresh craters, in place.
+    """Brighten albedo (n_vertices,) along the rays of craters, in place.
 
     The rays of `removed` craters (indices) are drawn like the others, but not added.
     """
@@ -55,33 +81,25 @@ def add_rays(
     local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
     able = np.flatnonzero((wear < RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
     # The largest ones: rays of a small crater would be only a few pixels long.
-    for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][:n_rayed]:
+    for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][: law.n_rayed]:
         n_rays = int(rng.integers(7, 15))
         direction = rng.uniform(0, 2 * np.pi, n_rays)
         width = rng.uniform(0.05, 0.16, n_rays)
         length = rng.uniform(3.0, RAYS_REACH, n_rays)
         if removed is not None and k in removed:
             continue
-        fresh = strength * 0.35 * (1 - wear[k] / RAYED_WEAR)
-        _add_rays(
-            albedo,
-            grid.n_half,
-            grid.half_widths_m,
-            craters.x_m[k],
-            craters.y_m[k],
-            craters.diameter_m[k] / 2,
-            direction,
-            width,
-            length,
-            fresh,
-        )
+        fresh = law.strength * 0.35 * (1 - wear[k] / RAYED_WEAR)
+        radius = craters.diameter_m[k] / 2
+        rays = _Rays(craters.x_m[k], craters.y_m[k], radius, direction, width, length, fresh)
+        _add_rays(albedo, grid.n_half, grid.half_widths_m, rays)
 
 
 @njit()
-def _add_rays(albedo, n_half, half_widths, x, y, radius, direction, width, length, fresh):
+def _add_rays(albedo, n_half, half_widths, rays):
+    x, y, radius, direction, width, length, fresh = rays
     lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
     reach = length.max() * radius
-    count = lines_in(x - reach, x + reach, y - reach, y + reach, n_half, half_widths, lines)
+    count = lines_in((x - reach, x + reach, y - reach, y + reach), n_half, half_widths, lines)
     for line in range(count):
         first, number = int(lines[line, 4]), int(lines[line, 5])
         for p in range(number):

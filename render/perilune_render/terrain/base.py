@@ -45,10 +45,10 @@ class Base:
         resolved = np.inf if self.model is None else resolved_m(self.model)
         add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
         if self.surroundings is not None:
-            add_fitted_relief(self.height_m, grid, self.surroundings, self.beyond_m, seed, shortest_m, longest_m)
+            add_fitted_relief(self.height_m, grid, self.surroundings, self.beyond_m, seed, (shortest_m, longest_m))
 
     def permitted(self, craters: Craters) -> Craters:
-        """The craters to add: those too small for the model to resolve, and those that do not reach the model."""
+        """The craters to add: craters too small for the model to resolve, and craters that do not reach the model."""
         if self.model is None or self.surroundings is None:
             return craters
         large = craters.diameter_m > resolved_m(self.model)

@@ -36,7 +36,7 @@ _FIELD_DECAY = 0.7
 FULL_SPACINGS = 5.0
 """Smallest diameter, in vertex spacings, of a boulder with the finer mesh."""
 _FARTHEST = 0.9
-"""Largest distance of a rock's surface from its centre, mean diameters: that of the flattest, longest rock."""
+"""Largest distance of a rock's surface from its centre, mean diameters: the flattest, longest rock has it."""
 N_POINTS, N_FEW_POINTS = 60, 14
 """Numbers of points of a rock's finer and coarser mesh."""
 
@@ -74,9 +74,9 @@ def draw_boulders(
     """Draw the boulders of a scene: a uniform density on the plain, and fields around young craters.
 
     Fields surround primary craters of at least 10 m. At the rim of a newly formed crater the density of its field is
-    `field_density` times that of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, with age as
+    `field_density` times the density of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, with age as
     (1 - age / 4 Gyr)^3, and with the crater's wear as exp(-K / 0.05 R^2), our choice.
-    The fields of `removed` craters (indices) are drawn like the others and then left out.
+    The fields of `removed` craters (indices) are drawn like the others and then omitted.
     """
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
@@ -194,28 +194,28 @@ def largest_height_m(boulders: Boulders) -> float:
 
 
 def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_m: Array) -> Array:
-    """Heights (M,) of the highest boulder at places (M,), O_L, metres; -inf where none is. See `boulder_mesh`."""
+    """Heights (M,) of the highest boulder at places (M,), O_L, metres; -inf without a boulder. See `boulder_mesh`."""
     tops = np.full(len(x_m), -np.inf)
     widest = _FARTHEST * boulders.diameter_m.max(initial=0.0)
     if not len(x_m) or not len(boulders):
         return tops
     near = (boulders.x_m > x_m.min() - widest) & (boulders.x_m < x_m.max() + widest)
     near = np.flatnonzero(near & (boulders.y_m > y_m.min() - widest) & (boulders.y_m < y_m.max() + widest))
-    rocks, places = boulders.chosen(near), np.stack([x_m, y_m], axis=-1)
+    rocks, points = boulders.chosen(near), np.stack([x_m, y_m], axis=-1)
     full = rocks.diameter_m >= FULL_SPACINGS * grid.spacing_under(rocks.x_m, rocks.y_m)
     rotations = matrix_from_quaternion(rocks.rotation_wxyz.reshape(-1, 4))
-    around = cKDTree(np.stack([rocks.x_m, rocks.y_m], axis=-1)).query_ball_point(places, widest)
+    around = cKDTree(np.stack([rocks.x_m, rocks.y_m], axis=-1)).query_ball_point(points, widest)
     solids: dict[tuple[int, int], trimesh.Trimesh] = {}
-    for place, candidates in enumerate(around):
+    for index, candidates in enumerate(around):
         for k in candidates:
-            away = places[place] - [rocks.x_m[k], rocks.y_m[k]]
+            away = points[index] - [rocks.x_m[k], rocks.y_m[k]]
             if np.hypot(*away) > _FARTHEST * rocks.diameter_m[k]:
                 continue
             kind = int(rocks.shape_id[k]), N_POINTS if full[k] else N_FEW_POINTS
             if kind not in solids:
                 solids[kind] = rock(kind[0], seed, kind[1])
             top = _top(solids[kind], away @ rotations[k, :2] / rocks.diameter_m[k], rotations[k, 2])
-            tops[place] = max(tops[place], z_m[near[k]] + rocks.diameter_m[k] * top)
+            tops[index] = max(tops[index], z_m[near[k]] + rocks.diameter_m[k] * top)
     return tops
 
 

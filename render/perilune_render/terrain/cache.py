@@ -121,8 +121,8 @@ def _read(path: Path, view: ViewEnvelope) -> Scene | None:
 def _make_room(folder: Path, most_bytes: float) -> None:
     kept = sorted(folder.glob("[0-9a-f]*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
     total = 0
-    for place, path in enumerate(kept):
+    for index, path in enumerate(kept):
         total += path.stat().st_size
         # Keep the newest file, however large.
-        if total > most_bytes and place > 0:
+        if total > most_bytes and index > 0:
             path.unlink(missing_ok=True)

@@ -29,9 +29,9 @@ class SeenGround:
         """
         azimuth = np.radians(approach_deg + np.array([-0.5, 0.0, 0.5]))
         towards = -np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
-        places = np.concatenate([d[:, None, None] * towards for d in (self.nearest_m, self.farthest_m)], axis=1)
+        points = np.concatenate([d[:, None, None] * towards for d in (self.nearest_m, self.farthest_m)], axis=1)
         margin = self.margin_m[:, None]
-        return places.min(axis=1) - margin, places.max(axis=1) + margin
+        return points.min(axis=1) - margin, points.max(axis=1) + margin
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ def coarser(grid: Grid, step: int) -> Grid:
 def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = True) -> None:
     """Write a mesh of ground and boulders, metres; `step` multiplies the ground's vertex spacing.
 
-    The axes are those of O_L (x west, y south, z up); in GLB and OBJ they are x west, y up, z north.
+    The axes are the axes of O_L (x west, y south, z up); in GLB and OBJ they are x west, y up, z north.
     """
     import trimesh
 
@@ -63,14 +63,14 @@ def site_profile(latitude_deg: float, longitude_deg: float, n: int, pixel_m: flo
     """Options of rasterio for a float32 GeoTIFF of n x n pixels about a site: north up, azimuthal equidistant."""
     import rasterio
 
-    place = f"+lat_0={latitude_deg!r} +lon_0={longitude_deg!r}"
+    centre = f"+lat_0={latitude_deg!r} +lon_0={longitude_deg!r}"
     return {
         "driver": "GTiff",
         "width": n,
         "height": n,
         "count": n_bands,
         "dtype": "float32",
-        "crs": f"+proj=aeqd {place} +R={MOON_RADIUS_M:.0f} +units=m +no_defs",
+        "crs": f"+proj=aeqd {centre} +R={MOON_RADIUS_M:.0f} +units=m +no_defs",
         "transform": rasterio.Affine(pixel_m, 0, -n / 2 * pixel_m, 0, -pixel_m, n / 2 * pixel_m),
         "compress": "deflate",
         "predictor": 3,

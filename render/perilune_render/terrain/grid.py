@@ -95,9 +95,9 @@ class Grid:
         """x and y of all vertices, metres, (n_vertices,) each."""
         even = np.linspace(-1, 1, 2 * self.n_half + 1) * self.half_widths_m[0]
         up = -1 + np.arange(2 * self.n_half) / self.n_half
-        one = np.ones_like(up)
-        round_x = np.concatenate([up, one, -up, -one])
-        round_y = np.concatenate([-one, up, one, -up])
+        ones = np.ones_like(up)
+        round_x = np.concatenate([up, ones, -up, -ones])
+        round_y = np.concatenate([-ones, up, ones, -up])
         rings = self.half_widths_m[1:, None]
         x = np.concatenate([np.tile(even, len(even)), (rings * round_x).ravel()])
         y = np.concatenate([np.repeat(even, len(even)), (rings * round_y).ravel()])
@@ -157,18 +157,21 @@ def grid_of(
 
 
 @njit(inline="always")
-def _put(lines, row, x, y, dx, dy, first, number, ring):
-    lines[row, 0], lines[row, 1], lines[row, 2], lines[row, 3] = x, y, dx, dy
-    lines[row, 4], lines[row, 5], lines[row, 6] = first, number, ring
+def _put(lines, row, start, step, vertices, ring):
+    """Write a line: (x, y) of its start, its step (dx, dy), its vertices (first index, number) and its ring."""
+    lines[row, 0], lines[row, 1], lines[row, 2], lines[row, 3] = start[0], start[1], step[0], step[1]
+    lines[row, 4], lines[row, 5], lines[row, 6] = vertices[0], vertices[1], ring
 
 
 @njit()
-def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
+def lines_in(window, n_half, half_widths, lines):
     """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns the number of lines.
 
-    All places are relative to the grid's centre. A line is: x and y of its first vertex, steps in x and y, index of its
-    first vertex, number of vertices, and ring (0 is the inner square).
+    `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the grid's centre. A line is: x
+    and y of its first vertex, steps in x and y, index of its first vertex, number of vertices, and ring (0 is the inner
+    square).
     """
+    x_low, x_high, y_low, y_high = window
     count = 0
     n = n_half
     step = half_widths[0] / n
@@ -177,7 +180,7 @@ def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
     if i_low <= i_high:
         for j in range(j_low, j_high + 1):
             first = (j + n) * (2 * n + 1) + i_low + n
-            _put(lines, count, i_low * step, j * step, step, 0.0, first, i_high - i_low + 1, 0)
+            _put(lines, count, (i_low * step, j * step), (step, 0.0), (first, i_high - i_low + 1), 0)
             count += 1
     nearest = max(max(x_low, -x_high), max(y_low, -y_high))
     farthest = max(max(x_high, -x_low), max(y_high, -y_low))
@@ -201,9 +204,9 @@ def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
                 continue
             start = sign * (t_low * step - d)
             first = (2 * n + 1) ** 2 + (ring - 1) * 8 * n + side * 2 * n + t_low
-            x, y = (start, across) if along_x else (across, start)
-            dx, dy = (sign * step, 0.0) if along_x else (0.0, sign * step)
-            _put(lines, count, x, y, dx, dy, first, t_high - t_low + 1, ring)
+            corner = (start, across) if along_x else (across, start)
+            steps = (sign * step, 0.0) if along_x else (0.0, sign * step)
+            _put(lines, count, corner, steps, (first, t_high - t_low + 1), ring)
             count += 1
     return count
 
@@ -224,13 +227,13 @@ def place_in_ring(x, y, n_half):
 
 
 @njit()
-def vertex_of_ring(ring, place, n_half):
+def vertex_of_ring(ring, position, n_half):
     """Index of a vertex from its ring (0 is the inner square's border) and position from the corner at -x, -y."""
     n = n_half
-    place %= 8 * n
+    position %= 8 * n
     if ring > 0:
-        return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place
-    side, t = place // (2 * n), place % (2 * n)
+        return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + position
+    side, t = position // (2 * n), position % (2 * n)
     if side == 0:
         i, j = t, 0
     elif side == 1:

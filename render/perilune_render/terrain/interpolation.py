@@ -41,12 +41,12 @@ def corners(x, y, n_half, half_widths):
     width = half_widths[ring] - half_widths[inner]
     g = min((distance - half_widths[inner]) / width, 1.0) if width > 0 else 0.0
     along = place_in_ring(x, y, n)
-    place = int(along)
+    position = int(along)
     return (
-        vertex_of_ring(inner, place, n),
-        vertex_of_ring(inner, place + 1, n),
-        vertex_of_ring(ring, place, n),
-        vertex_of_ring(ring, place + 1, n),
-        along - place,
+        vertex_of_ring(inner, position, n),
+        vertex_of_ring(inner, position + 1, n),
+        vertex_of_ring(ring, position, n),
+        vertex_of_ring(ring, position + 1, n),
+        along - position,
         g,
     )

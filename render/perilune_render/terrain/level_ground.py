@@ -1,6 +1,7 @@
 """The ground of a level: the ground of a scene, averaged over the cells of a level's vertices."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,9 +10,46 @@ from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import corners
 from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.frames import Array
 
 _MOST_SAMPLES = 8
-"""Largest number of places along one side of a cell; more would be needed only out of view."""
+"""Largest number of points along one side of a cell; more would be needed only out of view."""
+
+
+class _Mesh(NamedTuple):
+    """The grid whose vertices have the field."""
+
+    centre_x: float
+    """x of its centre, O_L, metres."""
+    centre_y: float
+    """y of its centre, O_L, metres."""
+    n_half: int
+    """`Grid.n_half`."""
+    half_widths: Array
+    """`Grid.half_widths_m`."""
+    spacings: Array
+    """`Grid.spacings_m`."""
+
+
+class _Cells(NamedTuple):
+    """The cells of the N vertices of a level."""
+
+    centre_x: float
+    """x of the level's centre, O_L, metres."""
+    centre_y: float
+    """y of the level's centre, O_L, metres."""
+    n_inner: int
+    """Number of vertices in its inner square, which come first."""
+    n_ring: int
+    """Number of vertices in each of its rings."""
+    around: Array
+    """Sides of the cells along the ring, metres, for the inner square and each ring (R + 1,)."""
+    across: Array
+    """Sides of the cells across the ring, metres (R + 1,)."""
+    x: Array
+    """x of the vertices, O_L, metres (N,)."""
+    y: Array
+    """y of the vertices, O_L, metres (N,)."""
 
 
 def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
@@ -35,18 +73,19 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
 def averaged(field: np.ndarray, whole: Grid, grid: Grid) -> np.ndarray:
     """A field on the vertices of `whole`, averaged over the cell of each vertex of `grid`: (n_vertices,) float32.
 
-    A cell has as many evenly spaced places as `whole` has vertices in it, and at least one. Outside `whole` the field
-    has the values of its border.
+    The field is interpolated at as many evenly spaced points of a cell as `whole` has vertices in it, and at least one.
+    Outside `whole` the field has the values of its border.
     """
-    x, y = grid.vertices_xy()
-    around, across = grid.cell_sides_m
-    site = whole.centre_x_m, whole.centre_y_m, whole.n_half, whole.half_widths_m, whole.spacings_m
-    level = grid.centre_x_m, grid.centre_y_m, (2 * grid.n_half + 1) ** 2, 8 * grid.n_half, around, across
-    return _averaged(field, *site, *level, x, y)
+    n_inner, n_ring = (2 * grid.n_half + 1) ** 2, 8 * grid.n_half
+    mesh = _Mesh(whole.centre_x_m, whole.centre_y_m, whole.n_half, whole.half_widths_m, whole.spacings_m)
+    cells = _Cells(grid.centre_x_m, grid.centre_y_m, n_inner, n_ring, *grid.cell_sides_m, *grid.vertices_xy())
+    return _averaged(field, mesh, cells)
 
 
 @njit()
-def _averaged(field, x0, y0, n, half_widths, spacings, cx, cy, n_inner, n_ring, around, across, x, y):
+def _averaged(field, mesh, cells):
+    x0, y0, n, half_widths, spacings = mesh
+    cx, cy, n_inner, n_ring, around, across, x, y = cells
     means = np.empty(len(x), np.float32)
     for k in range(len(x)):
         ring = 0 if k < n_inner else 1 + (k - n_inner) // n_ring

@@ -20,8 +20,8 @@ _WIDEST_BAND = 1.25
 """Largest ratio of the heights of a level's band. In a wider one the spacing, and with it the smallest craters, would
 change visibly between two frames."""
 _GROUND_PER_MESH = 10
-"""Largest ratio of the number of vertices of a scene's ground to that of a mesh. While the ground is generated, one of
-its vertices takes about a sixth of the memory that a vertex takes in Blender."""
+"""Largest number of vertices of a scene's ground, divided by the largest number of a mesh. While the ground is
+generated, one of its vertices takes about a sixth of the memory that a vertex takes in Blender."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +41,7 @@ def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) ->
     heights, from the lowest, is as wide as this limit on each level and _WIDEST_BAND allow. Spacing is at most
     `terrain.spacing_px` times the smallest ground pixel of the band. Raises UserError if no level fits.
     """
-    check_levels(terrain, view)
-    whole = graded_grid(terrain, view)
+    whole = checked_grid(terrain, view)
     if view.seen is None or whole.n_vertices <= terrain.max_vertices:
         return (Level(np.inf, whole),)
     levels, first, last = [], 0, len(view.seen.z_m) - 1
@@ -55,12 +54,17 @@ def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) ->
     return tuple(levels)
 
 
-def check_levels(terrain: TerrainConfig, view: ViewEnvelope) -> None:
-    """Raise UserError if a mesh needs more than `terrain.max_vertices`, or ground _GROUND_PER_MESH times as many."""
-    if graded_grid(terrain, view).n_vertices > terrain.max_vertices:
+def checked_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
+    """The grid of the ground for all views (`graded_grid`).
+
+    Raises UserError if a mesh needs more than `terrain.max_vertices`, or the ground _GROUND_PER_MESH times as many.
+    """
+    grid = graded_grid(terrain, view)
+    if grid.n_vertices > terrain.max_vertices:
         needed = _needed(terrain, view)
         if needed > terrain.max_vertices:
             raise _refusal(terrain, view, needed)
+    return grid
 
 
 def level_index(levels: tuple[Level, ...], z_m: float) -> int:
@@ -88,7 +92,7 @@ def _band(
 def _needed(terrain: TerrainConfig, view: ViewEnvelope) -> int:
     """Number of vertices that the limit must allow: of the largest of the narrowest bands, or of the whole ground.
 
-    A trajectory along an axis is the one whose frames show the widest square.
+    A trajectory along an axis shows the widest square of ground.
     """
     whole = graded_grid(terrain, view).n_vertices
     if view.seen is None:
@@ -123,7 +127,7 @@ def _refusal(terrain: TerrainConfig, view: ViewEnvelope, needed: int) -> UserErr
 
 
 def _last_that_fits(band: Callable[[int], Grid], low: int, high: int, most: int) -> int:
-    """The last index from `low` to `high` up to which a band has at most `most` vertices; `low` is taken to fit."""
+    """The last index from `low` to `high` up to which a band has at most `most` vertices; `low` is assumed to fit."""
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if band(middle).n_vertices <= most else (low, middle - 1)

@@ -1,4 +1,14 @@
-"""A scene: ground, craters and boulders of one site as plain data."""
+r"""A scene: ground, craters and boulders of one site as plain data.
+
+`grow_scene` builds it in layers, each drawn from its own stream of the scene's seed:
+
+    6. boulders             o      .o             o .       set on the finished ground; rims are measured on it
+    5. short waves     ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~     relief below 100 m, younger than the craters
+    2. craters         __   ____   _________   ________     from oldest to youngest, with rays (4. without removed ones)
+                         \_/    \_/         \_/
+    1. base            --__--~~~~~--___--~~~~--__--~~~~     flat, or an elevation model; with long waves
+                                                            (3. the model shows the craters of its catalogue)
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,7 +17,7 @@ import numpy as np
 
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.config.terrain import TerrainConfig
-from perilune_render.terrain.albedo import add_patches, add_rays, brightness
+from perilune_render.terrain.albedo import RayLaw, add_patches, add_rays, brightness
 from perilune_render.terrain.base import base_of
 from perilune_render.terrain.boulders import Boulders, check_boulders, draw_boulders
 from perilune_render.terrain.craters.population import Craters, check_craters, draw_craters
@@ -23,9 +33,9 @@ from perilune_render.terrain.elevation.model import (
     remarks,
 )
 from perilune_render.terrain.envelope import ViewEnvelope
-from perilune_render.terrain.grid import Grid, graded_grid
+from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
-from perilune_render.terrain.levels import check_levels
+from perilune_render.terrain.levels import checked_grid
 from perilune_render.terrain.relief import check_waves
 from perilune_shared.console.progress import say
 from perilune_shared.geometry.curvature import drop_m
@@ -77,57 +87,75 @@ class Scene:
         return np.delete(everything, self.removed)
 
 
+@dataclass(frozen=True, slots=True)
+class _Soil:
+    """What craters change at the vertices, in place."""
+
+    height_m: Array
+    """Heights, metres (n_vertices,)."""
+    albedo: Array
+    """Factor on the reflectance (n_vertices,)."""
+
+    def copy(self) -> "_Soil":
+        return _Soil(self.height_m.copy(), self.albedo.copy())
+
+
 def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     """Generate the scene of a seed: base, relief, craters from oldest to youngest, boulders.
 
-    Craters that the configuration removes are left out, with their rays and boulders. Everything is drawn as if they
-    were there, and the heights keep their zero. Beyond `craters.removal.REACH_RADII` of them the heights are those of
-    the scene with all craters. Raises UserError if frames of `view` need too many vertices, or if the scene has no such
-    crater.
+    Craters that the configuration removes are omitted, with their rays and boulders. All random numbers are drawn as if
+    they were there, and the heights keep their zero. Beyond `craters.removal.REACH_RADII` of them the heights are those
+    of the scene with all craters. Raises UserError if frames of `view` need too many vertices, or if the scene has no
+    such crater.
     """
-    check_levels(config.terrain, view)
     terrain = config.terrain
-    grid = graded_grid(terrain, view)
+    grid = checked_grid(terrain, view)
     model = model_of(terrain, grid.extent_m)
+    # 1. Base and long waves.
     base = base_of(model, grid, terrain, seed)
-    height = base.height_m
+    soil = _Soil(base.height_m, np.ones(grid.n_vertices))
     base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
+    # 2. Craters and rays; those that younger craters have erased no longer count.
     drawn = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
-    albedo = np.ones(grid.n_vertices)
     if config.light.albedo_variation > 0:
-        add_patches(albedo, grid, config.light.albedo_variation, seed)
+        add_patches(soil.albedo, grid, config.light.albedo_variation, seed)
     wanted = config.removed_from(seed)
-    uncratered = (height.copy(), albedo.copy()) if wanted else (height, albedo)
-    stamped = _stamp(config, height, albedo, grid, drawn, seed)
+    uncratered = soil.copy() if wanted else soil
+    stamped = _stamp(config, soil, grid, drawn, seed)
     visible = np.flatnonzero(stamped.rim_left >= _LEAST_RIM)
     craters, sag = drawn.chosen(visible), stamped.sag_m[visible]
+    # 3. Craters of the catalogue come first. The elevation model shows them, so nothing is stamped.
     n_real = 0
     if model is not None and terrain.catalogue is not None:
         real = read_catalogue(Path(terrain.catalogue), model, grid, terrain).craters
         craters, sag, n_real = real.joined(craters), np.concatenate([np.zeros(len(real)), sag]), len(real)
+    # 4. Removed craters: stamp all others again, and take this ground near the removed ones only.
     removed = indices_of(wanted, n_real, len(craters), seed)
     raised_m = 0.0
     if len(removed):
-        again = _stamp(config, *uncratered, grid, drawn, seed, visible[removed - n_real])
-        places = craters.chosen(removed)
-        changed = near(*grid.vertices_xy(), places)
-        before_m = _at_site(height, grid)
-        height[changed], albedo[:] = uncratered[0][changed], uncratered[1]
-        raised_m = float(_at_site(height, grid) - before_m)
-        sag[n_real:] = np.where(near(craters.x_m, craters.y_m, places)[n_real:], again.sag_m[visible], sag[n_real:])
+        again = _stamp(config, uncratered, grid, drawn, seed, visible[removed - n_real])
+        gone = craters.chosen(removed)
+        changed = near(*grid.vertices_xy(), gone)
+        before_m = _at_site(soil.height_m, grid)
+        soil.height_m[changed], soil.albedo[:] = uncratered.height_m[changed], uncratered.albedo
+        raised_m = float(_at_site(soil.height_m, grid) - before_m)
+        sag[n_real:] = np.where(near(craters.x_m, craters.y_m, gone)[n_real:], again.sag_m[visible], sag[n_real:])
+    # 5. Short waves on top of the craters; the site is at height 0; far ground drops with the Moon's curvature.
     base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
+    height = soil.height_m
     height -= _at_site(height, grid) - raised_m
     if view.horizon:
         height -= drop_m(*grid.vertices_xy())
+    # 6. Boulders and rims on the finished ground. Boulders are drawn around all craters, the removed ones included.
     boulders = draw_boulders(terrain.boulders, grid, craters, seed, removed)
     kept = np.delete(np.arange(len(craters)), removed)
     craters, sag = craters.chosen(kept), sag[kept]
     return Scene(
         seed,
-        *_place(config, model),
+        *_site_deg(config, model),
         grid,
         height.astype(np.float32),
-        np.clip(albedo, 0.5, 2.2).astype(np.float32),
+        np.clip(soil.albedo, 0.5, 2.2).astype(np.float32),
         craters,
         measure_rims(height, grid, craters, sag),
         boulders,
@@ -140,20 +168,15 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
 
 
 def _stamp(
-    config: DatasetConfig,
-    height_m: Array,
-    albedo: Array,
-    grid: Grid,
-    craters: Craters,
-    seed: int,
-    removed: np.ndarray | None = None,
+    config: DatasetConfig, soil: _Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
 ) -> Stamped:
     """Add rays and stamp craters except the `removed` ones (indices), in place; their results in `Stamped` are 0."""
     kept = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
-    variation, own = config.light.albedo_variation, craters.chosen(kept)
+    variation, stays, law = config.light.albedo_variation, craters.chosen(kept), config.terrain.craters
     if variation > 0:
-        add_rays(albedo, grid, craters, config.terrain.craters.n_rayed, variation, seed, removed)
-    stamped = stamp_craters(height_m, albedo, grid, own, variation * brightness(own), config.terrain.craters.profile)
+        add_rays(soil.albedo, grid, craters, RayLaw(law.n_rayed, variation), seed, removed)
+    brightening = variation * brightness(stays)
+    stamped = stamp_craters(soil.height_m, soil.albedo, grid, stays, brightening, law.profile)
     if removed is None:
         return stamped
     sag, rim_left = np.zeros(len(craters)), np.zeros(len(craters))
@@ -166,13 +189,12 @@ def _at_site(height_m: Array, grid: Grid) -> Array:
     return value_at(height_m, grid, 0.0, 0.0)
 
 
-def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
-    """Check grid, relief and input files before the ground is generated. Raises UserError.
+def check_ground(config: DatasetConfig, view: ViewEnvelope) -> Grid:
+    """Check grid, relief and input files before the ground is generated; returns the grid. Raises UserError.
 
     Prints remarks on the elevation model.
     """
-    check_levels(config.terrain, view)
-    grid = graded_grid(config.terrain, view)
+    grid = checked_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)
     check_craters(config.terrain.craters, grid)
     check_boulders(config.terrain.boulders, grid)
@@ -185,11 +207,12 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
         if config.terrain.catalogue is not None:
             path = Path(config.terrain.catalogue)
             say(remark(path, read_catalogue(path, model, grid, config.terrain)), style="yellow")
+    return grid
 
 
 def site_of(config: DatasetConfig) -> tuple[float, float]:
     """Latitude and longitude of the site, degrees. Raises UserError if the elevation model cannot be read."""
-    return _place(config, model_of(config.terrain))
+    return _site_deg(config, model_of(config.terrain))
 
 
 def model_of(terrain: TerrainConfig, ground_m: float | None = None) -> ElevationModel | None:
@@ -200,7 +223,8 @@ def model_of(terrain: TerrainConfig, ground_m: float | None = None) -> Elevation
     return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation, ground_m)
 
 
-def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:
+def _site_deg(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:
+    """Latitude and longitude of the site, degrees."""
     if model is None:
         return config.terrain.latitude_deg, config.terrain.longitude_deg
     return model.latitude_deg, model.longitude_deg

@@ -1,8 +1,7 @@
 """Size-frequency laws of craters and boulders: one class for each published law.
 
-`csfd` is the cumulative number per square metre of objects of at least a diameter. Like a scipy `rv_continuous`, a law
-is also a distribution over its support, `min_diameter_m` to `max_diameter_m`: `count(area)` is the expected number,
-`rvs(area, rng)` draws a population with a Poisson number of diameters, `cdf` and `ppf` are those of one diameter.
+A law gives `csfd`, the cumulative number per square metre of objects of at least a diameter, and its support,
+`min_diameter_m` to `max_diameter_m`. `draw_diameters` draws a population.
 """
 
 from abc import ABC, abstractmethod
@@ -42,31 +41,6 @@ class SizeFrequency(ABC):
     def csfd(self, diameter_m: ArrayLike) -> Array:
         """Number per square metre of at least this diameter (metres), also outside the support."""
 
-    def count(self, area_m2: float) -> float:
-        """Expected number on an area (square metres) with diameters in the support."""
-        return float(area_m2 * (self.csfd(self.min_diameter_m) - self.csfd(self.max_diameter_m)))
-
-    def cdf(self, diameter_m: ArrayLike) -> Array:
-        """Share of the population, within the support, that is smaller than a diameter (metres)."""
-        most, least = self.csfd(self.min_diameter_m), self.csfd(self.max_diameter_m)
-        inside = np.clip(np.asarray(diameter_m, np.float64), self.min_diameter_m, self.max_diameter_m)
-        return (most - self.csfd(inside)) / (most - least)
-
-    def ppf(self, share: ArrayLike) -> Array:
-        """Quantile: the diameter (metres) below which a `share` of the population is; the inverse of `cdf`.
-
-        Interpolated in logarithms between 2000 nodes, which is exact for power laws and within 1e-5 for the others.
-        """
-        nodes = np.geomspace(self.max_diameter_m, self.min_diameter_m, 2000)
-        numbers = self.csfd(nodes)
-        number = numbers[-1] - np.asarray(share) * (numbers[-1] - numbers[0])
-        found = np.exp(np.interp(np.log(number), np.log(numbers), np.log(nodes)))
-        return np.clip(found, self.min_diameter_m, self.max_diameter_m)
-
-    def rvs(self, area_m2: float, rng: np.random.Generator) -> Array:
-        """Diameters (N,), metres, of one population on an area (square metres); N has a Poisson distribution."""
-        return self.ppf(rng.random(rng.poisson(self.count(area_m2))))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NeukumProduction(SizeFrequency):
@@ -94,19 +68,6 @@ def _neukum_exponent(log_d_km: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PowerLaw(SizeFrequency):
-    """N(>D) = coefficient D^exponent per square metre, D in metres."""
-
-    coefficient: float
-    """Number per square metre of at least 1 m."""
-    exponent: float
-    """Exponent, negative."""
-
-    def csfd(self, diameter_m: ArrayLike) -> Array:
-        return self.coefficient * np.asarray(diameter_m, np.float64) ** self.exponent
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TraskEquilibrium(SizeFrequency):
     """Empirical equilibrium of small craters, N(>D) = 10^-1.1 D^-2 per square metre: Trask 1966 (JPL TR 32-800).
 
@@ -126,7 +87,7 @@ class TraskEquilibrium(SizeFrequency):
 class MintonEquilibrium(SizeFrequency):
     """Equilibrium of small craters on a mare, N(>D) = 0.0336 D^-2 per square metre.
 
-    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support is that of Trask's law.
+    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support equals the support of Trask's law.
     """
 
     share: float = 1.0

@@ -89,10 +89,12 @@ def subset(
     overwrite: OverwriteFolder = False,
 ) -> None:
     """Copy part of a dataset: by conditions on columns, number of frames or size."""
+    from perilune_shared.editing.subset import Limit
     from perilune_shared.editing.subset import subset as choose
 
+    limit = None if frames is None and mb is None else Limit(frames, mb)
     with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
-        choose(ps.open_dataset(dataset), folder, tuple(where or ()), frames, mb, _mode(images, link), progress)
+        choose(ps.open_dataset(dataset), folder, tuple(where or ()), limit, _mode(images, link), progress)
     _print_counts(out)
 
 
@@ -110,10 +112,11 @@ def split(
     overwrite: OverwriteFolder = False,
 ) -> None:
     """Re-split a dataset into train, val and test, by scene, trajectory or frame."""
-    from perilune_shared.editing.split import split_dataset
+    from perilune_shared.editing.split import Split, split_dataset
 
+    parts = Split(by, val, test, seed)
     with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:
-        split_dataset(ps.open_dataset(dataset), folder, by, val, test, seed, _mode(images, link), progress)
+        split_dataset(ps.open_dataset(dataset), folder, parts, _mode(images, link), progress)
     _print_counts(out)
 
 

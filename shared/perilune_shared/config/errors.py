@@ -56,7 +56,7 @@ _KEY = "[key]"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a suggestion for an unknown name: the most similar known name, or all known names if none is similar."""
+    """Return a suggestion for an unknown name: the most similar known name, or all known names without one."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=_MIN_SIMILARITY)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
@@ -134,7 +134,7 @@ def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
             field = section.model_fields.get(key)
             annotation = None if field is None else field.annotation
         else:
-            # A key of a mapping, or the number of an item: go on with the type of the values.
+            # A key of a mapping, or the number of an item: continue with the type of the values.
             annotation = next(iter(typing.get_args(_container_in(annotation))[-1:]), None)
     return [name for section in _sections_in(annotation)[:1] for name in section.model_fields]
 

@@ -46,9 +46,11 @@ def keys(section: str, config: Section) -> Iterator[Key]:
             default = None if field.is_required() else _default(field)
             yield Key(full, field, _meaning(field), _choices(field), default, _flow(plain[name]))
             if value is None and (optional := _section_of(field)):
-                for inner, own in optional.model_fields.items():
-                    usual = "required" if own.is_required() else _default(own)
-                    yield Key(f"{full}.{inner}", own, _meaning(own), _choices(own), usual, usual)
+                for inner, inner_field in optional.model_fields.items():
+                    usual = "required" if inner_field.is_required() else _default(inner_field)
+                    yield Key(
+                        f"{full}.{inner}", inner_field, _meaning(inner_field), _choices(inner_field), usual, usual
+                    )
 
 
 def annotated_yaml(section: str, config: Section) -> str:

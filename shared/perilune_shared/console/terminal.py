@@ -63,8 +63,8 @@ def answer_table(
 ) -> None:
     """Print a table on standard output; long cells are folded. With `numbers` all columns but the first are aligned."""
     table = Table(title=Text(one_line(title)) if title else None, caption=Text(one_line(caption)) if caption else None)
-    for place, name in enumerate(head):
-        table.add_column(Text(one_line(name)), justify="right" if numbers and place else "left", overflow="fold")
+    for index, name in enumerate(head):
+        table.add_column(Text(one_line(name)), justify="right" if numbers and index else "left", overflow="fold")
     for row in rows:
         table.add_row(*(Text(one_line(cell), overflow="fold") for cell in row))
     Console().print(table)

@@ -72,7 +72,9 @@ class Condition:
 
     def columns_of_only(self, table: str) -> list[str] | None:
         """Return the columns used if all belong to `table`, otherwise None."""
-        return sorted(name for _, name in self.columns) if {table} == {own for own, _ in self.columns} else None
+        return (
+            sorted(name for _, name in self.columns) if {table} == {of_table for of_table, _ in self.columns} else None
+        )
 
     def within_table(self) -> Any:
         """Return the pyarrow expression with plain column names, for a condition on one table."""
@@ -82,10 +84,10 @@ class Condition:
         """Evaluate the condition (N,) on columns named `table.column`. Raises UserError if numbers overflow."""
         mask = np.zeros(len(rows), np.bool_)
         try:
-            found = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
+            rows_that_hold = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
         except pa.ArrowException as error:
             raise self._fault(self.text, f"numbers within the range of their columns ({error})") from None
-        mask[found[""].to_numpy()] = True
+        mask[rows_that_hold[""].to_numpy()] = True
         return mask
 
     def _compiled(self, name_of: Callable[[str, str], str]) -> Any:
@@ -170,11 +172,11 @@ class Condition:
 
     def _compare(self, node: ast.Compare, walk: Callable[[ast.expr], _Value]) -> _Value:
         sides = [node.left, *node.comparators]
-        found = []
+        comparisons = []
         for op, left, right in zip(node.ops, sides, sides[1:], strict=False):
             if isinstance(op, ast.In | ast.NotIn):
                 is_in = self._is_in(walk(left), left, right)
-                found.append(is_in if isinstance(op, ast.In) else ~is_in)
+                comparisons.append(is_in if isinstance(op, ast.In) else ~is_in)
             elif type(op) in _COMPARISONS:
                 a, b = walk(left), walk(right)
                 if not ((a.is_number and b.is_number) or a.kind == b.kind == "text"):
@@ -182,10 +184,10 @@ class Condition:
                         f"{ast.unparse(left)} ({a.kind}) with {ast.unparse(right)} ({b.kind})",
                         "comparisons of numbers with numbers and text with text",
                     )
-                found.append(_COMPARISONS[type(op)](a.expression, b.expression))
+                comparisons.append(_COMPARISONS[type(op)](a.expression, b.expression))
             else:
                 raise self._fault(ast.unparse(node), "one of == != < <= > >= in")
-        return _Value("boolean", functools.reduce(operator.and_, found))
+        return _Value("boolean", functools.reduce(operator.and_, comparisons))
 
     def _is_in(self, value: _Value, left: ast.expr, right: ast.expr) -> Any:
         if not isinstance(right, ast.Tuple | ast.List) or not right.elts:
@@ -200,13 +202,13 @@ class Condition:
             expected = "comparisons of numbers with numbers and text with text"
             raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", expected)
         if texts:
-            found = value.expression.isin(pa.array(items, pa.string()))
+            matches = value.expression.isin(pa.array(items, pa.string()))
         elif value.kind == "integer" and all(isinstance(item, int) for item in items):
-            found = value.expression.isin(pa.array(items, pa.int64()))
+            matches = value.expression.isin(pa.array(items, pa.int64()))
         else:
-            found = value.expression.cast(pa.float64()).isin(pa.array([float(item) for item in items]))
+            matches = value.expression.cast(pa.float64()).isin(pa.array([float(item) for item in items]))
         # pyarrow evaluates `null in list` as false, so `null not in list` would be true; return null.
-        return pc.if_else(value.expression.is_valid(), found, pa.scalar(None, pa.bool_()))
+        return pc.if_else(value.expression.is_valid(), matches, pa.scalar(None, pa.bool_()))
 
     def _number(self, value: _Value, node: ast.expr) -> _Value:
         if not value.is_number:

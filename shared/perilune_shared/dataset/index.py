@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from perilune_shared.dataset.info_file import INFO_NAME, write_info
 from perilune_shared.dataset.metadata import DatasetInfo, IndexPart
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
-from perilune_shared.dataset.parts import Part, Written
+from perilune_shared.dataset.parts import Part, WrittenFile
 from perilune_shared.dataset.schema import SCHEMA_VERSION
 from perilune_shared.dataset.statistics import false_statistics
 from perilune_shared.errors import UserError
@@ -42,10 +42,10 @@ _PATH = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}(/[A-Za-z0-9][A-Za-z0-9._-]{0,199})*$
 _SHA256 = r"^[0-9a-f]{64}$"
 
 
-def index_rows(written: Iterable[Written]) -> pa.Table:
+def index_rows(written: Iterable[WrittenFile]) -> pa.Table:
     """Return the rows of files, sorted by path."""
-    found = sorted(written, key=lambda file: file.path)
-    columns = [[file.path for file in found], [file.size_bytes for file in found], [file.sha256 for file in found]]
+    files = sorted(written, key=lambda file: file.path)
+    columns = [[file.path for file in files], [file.size_bytes for file in files], [file.sha256 for file in files]]
     return pa.table(columns, schema=INDEX)
 
 
@@ -65,8 +65,8 @@ def scene_file_rows(scenes: pa.Table) -> pa.Table:
 def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
     pieces = [INDEX.empty_table()]
     for kind in kinds:
-        own = table.filter(pc.is_valid(table[f"{kind}_path"]))
-        columns = [own[f"{kind}_{column}"] for column in ("path", "bytes", "sha256")]
+        of_kind = table.filter(pc.is_valid(table[f"{kind}_path"]))
+        columns = [of_kind[f"{kind}_{column}"] for column in ("path", "bytes", "sha256")]
         if any(column.null_count for column in columns):
             raise UserError(name, f"{kind}_sha256", "null", f"size and SHA-256 of every {name.removesuffix('s')}")
         pieces.append(

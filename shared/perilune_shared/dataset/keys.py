@@ -62,7 +62,7 @@ class KeyCheck:
         self._dataset = dataset
         scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
         _check_unique(dataset, "scenes", scenes)
-        self.scene_of = {name: place for place, name in enumerate(scenes["scene_id"])}
+        self.scene_of = {name: index for index, name in enumerate(scenes["scene_id"])}
         trajectories = dataset.table("trajectories", KEYS["trajectories"])
         _check_unique(dataset, "trajectories", trajectories.to_pandas())
         _check_known(dataset, "trajectories", "scene_id", trajectories["scene_id"], self.scene_of)
@@ -73,7 +73,7 @@ class KeyCheck:
             raise UserError(
                 dataset.store, "frames: trajectory_id", f"no {'/'.join(min(missing))}", f"trajectories; {_HINT}"
             )
-        self._frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
+        self._frame_of = {name: index for index, name in enumerate(frames["frame_id"].to_pylist())}
         if len(self._frame_of) != len(frames):
             _check_unique(dataset, "frames", frames.select(KEYS["frames"]).to_pandas())
         self._numbers, self._keys = _checked_ids_and_keys(dataset, "craters", self.scene_of)
@@ -82,13 +82,13 @@ class KeyCheck:
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
         """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
 
-        Raises UserError if a frame or crater is missing, or if `rows` has scene_id and it is not that of the frame.
+        Raises UserError if a frame or crater is missing, or if `rows` has another scene_id than the frame.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         if "scene_id" in rows.column_names:
-            own = _looked_up(rows["scene_id"], self.scene_of) == self._scene_of_frame[frame]
-            if not own.all():
-                row = rows.slice(int(np.argmin(own)), 1).to_pylist()[0]
+            same_scene = _looked_up(rows["scene_id"], self.scene_of) == self._scene_of_frame[frame]
+            if not same_scene.all():
+                row = rows.slice(int(np.argmin(same_scene)), 1).to_pylist()[0]
                 found = f"{row['scene_id']} in a label of {row['frame_id']}"
                 raise UserError(self._dataset.store, "labels: scene_id", found, f"the scene of the frame; {_HINT}")
         ids = rows["crater_id"].to_numpy()
@@ -96,8 +96,8 @@ class KeyCheck:
         known = number < len(self._numbers)
         known[known] = self._numbers[number[known]] == ids[known]
         key = self._scene_of_frame[frame] * len(self._numbers) + number
-        place = np.searchsorted(self._keys, key[known])
-        known[known] = (place < len(self._keys)) & (self._keys[np.minimum(place, len(self._keys) - 1)] == key[known])
+        index = np.searchsorted(self._keys, key[known])
+        known[known] = (index < len(self._keys)) & (self._keys[np.minimum(index, len(self._keys) - 1)] == key[known])
         if not known.all():
             row = rows.slice(int(np.argmin(known)), 1).to_pylist()[0]
             found = f"no crater {row['crater_id']} of a label of {row['frame_id']} names"
@@ -113,19 +113,19 @@ class KeyCheck:
         repeated = np.flatnonzero(np.diff(keys) == 0)
         if len(repeated):
             frame_place, number_place = divmod(int(keys[repeated[0]]), len(self._numbers))
-            frame_id = next(name for name, place in self._frame_of.items() if place == frame_place)
+            frame_id = next(name for name, index in self._frame_of.items() if index == frame_place)
             found = f"crater {self._numbers[number_place]} of {frame_id} twice"
             raise UserError(self._dataset.store, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
 
 
 def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
     """Look up each text of a column (N,) in `place_of`; -1 if it is missing. Each distinct text is looked up once."""
-    found = []
+    looked_up = []
     for chunk in column.chunks:
         words = chunk.dictionary_encode()
-        own = [*(place_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
-        found.append(np.array(own, np.int64)[words.indices.fill_null(len(own) - 1).to_numpy()])
-    return np.concatenate(found) if found else np.empty(0, np.int64)
+        indices = [*(place_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
+        looked_up.append(np.array(indices, np.int64)[words.indices.fill_null(len(indices) - 1).to_numpy()])
+    return np.concatenate(looked_up) if looked_up else np.empty(0, np.int64)
 
 
 def _checked_ids_and_keys(
@@ -134,8 +134,8 @@ def _checked_ids_and_keys(
     """Check the keys of craters or boulders; return all ids and all keys (scene and id as one integer), sorted."""
     rows = dataset.table(table, KEYS[table])
     scene = _check_known(dataset, table, "scene_id", rows["scene_id"], scene_of)
-    numbers, place = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
-    keys = np.sort(scene * len(numbers) + place)
+    numbers, position = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
+    keys = np.sort(scene * len(numbers) + position)
     if (np.diff(keys) == 0).any():
         _check_unique(dataset, table, rows.to_pandas())
     return numbers, keys

@@ -1,4 +1,4 @@
-"""Columns of labels that repeat those of their frames, so that the table labels can be used alone."""
+"""Columns of labels that repeat columns of their frames, so that the table labels can be used alone."""
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -12,12 +12,12 @@ def with_frame_columns(labels: pa.Table, frames: pa.Table) -> pa.Table:
 
     `frames` has at least frame_id, scene_id and split. Raises UserError if a label's frame is missing.
     """
-    place = pc.index_in(labels["frame_id"], frames["frame_id"].combine_chunks())
-    if place.null_count:
-        missing = labels["frame_id"].filter(pc.is_null(place))[0].as_py()
+    index = pc.index_in(labels["frame_id"], frames["frame_id"].combine_chunks())
+    if index.null_count:
+        missing = labels["frame_id"].filter(pc.is_null(index))[0].as_py()
         raise UserError("labels", "frame_id", missing, "a row of frames; see `perilune-manifest validate`")
     for name in ("scene_id", "split"):
         if name in labels.column_names:
             labels = labels.drop_columns([name])
-        labels = labels.append_column(TABLES["labels"].field(name), frames[name].take(place))
+        labels = labels.append_column(TABLES["labels"].field(name), frames[name].take(index))
     return labels

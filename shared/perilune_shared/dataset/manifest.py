@@ -87,7 +87,7 @@ class Dataset:
 
     @property
     def exr_camera(self) -> Camera:
-        """Camera of the frames' EXRs; that of the PNGs if there are no EXRs. The first one if there are several."""
+        """Camera of the frames' EXRs, or of the PNGs if there are no EXRs; the first one if there are several."""
         return (self.info.exr_camera or self.info.camera).intrinsics()
 
     @functools.cached_property
@@ -128,25 +128,25 @@ class Dataset:
         )
 
     @overload
-    def __getitem__(self, place: int | str) -> Frame: ...
+    def __getitem__(self, key: int | str) -> Frame: ...
     @overload
-    def __getitem__(self, place: slice) -> list[Frame]: ...
-    def __getitem__(self, place: int | str | slice) -> Frame | list[Frame]:
+    def __getitem__(self, key: slice) -> list[Frame]: ...
+    def __getitem__(self, key: int | str | slice) -> Frame | list[Frame]:
         """Return a frame by its row number in `frames` or by its frame_id, or the list of frames of a slice.
 
         Raises IndexError or KeyError if there is no such frame, UserError if its image or labels cannot be read.
         """
-        if isinstance(place, slice):
+        if isinstance(key, slice):
             with self.parts_kept_open():
-                return [self[k] for k in range(*place.indices(len(self.frames)))]
-        if isinstance(place, str):
-            found = self.frames.index[self.frames["frame_id"] == place]
-            if len(found) == 0:
-                raise KeyError(place)
-            place = int(found[0])
-        if not -len(self.frames) <= place < len(self.frames):
-            raise IndexError(place)
-        row = {str(name): value for name, value in self.frames.iloc[place].items()}
+                return [self[k] for k in range(*key.indices(len(self.frames)))]
+        if isinstance(key, str):
+            matching = self.frames.index[self.frames["frame_id"] == key]
+            if len(matching) == 0:
+                raise KeyError(key)
+            key = int(matching[0])
+        if not -len(self.frames) <= key < len(self.frames):
+            raise IndexError(key)
+        row = {str(name): value for name, value in self.frames.iloc[key].items()}
         labels = self.table("labels", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
         labels = labels.filter(pc.equal(labels["frame_id"], row["frame_id"]))
         ((_, png),) = self.pngs(pa.table({name: [row[name]] for name in ("frame_id", "png_path")}))
@@ -154,12 +154,12 @@ class Dataset:
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[str]:
         """Return the paths of a table's parts, sorted by name; with ids, those that may contain matching rows."""
-        found = self._listed.get(table)
-        if found is None:
-            found = parquet_files(self.store, f"manifest/{table}")
+        paths = self._listed.get(table)
+        if paths is None:
+            paths = parquet_files(self.store, f"manifest/{table}")
             if not self.store.is_local:  # listing an object store takes a request
-                self._listed[table] = found
-        return [part for part in found if may_contain(stem_of(part), scene_id, trajectory_id)]
+                self._listed[table] = paths
+        return [part for part in paths if may_contain(stem_of(part), scene_id, trajectory_id)]
 
     def table(
         self,
@@ -170,7 +170,7 @@ class Dataset:
         split: str | None = None,
         where: Condition | None = None,
     ) -> pa.Table:
-        """Read a table as Arrow: all or some columns; all rows or those of a scene, a trajectory, a split.
+        """Read a table as Arrow: all or some columns; all rows, or the rows of a scene, a trajectory, a split.
 
         A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table; row groups
         whose statistics exclude it are skipped. Only the parts, row groups and columns needed are read. Craters and
@@ -230,7 +230,7 @@ class Dataset:
             for start in range(0, len(paths), _MAX_REQUESTS):
                 portion = list(paths.items())[start : start + _MAX_REQUESTS]
                 yield from zip(
-                    (name for name, _ in portion), readers.map(read, (place for _, place in portion)), strict=True
+                    (name for name, _ in portion), readers.map(read, (path for _, path in portion)), strict=True
                 )
 
     def shards(self, split: str | None = None) -> list[str]:

@@ -214,8 +214,8 @@ class DatasetInfo(_Info):
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out what only datasets of several cameras have, so that others keep their bytes."""
-        found: dict[str, Any] = handler(self)
-        return {key: value for key, value in found.items() if value is not None or key not in _OF_SEVERAL}
+        values: dict[str, Any] = handler(self)
+        return {key: value for key, value in values.items() if value is not None or key not in _OF_SEVERAL}
 
     @property
     def leak(self) -> str:
@@ -227,7 +227,7 @@ class DatasetInfo(_Info):
         return self.camera if self.cameras is None or name is None else self.cameras[name]
 
     def exr_camera_of(self, name: str | None) -> CameraRecord:
-        """Return the camera of the EXRs of such frames; that of the PNGs if there are no EXRs."""
+        """Return the camera of the EXRs of such frames; the camera of the PNGs if there are no EXRs."""
         if self.cameras is None or name is None:
             return self.exr_camera or self.camera
         return (self.exr_cameras or self.cameras)[name]
@@ -239,11 +239,11 @@ class DatasetInfo(_Info):
             return self
         kept = [name for name in self.cameras if name in used]
         fields: dict[str, Any] = {}
-        for one, several in (("camera", "cameras"), ("exr_camera", "exr_cameras")):
-            found = getattr(self, several)
-            if found is not None:
-                chosen = {name: found[name] for name in kept}
-                fields |= {one: chosen[kept[0]], several: chosen if len(kept) > 1 else None}
+        for single, several in (("camera", "cameras"), ("exr_camera", "exr_cameras")):
+            records = getattr(self, several)
+            if records is not None:
+                chosen = {name: records[name] for name in kept}
+                fields |= {single: chosen[kept[0]], several: chosen if len(kept) > 1 else None}
         return self.model_copy(update=fields)
 
     def recipe(self) -> Recipe:
@@ -253,8 +253,8 @@ class DatasetInfo(_Info):
 
     def row_time_s(self, recipe: object) -> float:
         """Return the row time of the rolling shutter in a recipe, given by its key, seconds; 0 if it has none."""
-        found = self.recipes.get(str(recipe))
-        sensor = found.config.get("sensor") if found is not None else None
+        known = self.recipes.get(str(recipe))
+        sensor = known.config.get("sensor") if known is not None else None
         value = sensor.get("row_time_s", 0.0) if isinstance(sensor, dict) else 0.0
         return float(value) if isinstance(value, int | float) and 0 <= value < 1e3 else 0.0
 

@@ -12,13 +12,13 @@ Split = Literal["train", "val", "test"]
 SplitUnit = Literal["scene", "trajectory", "frame"]
 """Rows that belong to one split as a whole."""
 ImageState = Literal["files", "packed", "absent", "planned"]
-"""Where the frames are: under frames/, in shards/*.parquet, left out, or not rendered yet (then without labels)."""
+"""Where the frames are: under frames/, in shards/*.parquet, omitted, or not rendered yet (then without labels)."""
 ImageKind = Literal["png", "exr", "lidar"]
 """The files of a frame: image of the sensor; radiance with depth and crater index; ranges of the flash lidar."""
 SceneFileKind = Literal["hazard"]
 """The files of a scene: its hazard map."""
 ImageChoice = Literal["copy", "none", "plan"]
-"""How frames are written: `copy`, `none` (left out), or `plan` (frames, craters, boulders and labels left out: scenes
+"""How frames are written: `copy`, `none` (omitted), or `plan` (frames, craters, boulders and labels omitted: scenes
 and poses determine them)."""
 ImageMode = Literal[ImageChoice, "link"]
 """Also `link`: hard links where the file system allows them, so that an edit of a frame changes both datasets."""

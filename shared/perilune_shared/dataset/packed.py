@@ -73,8 +73,8 @@ def split_of(shard: str) -> str:
 
 def shards_of(store: Store, split: str | None = None) -> list[str]:
     """Return the paths of the shards of a dataset, or of one split, sorted by name. Other files are not shards."""
-    found = [path for path in parquet_files(store, FOLDER) if _NAME.fullmatch(path.rpartition("/")[2])]
-    return [path for path in found if split in (None, split_of(path))]
+    paths = [path for path in parquet_files(store, FOLDER) if _NAME.fullmatch(path.rpartition("/")[2])]
+    return [path for path in paths if split in (None, split_of(path))]
 
 
 def open_shard(store: Store, path: str) -> Part:
@@ -108,13 +108,13 @@ def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> 
 def packed_rows(frames: pa.Table, labels: pa.Table, pngs: list[bytes | None]) -> pa.Table:
     """Return rows of a shard from rows of `frames` (N), rows of `labels` and PNG bytes (N).
 
-    Labels of other frames are left out; those of one frame keep their order.
+    Labels of other frames are omitted; the labels of a frame keep their order.
     """
     row_of = pc.index_in(labels["frame_id"], frames["frame_id"].combine_chunks())
     frame_of = pc.fill_null(row_of, len(frames)).to_numpy()
     counts = np.bincount(frame_of, minlength=len(frames) + 1)[: len(frames)]
-    own = np.argsort(frame_of, kind="stable")[: counts.sum()]
-    columns = [labels[field.name].combine_chunks().take(pa.array(own)) for field in LABEL]
+    of_frames = np.argsort(frame_of, kind="stable")[: counts.sum()]
+    columns = [labels[field.name].combine_chunks().take(pa.array(of_frames)) for field in LABEL]
     offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]), pa.int32())
     nested = pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(columns, fields=list(LABEL)))
     images = [pa.array(pngs, pa.binary()), frames["png_path"].combine_chunks()]

@@ -48,7 +48,7 @@ _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_I
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class WrittenFile:
     """A file that was written, hashed while its bytes were in memory."""
 
     path: str
@@ -59,7 +59,7 @@ class Written:
     """SHA-256, hexadecimal."""
 
     @classmethod
-    def of(cls, path: str, content: bytes) -> "Written":
+    def of(cls, path: str, content: bytes) -> "WrittenFile":
         """Describe a file by its content."""
         return cls(path, len(content), hashlib.sha256(content).hexdigest())
 
@@ -67,8 +67,8 @@ class Written:
 def parquet_files(store: Store, folder: str) -> list[str]:
     """Return the paths of the Parquet files directly in a folder of a store, sorted by name; not hidden ones."""
     if store.folder is not None:
-        place = store.folder / folder
-        names = [entry.name for entry in os.scandir(place)] if place.is_dir() else []
+        local = store.folder / folder
+        names = [entry.name for entry in os.scandir(local)] if local.is_dir() else []
     else:
         names = [item.path.removeprefix(f"{folder}/") for item in store.list(folder)]
     return [f"{folder}/{name}" for name in sorted(names, key=lambda name: name[:-8]) if _PARQUET_FILE.fullmatch(name)]
@@ -104,7 +104,7 @@ class Part:
             self.found = self.file.metadata.schema.to_arrow_schema()
             # Asked for once: each access of pyarrow's metadata makes new objects.
             columns = self.file.metadata.schema
-            self._paths = [columns.column(place).path for place in range(len(columns))]
+            self._paths = [columns.column(index).path for index in range(len(columns))]
             check_footer(self.file.metadata, self.places_of(self.schema.names), self._n_bytes, self.address)
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
@@ -163,7 +163,7 @@ class Part:
     def places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
         """Places and paths of the columns of the file that belong to fields of these names."""
         wanted = set(names)
-        return [(place, path) for place, path in enumerate(self._paths) if path.split(".")[0] in wanted]
+        return [(index, path) for index, path in enumerate(self._paths) if path.split(".")[0] in wanted]
 
     def read(
         self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
@@ -179,13 +179,13 @@ class Part:
         missing = [name for name in names if name in self._may_be_absent and name not in self.found.names]
         present = [name for name in names if name not in missing]
         for field in map(schema.field, present):
-            place = self.found.get_field_index(field.name)
-            if place < 0:
+            index = self.found.get_field_index(field.name)
+            if index < 0:
                 raise UserError(
                     self.address, "columns", f"no {field.name}", f"every column of version {SCHEMA_VERSION}"
                 )
-            if self.found.field(place).type != field.type:
-                raise UserError(self.address, field.name, self.found.field(place).type, f"{field.type}")
+            if self.found.field(index).type != field.type:
+                raise UserError(self.address, field.name, self.found.field(index).type, f"{field.type}")
         try:
             with self._bytes_of(chosen, present) as stream:
                 for group in chosen:
@@ -212,9 +212,9 @@ class Part:
                 yield stream
             return
         columns = [
-            range_of(row_group.column(place))
+            range_of(row_group.column(index))
             for row_group in map(self.file.metadata.row_group, groups)
-            for place, _ in self.places_of(names)
+            for index, _ in self.places_of(names)
         ]
         with self._ranges.fetched(columns):
             yield cast(BinaryIO, self._ranges)
@@ -222,10 +222,10 @@ class Part:
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """Check that the pages do not exceed the sizes in the footer, which have been checked."""
         metadata = self.file.metadata.row_group(group)
-        for place, name in self.places_of(names):
+        for index, name in self.places_of(names):
             if (group, name) in self._checked:
                 continue
-            column = metadata.column(place)
+            column = metadata.column(index)
             pages = pages_of(stream, column)
             if pages.uncompressed_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
                 found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
@@ -250,10 +250,10 @@ class Part:
         """Return the row groups that may contain texts in [low, high), by their statistics."""
         footer = self.file.metadata
         names = [footer.schema.column(i).path for i in range(footer.num_columns)]
-        place = names.index(column) if column in names else -1
+        index = names.index(column) if column in names else -1
         chosen = []
         for group in range(footer.num_row_groups):
-            known = footer.row_group(group).column(place).statistics if place >= 0 else None
+            known = footer.row_group(group).column(index).statistics if index >= 0 else None
             try:
                 excluded = (
                     known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
@@ -286,11 +286,6 @@ def _first_mismatch(words: pa.Array, pattern: str) -> str | None:
     return words.filter(pc.invert(fits))[0].as_py() if pc.all(fits).as_py() is False else None
 
 
-def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read one local part. Raises UserError if it cannot be read or is of another table or schema version."""
-    return Part(open_store(path.parent), path.name, table).read(columns)
-
-
 def write_part(
     address: Address,
     table: str,
@@ -299,7 +294,7 @@ def write_part(
     rows_per_group: int | None = None,
     *,
     replace: bool = False,
-) -> Written:
+) -> WrittenFile:
     """Write the part `manifest/<table>/<name>.parquet` of a dataset.
 
     Raises FileExistsError if it exists, unless `replace`. Raises UserError if the name, which may come from the rows of
@@ -318,4 +313,4 @@ def write_part(
         store.replace(path, content)
     else:
         store.write(path, content)
-    return Written.of(path, content)
+    return WrittenFile.of(path, content)

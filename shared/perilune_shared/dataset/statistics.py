@@ -34,11 +34,11 @@ def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[Use
         yield UserError(part.address, "row group", _OF_GROUP[number], "none")
     chunks = stated.get(_COLUMNS, [])
     for name in rows.column_names:
-        places = part.places_of([name])
-        leaves = _leaves(rows[name].combine_chunks()) if places else ()
-        for (place, path), leaf in zip(places, leaves, strict=False):
+        columns = part.places_of([name])
+        leaves = _leaves(rows[name].combine_chunks()) if columns else ()
+        for (index, path), leaf in zip(columns, leaves, strict=False):
             try:
-                yield from _false_of_column(part.address, path, chunks[place], leaf)
+                yield from _false_of_column(part.address, path, chunks[index], leaf)
             except (TypeError, KeyError, IndexError, AttributeError, ValueError):
                 yield UserError(part.address, path, "a damaged description in the footer", "a complete Parquet file")
 
@@ -46,8 +46,8 @@ def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[Use
 def _leaves(column: pa.Array) -> Iterator[pa.Array]:
     """Yield the arrays that Parquet stores as columns, in its order; without the elements of lists that are null."""
     if pa.types.is_struct(column.type):
-        for place in range(column.type.num_fields):
-            yield from _leaves(pc.struct_field(column, place))
+        for index in range(column.type.num_fields):
+            yield from _leaves(pc.struct_field(column, index))
     elif pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
         yield from _leaves(column.flatten())
     else:
@@ -60,8 +60,8 @@ def _false_of_column(address: str, path: str, chunk: Fields, values: pa.Array) -
     for notes, fields in ((_OF_CHUNK, chunk), (_OF_COLUMN, metadata)):
         for number in sorted(notes.keys() & fields.keys()):
             yield UserError(address, path, notes[number], "none")
-    if (own := b".".join(metadata[_PATH])) != path.encode():
-        yield UserError(address, path, f"the name {own.decode(errors='replace')}", f"{path}, as in the schema")
+    if (own_path := b".".join(metadata[_PATH])) != path.encode():
+        yield UserError(address, path, f"the name {own_path.decode(errors='replace')}", f"{path}, as in the schema")
     statistics = metadata.get(_STATISTICS, {})
     n_present = len(values) - values.null_count
     if _NULLS in statistics and metadata[_N_VALUES] - statistics[_NULLS] != n_present:

@@ -6,7 +6,7 @@ import pyarrow as pa
 
 from perilune_shared.dataset.metadata import Counts
 from perilune_shared.dataset.names import WHOLE_TABLE
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written, write_part
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WrittenFile, write_part
 from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, complete
 from perilune_shared.storage.store import Store
 
@@ -25,7 +25,7 @@ class WholeTables:
         self._n_buffered = dict.fromkeys(TABLES, 0)
         self._n_parts = dict.fromkeys(TABLES, 0)
         self._n_rows = dict.fromkeys(TABLES, 0)
-        self._written: list[Written] = []
+        self._written: list[WrittenFile] = []
 
     @property
     def counts(self) -> Counts:
@@ -45,7 +45,7 @@ class WholeTables:
             self._n_buffered[name] += len(self._buffered[name][-1])
             rows = rows[free:]
 
-    def finish(self) -> list[Written]:
+    def finish(self) -> list[WrittenFile]:
         """Write buffered rows, and one empty part for each required table without rows; return all parts."""
         for name in TABLES:
             is_needed = name not in OPTIONAL_TABLES and not self._n_parts[name]

@@ -34,15 +34,15 @@ class Difference:
 
 def differences(first: Dataset, second: Dataset) -> list[Difference]:
     """Return all differences; the list is empty if the content is equal, however parts and frames are stored."""
-    found = list(_info(_plain(first), _plain(second), ""))
-    one, two = set(first.scene_ids()), set(second.scene_ids())
-    for here, other, only in ((one, two, True), (two, one, False)):
+    result = list(_info(_plain(first), _plain(second), ""))
+    first_ids, second_ids = set(first.scene_ids()), set(second.scene_ids())
+    for here, other, only in ((first_ids, second_ids, True), (second_ids, first_ids, False)):
         missing = sorted(here - other)
         if missing:
             present = ("present", "-") if only else ("-", "present")
-            found.append(Difference("scenes", "", len(missing), missing[0], *present))
+            result.append(Difference("scenes", "", len(missing), missing[0], *present))
     gathered: dict[tuple[str, str], Difference] = {}
-    for scene_id in sorted(one & two):
+    for scene_id in sorted(first_ids & second_ids):
         for name in TABLES:
             pair = (dataset.table(name, scene_id=scene_id).to_pandas() for dataset in (first, second))
             for each in _rows(name, *pair):
@@ -51,39 +51,39 @@ def differences(first: Dataset, second: Dataset) -> list[Difference]:
                 total = each.rows + (before.rows if before else 0)
                 kept = before or each
                 gathered[key] = Difference(kept.place, kept.column, total, kept.example, kept.first, kept.second)
-    return found + list(gathered.values())
+    return result + list(gathered.values())
 
 
 def _plain(dataset: Dataset) -> dict:
     return dataset.info.model_dump(mode="json", exclude={"images", "counts", "index"})
 
 
-def _info(one: object, two: object, path: str) -> Iterator[Difference]:
-    if one == two:
+def _info(old: object, new: object, path: str) -> Iterator[Difference]:
+    if old == new:
         return
-    if isinstance(one, dict) and isinstance(two, dict):
-        for key in sorted({*one, *two}):
-            yield from _info(one.get(key), two.get(key), f"{path}.{key}".lstrip("."))
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _info(old.get(key), new.get(key), f"{path}.{key}".lstrip("."))
         return
-    yield Difference("dataset.json", path, 1, "", _text(one), _text(two))
+    yield Difference("dataset.json", path, 1, "", _text(old), _text(new))
 
 
-def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Difference]:
+def _rows(table: str, old: pd.DataFrame, new: pd.DataFrame) -> Iterator[Difference]:
     """Yield the differences in one table of one scene."""
     keys = KEYS[table]
-    if any(frame.duplicated(keys).any() for frame in (one, two)):
+    if any(frame.duplicated(keys).any() for frame in (old, new)):
         # Number rows with equal keys, in an order that does not depend on how they are stored.
-        one, two = (_numbered(frame, keys) for frame in (one, two))
+        old, new = (_numbered(frame, keys) for frame in (old, new))
         keys = [*keys, _COPY_NUMBER]
-    one, two = (frame.set_index(keys).sort_index() for frame in (one, two))
-    for here, other, present in ((one, two, ("present", "-")), (two, one, ("-", "present"))):
+    old, new = (frame.set_index(keys).sort_index() for frame in (old, new))
+    for here, other, present in ((old, new, ("present", "-")), (new, old, ("-", "present"))):
         missing = here.index.difference(other.index)
         if len(missing):
             yield Difference(table, "", len(missing), _text(missing[0]), *present)
-    common = one.index.intersection(two.index)
-    one, two = one.loc[common], two.loc[common]
-    for column in one.columns:
-        a, b = one[column], two[column]
+    common = old.index.intersection(new.index)
+    old, new = old.loc[common], new.loc[common]
+    for column in old.columns:
+        a, b = old[column], new[column]
         if a.map(np.ndim).gt(0).any() if a.dtype == object else False:
             differs = np.array([not np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True)], bool)
         else:

@@ -27,26 +27,26 @@ def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
     """
     spdx = _spdx()
     terms: dict[str, str] = {}
-    for place, text in licences:
-        for term in _terms(spdx, place, text):
+    for where, text in licences:
+        for term in _terms(spdx, where, text):
             # Simplify, so that the order of alternatives does not matter.
             terms.setdefault(str(term.simplify()), str(term))
     parsed = [spdx.parse(term) for _, term in sorted(terms.items())]
     return str(spdx.AND(*parsed)) if len(parsed) > 1 else str(parsed[0])
 
 
-def _terms(spdx: Licensing, place: object, text: str) -> list[Any]:
+def _terms(spdx: Licensing, where: object, text: str) -> list[Any]:
     """Return the terms that an expression joins by AND."""
     expected = "an SPDX licence expression such as CC-BY-4.0, or LicenseRef-<name>"
     try:
         expression = spdx.parse(text)
         if expression is None:
-            raise UserError(place, "licence", "nothing", expected)
+            raise UserError(where, "licence", "nothing", expected)
         unknown = [key for key in spdx.unknown_license_keys(expression) if not _CUSTOM.fullmatch(key)]
     except (ExpressionError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(place, "licence", f"{text!r} ({error})", expected) from None
+        raise UserError(where, "licence", f"{text!r} ({error})", expected) from None
     if unknown:
-        raise UserError(place, "licence", ", ".join(unknown), expected)
+        raise UserError(where, "licence", ", ".join(unknown), expected)
     pending, terms = [expression], []
     while pending:
         term = pending.pop(0)

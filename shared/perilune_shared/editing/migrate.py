@@ -135,8 +135,8 @@ class _OldDataset(Dataset):
     def _of_scene(self, table: str, rows: pa.Table, scene_id: str) -> pa.Table:
         key = "scene_id" if "scene_id" in rows.column_names else "frame_id"
         values = rows[key].to_pylist()
-        own = [value == scene_id if key == "scene_id" else value.startswith(f"{scene_id}/") for value in values]
-        return rows.filter(pa.array(own, pa.bool_()))
+        in_scene = [value == scene_id if key == "scene_id" else value.startswith(f"{scene_id}/") for value in values]
+        return rows.filter(pa.array(in_scene, pa.bool_()))
 
     def _splits(self, frame_ids: pa.ChunkedArray, scene_id: str) -> list[str | None]:
         frames = self.rows("frames", scene_id)

@@ -13,7 +13,7 @@ from perilune_shared.dataset.names import SCENE_FILE_KINDS, SPLITS
 from perilune_shared.dataset.packed import LABEL, SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.editing.rewrite import check_source, rewrite
+from perilune_shared.editing.rewrite import Rewriting, check_source, rewrite
 from perilune_shared.editing.writer import DatasetWriter, new_dataset, with_column, with_new_paths
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
@@ -132,7 +132,7 @@ def unpack(source: Dataset, out: Address, progress: Progress = NO_PROGRESS, *, l
     """
     check_source(source, out, progress)
     info: DatasetInfo = source.info.changed("unpacked")
-    rewrite(source, out, info, lambda tables: tables, "link" if link else "copy", progress)
+    rewrite(source, out, Rewriting(info, lambda tables: tables, "link" if link else "copy"), progress)
 
 
 def _without(columns: Sequence[str], rows: pa.Table) -> pa.Table:

@@ -1,6 +1,7 @@
 """Rewrite a dataset as a new one; used by all tools that change or select rows."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import pyarrow.compute as pc
 
@@ -18,29 +19,36 @@ from perilune_shared.validation.files import check_files
 _DERIVED_TABLES = ("craters", "boulders", "labels", *OPTIONAL_TABLES)
 
 
-def rewrite(
-    source: Dataset,
-    out: Address,
-    info: DatasetInfo,
-    change: Callable[[SceneTables], SceneTables],
-    images: ImageMode,
-    progress: Progress = NO_PROGRESS,
-    scene_ids: Sequence[str] | None = None,
-) -> None:
-    """Write the scenes of `source`, by default all, after applying `change` to the tables of each.
+@dataclass(frozen=True, slots=True)
+class Rewriting:
+    """How a dataset is rewritten."""
 
-    Scenes and labels without frames are left out. The caller must have checked the source (`check_source`).
+    info: DatasetInfo
+    """The new `dataset.json`, except for its counts and `images`."""
+    change: Callable[[SceneTables], SceneTables]
+    """Returns the new tables of a scene from the old ones."""
+    images: ImageMode
+    """What becomes of the images."""
+    scene_ids: Sequence[str] | None = None
+    """Scenes to write; None for all."""
+
+
+def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progress = NO_PROGRESS) -> None:
+    """Write the scenes of `source` into `out`, changed; scenes and labels without frames are omitted.
+
+    The caller must have checked the source (`check_source`).
     """
-    info = info.model_copy(update={"images": state_of([source], images)})
-    scene_ids = source.scene_ids() if scene_ids is None else scene_ids
+    images = rewriting.images
+    info = rewriting.info.model_copy(update={"images": state_of([source], images)})
+    scene_ids = source.scene_ids() if rewriting.scene_ids is None else rewriting.scene_ids
     task = progress.add_task("writing", total=len(scene_ids), unit="scenes")
     with new_dataset(out, info) as writer:
         for scene_id in scene_ids:
-            tables = change(source.scene(scene_id))
+            tables = rewriting.change(source.scene(scene_id))
             frames = tables["frames"]
             if len(frames):
-                own = pc.is_in(tables["labels"]["frame_id"], frames["frame_id"].combine_chunks())
-                tables = {**tables, "labels": tables["labels"].filter(own)}
+                of_frames = pc.is_in(tables["labels"]["frame_id"], frames["frame_id"].combine_chunks())
+                tables = {**tables, "labels": tables["labels"].filter(of_frames)}
                 writer.add_scene(without_derived_rows(tables) if info.images == "planned" else tables)
                 if info.images == "files":
                     names = {name: name for name in frames["frame_id"].to_pylist()}

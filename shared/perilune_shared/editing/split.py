@@ -1,37 +1,54 @@
 """Re-split a dataset into train, val and test."""
 
+from dataclasses import dataclass
+
 import numpy as np
+import pandas as pd
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from perilune_shared.console.progress import NO_PROGRESS, Progress
+from perilune_shared.content import terrain_of
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import ImageMode, SplitUnit
-from perilune_shared.editing.flights import terrains_and_flights
-from perilune_shared.editing.rewrite import check_source, rewrite
+from perilune_shared.dataset.names import ImageMode, SplitUnit, trajectory_of_body
+from perilune_shared.editing.rewrite import Rewriting, check_source, rewrite
 from perilune_shared.editing.writer import SceneTables, with_column
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 
 
+@dataclass(frozen=True, slots=True)
+class Split:
+    """How a dataset is split."""
+
+    by: SplitUnit = "scene"
+    """Unit that is assigned as a whole: scene, trajectory or frame."""
+    val_share: float = 0.1
+    """Share of the units in the validation split."""
+    test_share: float = 0.1
+    """Share of the units in the test split."""
+    seed: int = 0
+    """Random seed of the split."""
+
+
 def split_dataset(
     source: Dataset,
     out: Address,
-    by: SplitUnit = "scene",
-    val_share: float = 0.1,
-    test_share: float = 0.1,
-    seed: int = 0,
+    split: Split | None = None,
     images: ImageMode = "copy",
     progress: Progress = NO_PROGRESS,
 ) -> None:
     """Write a dataset whose scenes, trajectories or frames are randomly assigned to train, val and test.
 
-    Units are identified by content, not by name (`perilune_shared.editing.flights`). Scenes with the same terrain are
-    one unit, even if their names or Suns differ; so are all scenes on one elevation model. Trajectories of one flight
-    are one unit, also if the flight was rendered or developed again. Frames with one pose are one unit. `frame` with
-    shares of 0.1 is the paper's protocol: all three splits contain the same terrain, so test metrics are optimistic;
-    `split_by` in dataset.json records it. Each split with a share above 0 gets at least one unit. Raises UserError if
-    there are too few units.
+    By default scenes are assigned, with shares of 0.1. Units are identified by content, not by name
+    (`terrains_and_flights`). Scenes with the same terrain are one unit, even if their names or Suns differ;
+    so are all scenes on one elevation model. Trajectories of one flight are one unit, also if the flight was rendered
+    or developed again. Frames with one pose are one unit. `frame` with shares of 0.1 is the paper's protocol: all three
+    splits contain the same terrain, so test metrics are optimistic; `split_by` in dataset.json records it. Each split
+    with a share above 0 gets at least one unit. Raises UserError if there are too few units.
     """
+    split = split or Split()
+    by, val_share, test_share, seed = split.by, split.val_share, split.test_share, split.seed
     if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
         raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "at least 0, with a sum below 1")
     check_source(source, out, progress)
@@ -52,4 +69,59 @@ def split_dataset(
         return {**tables, "frames": with_column(tables["frames"], "split", splits)}
 
     line = f"split by {by}, val {val_share:g}, test {test_share:g}, seed {seed}"
-    rewrite(source, out, source.info.changed(line), change, images, progress)
+    rewrite(source, out, Rewriting(source.info.changed(line), change, images), progress)
+
+
+def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
+    """Return the table of all frames, sorted by frame_id, with their `terrain`, `flight` and `pose`.
+
+    Terrain is the key from `terrain_of`; pose numbers each position and rotation over a terrain. Trajectories over one
+    terrain are the same flight if they have the same random seed or a common pose. So a flight that was developed again
+    or rendered with another Sun is the same flight. A split by one of these units puts each unit in one split.
+    """
+    columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
+    rows = dataset.table("frames", [*columns, "camera", "frame_index"]).sort_by("frame_id")
+    frames = rows.select(columns[:3]).to_pandas()
+    scenes = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pandas()
+    terrain = {row.scene_id: terrain_of(row.dem_source, row.content_sha256) for row in scenes.itertuples()}
+    frames["terrain"] = frames["scene_id"].map(terrain)
+    seeds = dataset.table("trajectories", ["scene_id", "trajectory_id", "seed"]).to_pandas()
+    frames["seed"] = frames.merge(seeds, on=["scene_id", "trajectory_id"], how="left")["seed"].to_numpy()
+    numbers = [
+        rows[name].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(rows), -1)
+        for name in columns[3:5]
+    ]
+    # Adding 0.0 turns negative zero into zero.
+    poses = pd.DataFrame(np.hstack(numbers) + 0.0).assign(terrain=frames["terrain"].to_numpy())
+    frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
+    if dataset.info.cameras is not None:  # the poses of all cameras of one instant are one unit
+        rig = rows.select(["scene_id", "trajectory_id", "camera", "frame_index"]).to_pylist()
+        names = [trajectory_of_body(str(row["camera"]), row["trajectory_id"]) for row in rig]
+        instant = frames.assign(body=names, index=rows["frame_index"].to_numpy()).groupby(["scene_id", "body", "index"])
+        frames["pose"] = _connected_groups(frames["pose"].to_numpy(), [instant.ngroup().to_numpy()])
+    trajectory = frames.groupby(["scene_id", "trajectory_id"], sort=False).ngroup().to_numpy()
+    by_seed = frames.groupby(["terrain", "seed"], dropna=False).ngroup().to_numpy()
+    frames["flight"] = _connected_groups(trajectory, [by_seed, frames["pose"].to_numpy()])
+    return frames[["frame_id", "terrain", "flight", "pose"]]
+
+
+def _connected_groups(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Return the group of each row (N,). Rows with the same unit, or an equal value of any key, are in one group.
+
+    So are rows that are connected through other rows. `unit` (N,) has numbers from 0; `keys` are arrays (N,).
+    """
+    root = np.arange(unit.max(initial=-1) + 1)
+
+    def find(number: int) -> int:
+        while root[number] != number:
+            root[number] = root[root[number]]
+            number = root[number]
+        return number
+
+    for key in keys:
+        pairs = pd.DataFrame({"key": key, "unit": unit}).drop_duplicates()
+        first = pairs.groupby("key")["unit"].transform("first").to_numpy()
+        second = pairs["unit"].to_numpy()
+        for left, right in zip(first[first != second], second[first != second], strict=True):
+            root[find(int(right))] = find(int(left))
+    return np.array([find(number) for number in range(len(root))], np.int64)[unit]

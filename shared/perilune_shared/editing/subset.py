@@ -1,6 +1,7 @@
 """Take part of a dataset: by conditions on columns, by number of frames, or by size."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -11,26 +12,35 @@ from perilune_shared.console.progress import NO_PROGRESS, Progress
 from perilune_shared.dataset.expression import Condition, columns_of
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import ImageMode
-from perilune_shared.editing.rewrite import check_source, rewrite
+from perilune_shared.editing.rewrite import Rewriting, check_source, rewrite
 from perilune_shared.editing.writer import SceneTables
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """How much of a dataset is taken."""
+
+    n_frames: int | None = None
+    """Largest number of frames; None for any."""
+    megabytes: float | None = None
+    """Largest size of the PNGs, 10^6 bytes; None for any."""
 
 
 def subset(
     source: Dataset,
     out: Address,
     where: Sequence[str] = (),
-    n_frames: int | None = None,
-    megabytes: float | None = None,
+    limit: Limit | None = None,
     images: ImageMode = "copy",
     progress: Progress = NO_PROGRESS,
 ) -> None:
     """Write the frames and labels that fulfil all conditions, up to a number of frames or a size of the PNGs.
 
     A condition on columns of frames, trajectories and scenes selects frames. One that uses labels or craters selects
-    labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. With
-    `n_frames` or `megabytes` (10^6 bytes), trajectories are taken from each scene in turn until the limit is reached,
+    labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. With a
+    `limit`, trajectories are taken from each scene in turn until the limit is reached,
     so that the subset has many terrains; the last trajectory is truncated. Raises UserError if no frame is left.
     """
     conditions = [Condition(text) for text in where]
@@ -41,9 +51,7 @@ def subset(
         expected = "conditions on frames, trajectories and scenes: a plan has no labels"
         raise UserError("--where", "condition", on_labels[0].text, expected)
     check_source(source, out, progress)
-    kept = None
-    if n_frames is not None or megabytes is not None:
-        kept = _first_frames(source, on_frames, n_frames, megabytes)
+    kept = None if limit is None else _first_frames(source, on_frames, limit)
 
     def change(tables: SceneTables) -> SceneTables:
         frames = tables["frames"]
@@ -54,11 +62,12 @@ def subset(
         return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
 
     steps = [*(f"where {text}" for text in where)]
-    steps += [f"{n_frames} frames"] if n_frames is not None else []
-    steps += [f"{megabytes:g} MB"] if megabytes is not None else []
+    if limit is not None:
+        steps += [f"{limit.n_frames} frames"] if limit.n_frames is not None else []
+        steps += [f"{limit.megabytes:g} MB"] if limit.megabytes is not None else []
     steps += ["no craters and labels"] if images == "plan" else []
     info = source.info.changed("subset: " + ("; ".join(steps) or "all").replace("<", " lt ").replace(">", " gt "))
-    rewrite(source, out, info, change, images, progress, _scenes_with(source, on_frames))
+    rewrite(source, out, Rewriting(info, change, images, _scenes_with(source, on_frames)), progress)
 
 
 def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
@@ -74,10 +83,9 @@ def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
     return sorted(scene_ids)
 
 
-def _first_frames(
-    source: Dataset, on_frames: Sequence[Condition], n_frames: int | None, megabytes: float | None
-) -> pa.Array:
-    """Return the frame_ids of trajectories, taken from each scene in turn, up to a number of frames or a size."""
+def _first_frames(source: Dataset, on_frames: Sequence[Condition], limit: Limit) -> pa.Array:
+    """Return the frame_ids of trajectories, taken from each scene in turn, up to the limit."""
+    n_frames, megabytes = limit.n_frames, limit.megabytes
     if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
         raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
     pieces = []

@@ -19,7 +19,7 @@ from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SplitUnit, frame_path, scene_file_path
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WrittenFile
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.dataset.whole_tables import WholeTables
 from perilune_shared.errors import UserError
@@ -59,8 +59,8 @@ class DatasetWriter:
         terrain = terrain_of(scene["dem_source"], scene["content_sha256"])
         self._splits_of_terrain[terrain] |= set(splits)
         for trajectory in tables["trajectories"].select(["trajectory_id", "seed"]).to_pylist():
-            own = np.asarray(pc.equal(frames["trajectory_id"], trajectory["trajectory_id"]), bool)
-            self._splits_of_trajectory[terrain, trajectory["seed"]] |= set(splits[own])
+            of_trajectory = np.asarray(pc.equal(frames["trajectory_id"], trajectory["trajectory_id"]), bool)
+            self._splits_of_trajectory[terrain, trajectory["seed"]] |= set(splits[of_trajectory])
         self._has_exr |= frames["exr_path"].null_count < len(frames)
         self._cameras |= set(frames["camera"].drop_null().unique().to_pylist())
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
@@ -109,7 +109,7 @@ class DatasetWriter:
     def add_file(self, path: str, content: bytes) -> None:
         """Write another file of the dataset."""
         self.store.write(path, content, durable=False)
-        self._index.append(index_rows([Written.of(path, content)]))
+        self._index.append(index_rows([WrittenFile.of(path, content)]))
 
     def finish(self, out: Address) -> None:
         """Write buffered rows, the index, then dataset.json. Raises UserError about `out` if there are no frames."""
@@ -163,10 +163,10 @@ def check_scene(where: object, tables: SceneTables) -> None:
 
 def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
     """Return a table with one column replaced."""
-    place = table.schema.get_field_index(name)
-    field = table.schema.field(place)
+    index = table.schema.get_field_index(name)
+    field = table.schema.field(index)
     array = values if isinstance(values, pa.Array | pa.ChunkedArray) else pa.array(values, field.type)
-    return table.set_column(place, field, array)
+    return table.set_column(index, field, array)
 
 
 def with_new_paths(frames: pa.Table) -> pa.Table:
@@ -202,9 +202,9 @@ def _with_counts_and_splits(trajectories: pa.Table, frames: pa.Table) -> pa.Tabl
     rows = {row["trajectory_id"]: row for row in counted.to_pylist()}
     ids = trajectories["trajectory_id"].to_pylist()
     trajectories = trajectories.filter(pa.array(name in rows for name in ids))
-    own = [rows[name] for name in ids if name in rows]
-    n_frames = [row["frame_id_count"] for row in own]
-    splits = [row["split_min"] if row["split_count_distinct"] == 1 else None for row in own]
+    rows_of_scene = [rows[name] for name in ids if name in rows]
+    n_frames = [row["frame_id_count"] for row in rows_of_scene]
+    splits = [row["split_min"] if row["split_count_distinct"] == 1 else None for row in rows_of_scene]
     trajectories = with_column(trajectories, "n_frames", n_frames)
     return with_column(trajectories, "split", splits)
 

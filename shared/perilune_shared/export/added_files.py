@@ -14,7 +14,7 @@ from perilune_shared.dataset.index import index_rows, read_index, seal
 from perilune_shared.dataset.info_file import INFO_NAME, read_info
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.parts import Written
+from perilune_shared.dataset.parts import WrittenFile
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.locks import locked
@@ -78,13 +78,13 @@ def check_index(dataset: Dataset, targets: Iterable[Target], progress: Progress 
         if _is_below(target.store, dataset.store):
             expected = "a file directly in the dataset, or outside of it"
             raise UserError(target.address, "--out", "a file in a folder of the dataset", expected)
-    own = _own_names(dataset, targets)
-    for name in sorted(own - EXTRA_NAMES):
+    own_names = _own_names(dataset, targets)
+    for name in sorted(own_names - EXTRA_NAMES):
         raise UserError(dataset.store.at(name), "--out", name, f"{', '.join(sorted(EXTRA_NAMES))}, or another folder")
-    if not own or not dataset.info.complete:
+    if not own_names or not dataset.info.complete:
         return None
     info = read_info(dataset.store)
-    check_files(dataset, progress, replaced=own)
+    check_files(dataset, progress, replaced=own_names)
     return info
 
 
@@ -107,18 +107,18 @@ def add_files(
     with locked(store.folder) if store.folder is not None else contextlib.nullcontext():
         if read_info(store) != info:
             raise UserError(store.at(INFO_NAME), "content", "changed meanwhile", "no other writer; run it again")
-        own = _own_names(dataset, contents)
+        own_names = _own_names(dataset, contents)
         rows = read_index(store, info)
-        others = rows.filter(pc.invert(pc.is_in(rows["path"], pa.array(sorted(own), pa.string()))))
+        others = rows.filter(pc.invert(pc.is_in(rows["path"], pa.array(sorted(own_names), pa.string()))))
         # No file that an index names is overwritten: take the old ones out first.
         info = info if len(others) == len(rows) else seal(store, info, others)
         for target, content in contents.items():
             target.write(content)
-        known = {*others["path"].to_pylist(), *own}
+        known = {*others["path"].to_pylist(), *own_names}
         extra = sorted(name for name in EXTRA_NAMES - known if store.exists(name))
-        added = {target.name: content for target, content in contents.items() if target.name in own}
+        added = {target.name: content for target, content in contents.items() if target.name in own_names}
         added |= {name: store.read(name, most_bytes=_LARGEST_BYTES) for name in extra}
-        written = index_rows(Written.of(name, content) for name, content in added.items())
+        written = index_rows(WrittenFile.of(name, content) for name, content in added.items())
         info = info if licence is None else info.model_copy(update={"licence": licence})
         seal(store, info, pa.concat_tables([others, written]))
 

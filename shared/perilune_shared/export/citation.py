@@ -11,7 +11,8 @@ from perilune_shared.dataset.schema import TABLES
 
 
 def citation_of(dataset: Dataset) -> str:
-    """Return a BibTeX entry that identifies this dataset by the hash of its tables, which contain those of the frames.
+    """Return a BibTeX entry that identifies this dataset by the hash of its tables, which contain the hashes of the
+    frames.
 
     Cards and other added files do not change the hash; the shell prints it:
     `sha256sum manifest/*/*.parquet | sha256sum`.

@@ -116,13 +116,13 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
     image_ids = scene.frames.set_index("frame_id")["image_id"].loc[labels["frame_id"]].to_list()
     names = zip(image_ids, labels["label_id"], labels["crater_id"], labels["chosen"], strict=True)
     measures = {name: labels[name].to_numpy(np.float64) for name in LABEL_MEASURES if name in labels}
-    found: dict[int, list[dict[str, Any]]] = {}
+    annotations: dict[int, list[dict[str, Any]]] = {}
     for k, (image_id, label_id, crater_id, chosen) in enumerate(names):
         polygon = polygons[k] if is_inside[k] else clip_to_image(polygons[k], *size[k])
         area = area_of(polygon) if len(polygon) > 2 else 0.0
         if area <= 0 or boxes[k, 2:].min() <= 0:
             continue
-        found.setdefault(image_id, []).append(
+        annotations.setdefault(image_id, []).append(
             {
                 "id": label_id,
                 "image_id": image_id,
@@ -136,19 +136,19 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
                 **{name: _number(values[k]) for name, values in measures.items()},
             }
         )
-    return found
+    return annotations
 
 
 def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_]:
     """Whether box and outline of each label, clipped to its image, have an area; others are not exported."""
     boxes, size = clipped_boxes(labels, frames), frame_sizes(labels, frames)
-    found = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
     polygons = polygons_of(labels)
     cut = ~((polygons >= 0) & (polygons <= size[:, None])).all(axis=(1, 2))
-    for k in np.flatnonzero(found & cut):
+    for k in np.flatnonzero(inside & cut):
         polygon = clip_to_image(polygons[k], *size[k])
-        found[k] = len(polygon) > 2 and area_of(polygon) > 0
-    return found
+        inside[k] = len(polygon) > 2 and area_of(polygon) > 0
+    return inside
 
 
 class _SplitFile:

@@ -108,7 +108,7 @@ def metadata_of(dataset: Dataset) -> dict[str, Any]:
     """Return the JSON-LD object.
 
     A table with one part is a FileObject with its hash. A table with several parts is a FileSet; their hashes are in
-    the index. dataset.json is a FileSet too: it contains the hash of the index, which contains that of this file.
+    the index. dataset.json is a FileSet too: it contains the hash of the index, which contains the hash of this file.
     """
     info, hashes = dataset.info, table_hashes(dataset)
     distribution: list[dict[str, Any]] = [

@@ -1,10 +1,9 @@
-"""Make text of other people safe where it is printed or written: one function each for Markdown, HTML and CSV.
+"""Make text of other people safe where it is written: one function each for Markdown, its code spans and CSV.
 
-Names of files, runs and datasets, licences, classes and messages of other libraries are such text. On terminals it is
-`errors.one_line`, which the functions here call too; `terminal` prints nothing without it.
+Names of files, runs and datasets, licences, classes and messages of other libraries are such text. For terminals,
+`terminal` passes all text through `errors.one_line`, which the functions here call too. Jinja2 escapes HTML.
 """
 
-import html
 import os
 import re
 import string
@@ -27,7 +26,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "|", "%")
 def for_markdown(value: object) -> str:
     """Return text as one line that Markdown shows as it is: no markup, HTML, link or picture.
 
-    Bars stay, since tables of pages escape those of all cells.
+    Bars are kept, since tables of pages escape the bars of all cells.
     """
     return _LINK.sub(r"\\\1", one_line(value).translate(_MARKUP))
 
@@ -41,11 +40,6 @@ def code_span(value: object) -> str:
     return f"`{shortened(text, 200).strip() or 'none'}`"
 
 
-def for_html(value: object) -> str:
-    """Return text as one line for the content or a quoted attribute of an HTML element."""
-    return html.escape(one_line(value), quote=True)
-
-
 def for_csv(value: str) -> str:
     """Return text as the cell of a CSV table that no spreadsheet program takes for a formula: after an apostrophe."""
     text = one_line(value)
@@ -57,8 +51,8 @@ def for_csv(value: str) -> str:
 def write_csv(table: "pd.DataFrame", path: str | os.PathLike[str], **options: Any) -> None:
     """Write a table as CSV without its index; text, and the names of columns, by `for_csv`. `options` are pandas'."""
     safe = table.rename(columns=for_csv)
-    for place, kind in enumerate(safe.dtypes):
+    for index, kind in enumerate(safe.dtypes):
         if str(kind) in ("object", "str", "string"):
-            cells = [for_csv(cell) if isinstance(cell, str) else cell for cell in safe.iloc[:, place]]
-            safe.isetitem(place, cells)
+            cells = [for_csv(cell) if isinstance(cell, str) else cell for cell in safe.iloc[:, index]]
+            safe.isetitem(index, cells)
     safe.to_csv(path, index=False, **options)

@@ -104,10 +104,10 @@ def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]
 
 def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
     """Return the list of labels of each frame; labels and frames are sorted by frame_id."""
-    own = labels[labels["frame_id"].isin(frame_ids)]
-    counts = own["frame_id"].value_counts().reindex(frame_ids, fill_value=0).to_numpy()
+    of_frames = labels[labels["frame_id"].isin(frame_ids)]
+    counts = of_frames["frame_id"].value_counts().reindex(frame_ids, fill_value=0).to_numpy()
     offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]), pa.int32())
-    values = [pa.array(own[field.name].to_numpy(), field.type, from_pandas=True) for field in _LABEL]
+    values = [pa.array(of_frames[field.name].to_numpy(), field.type, from_pandas=True) for field in _LABEL]
     return pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(values, fields=list(_LABEL)))
 
 

@@ -21,7 +21,7 @@ def summary(dataset: Dataset) -> pd.DataFrame:
     keys = KeyCheck(dataset, frames)
     if not len(frames):
         raise UserError(dataset.store, "frames", "none", "a dataset with frames")
-    found = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
+    gathered = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
     split_of = frames["split"].combine_chunks().dictionary_encode()
     names = np.array(split_of.dictionary.to_pylist(), object)
     codes = split_of.indices.to_numpy()
@@ -32,12 +32,12 @@ def summary(dataset: Dataset) -> pd.DataFrame:
             code = codes[keys.add_labels(rows)]
             radius, visible = rows["radius_px"].to_numpy(), rows["visible_fraction"].to_numpy()
             for k, name in enumerate(names):
-                own = code == k
-                found[name].radius_px.append(radius[own].astype(np.float32))
-                found[name].visible += float(visible[own].sum())
+                in_split = code == k
+                gathered[name].radius_px.append(radius[in_split].astype(np.float32))
+                gathered[name].visible += float(visible[in_split].sum())
     keys.finish()
     table = frames.to_pandas()
-    return pd.DataFrame([_row(split, part, found[split]) for split, part in table.groupby("split")])
+    return pd.DataFrame([_row(split, part, gathered[split]) for split, part in table.groupby("split")])
 
 
 class _Gathered:

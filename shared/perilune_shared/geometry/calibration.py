@@ -106,14 +106,14 @@ def _kalibr(path: Path, content: dict[str, Any]) -> Calibration:
     coefficients = _numbers(path, name, content.get(name, []), (0, 4, 5, 8))
     stated = str(content.get("distortion_model", "none" if not any(coefficients) else ""))
     camera = _camera(path, size, (fx, fy, cx, cy), stated, coefficients)
-    rotation, place = None, np.zeros(3)
+    rotation, position = None, np.zeros(3)
     for name, is_inverse in (("T_cam_imu", False), ("T_BS", True)):
         if content.get(name) is not None:
             matrix = _numbers(path, name, content[name], (16,))
             pose = np.array(matrix).reshape(4, 4)
             rotation = pose[:3, :3].T if is_inverse else pose[:3, :3]
-            place = pose[:3, 3] if is_inverse else -pose[:3, :3].T @ pose[:3, 3]
-    x, y, z = place.tolist()
+            position = pose[:3, 3] if is_inverse else -pose[:3, :3].T @ pose[:3, 3]
+    x, y, z = position.tolist()
     return Calibration(camera, rotation, (x, y, z))
 
 

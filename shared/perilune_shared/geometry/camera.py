@@ -173,8 +173,8 @@ class Camera:
             x = x + (yy * off_x - xy * off_y) / determinant
             y = y + (xx * off_y - xy * off_x) / determinant
         got_x, got_y = self._distorted(x, y)
-        found = np.maximum(np.abs(target_x - got_x), np.abs(target_y - got_y)) < _MAX_UNDISTORTION_ERROR
-        return np.where(found, x, np.nan), np.where(found, y, np.nan)
+        converged = np.maximum(np.abs(target_x - got_x), np.abs(target_y - got_y)) < _MAX_UNDISTORTION_ERROR
+        return np.where(converged, x, np.nan), np.where(converged, y, np.nan)
 
     def _radial_table(self, largest: float) -> Array:
         """Tabulate radii before and after radial distortion (2, 2000), ascending, to about `largest` or to the fold."""

@@ -129,18 +129,18 @@ def _check(where: str, field: str, value: float, least: float, most: float) -> N
 def _place(field: str, value: ArrayLike) -> Array:
     """A place (3,). Raises UserError on anything but three finite numbers."""
     try:
-        found = np.asarray(value, np.float64)
+        values = np.asarray(value, np.float64)
     except (TypeError, ValueError):
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all():
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all():
         raise UserError("look_at", field, value, "x, y and z in O_L, metres")
-    return found
+    return values
 
 
 def listed(poses: Pose | Sequence[Pose]) -> list[Pose]:
     """One pose or several as a list. Raises UserError on anything else."""
-    found: list[Any] = list(poses) if isinstance(poses, Sequence) and not isinstance(poses, str) else [poses]
-    for each in found:
+    listed_poses: list[Any] = list(poses) if isinstance(poses, Sequence) and not isinstance(poses, str) else [poses]
+    for each in listed_poses:
         if not isinstance(each, Pose):
             raise UserError("render", "pose", repr(each), "look_down(...), look_at(...), or a list of poses")
-    return found
+    return listed_poses

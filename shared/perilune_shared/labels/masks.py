@@ -148,7 +148,7 @@ def crater_masks(
 
 def _resampled(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
     """Sample the depth image of `source` at the pixel nearest to each pixel centre of `camera`; both share one pose."""
-    place = np.floor(source.project(camera.rays(camera.pixel_centres())))
-    column = np.clip(place[..., 0], 0, source.width_px - 1).astype(int)
-    row = np.clip(place[..., 1], 0, source.height_px - 1).astype(int)
+    pixel = np.floor(source.project(camera.rays(camera.pixel_centres())))
+    column = np.clip(pixel[..., 0], 0, source.width_px - 1).astype(int)
+    row = np.clip(pixel[..., 1], 0, source.height_px - 1).astype(int)
     return depth_m[row, column]

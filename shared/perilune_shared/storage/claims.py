@@ -27,16 +27,16 @@ _LARGEST_BYTES = 10_000
 def claimed(store: Store, folder: str) -> Iterator[None]:
     """Hold a claim below `folder` of a store. Raises UserError if another process holds one."""
     path = f"{folder}/{secrets.token_hex(8)}.json"
-    own = {"pid": os.getpid(), "host": platform.node(), "system": _system()}
+    claim = {"pid": os.getpid(), "host": platform.node(), "system": _system()}
     ended = threading.Event()
 
     def renew() -> None:
         while not ended.wait(_RENEWAL_INTERVAL_S):
             with contextlib.suppress(UserError, OSError):
-                _write(store, path, own)
+                _write(store, path, claim)
 
     # Written before the others are read: of two runs that start together, at least one sees the other.
-    _write(store, path, own)
+    _write(store, path, claim)
     renewal = threading.Thread(target=renew, daemon=True, name=f"claim {store}")
     try:
         for item in [*store.list(folder)]:
@@ -50,7 +50,7 @@ def claimed(store: Store, folder: str) -> Iterator[None]:
         ended.set()
         if renewal.ident is not None:
             renewal.join()
-        # A store that does not answer is reported by what was written there before.
+        # If the store does not answer, an earlier write has already raised an error.
         with contextlib.suppress(UserError, OSError):
             store.delete(path)
 
@@ -64,8 +64,8 @@ def _check_ended(store: Store, claim: dict[str, Any]) -> None:
     raise UserError(store, "--out", found, f"another address; if that process was killed, wait {left_s:.0f} s")
 
 
-def _write(store: Store, path: str, own: dict[str, Any]) -> None:
-    store.replace(path, json.dumps({**own, "updated": time.time()}).encode())
+def _write(store: Store, path: str, claim: dict[str, Any]) -> None:
+    store.replace(path, json.dumps({**claim, "updated": time.time()}).encode())
 
 
 def _read(store: Store, path: str, size_bytes: int) -> dict[str, Any] | None:
@@ -79,7 +79,7 @@ def _read(store: Store, path: str, size_bytes: int) -> dict[str, Any] | None:
 
 
 def _runs_elsewhere(pid: int) -> bool:
-    """Whether a process other than this one has an id."""
+    """Whether another process than this one has this id."""
     if pid == os.getpid():
         return False
     try:
@@ -92,7 +92,7 @@ def _runs_elsewhere(pid: int) -> bool:
 
 
 def _system() -> str:
-    """Return an id of the processes that are visible here: equal in all processes with one numbering of processes."""
+    """Return an id that is equal in all processes whose process ids share one numbering (machine or container)."""
     with contextlib.suppress(OSError):
         boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot_id} {Path('/proc/self/ns/pid').readlink()}"

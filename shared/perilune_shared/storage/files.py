@@ -123,11 +123,11 @@ def inside(root: Path, relative: str) -> Path:
 
 def _has_link(root: Path, parts: Iterable[str]) -> bool:
     """Whether a path below `root` has a link, as far as it exists."""
-    place = os.fspath(root)
+    path = os.fspath(root)
     for part in parts:
-        place = f"{place}{os.sep}{part}"
+        path = f"{path}{os.sep}{part}"
         try:
-            if stat.S_ISLNK(os.lstat(place).st_mode):
+            if stat.S_ISLNK(os.lstat(path).st_mode):
                 return True
         except (FileNotFoundError, NotADirectoryError):
             return False

@@ -36,7 +36,7 @@ def check_footer(
     """Check the numbers of rows and values, and the bytes after decompression, of a file of `n_bytes` bytes.
 
     `footer` is pyarrow's metadata of the file, `columns` has place and path of each column that will be read; without
-    `limits` they are those of a dataset. Raises
+    `limits` the limits of a dataset apply. Raises
     UserError about `address` if a number exceeds its limit, ValueError if a row group has other columns than the file.
     """
     limits = limits or OF_DATASET
@@ -53,12 +53,12 @@ def check_footer(
             raise UserError(address, "rows", f"{in_group} in a row group", expected)
         if rows.num_columns != footer.num_columns:
             raise ValueError(f"a row group of {rows.num_columns} columns, expected {footer.num_columns}")
-        for place, path in columns:
-            column = rows.column(place)
+        for index, path in columns:
+            column = rows.column(index)
             n_values = column.num_values
             n_uncompressed += max(column.total_uncompressed_size, 0)
             if path.startswith(_NESTED_ROWS):
-                # Each is a row of a table, so the limit is that of rows.
+                # Each is a row of a table, so the limit of rows applies.
                 n_nested[path] = n_nested.get(path, 0) + n_values
                 if n_values > limits.group_rows or n_nested[path] > most_rows:
                     raise UserError(address, path, f"{n_values} values", f"at most {most_rows} for {n_bytes} bytes")

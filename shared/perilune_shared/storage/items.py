@@ -22,7 +22,7 @@ class Item:
 def local_items(folder: Path, prefix: str) -> Iterator[Item]:
     """Yield the files below a folder in the order of their paths; links are not followed.
 
-    Files and folders that another process deletes meanwhile are left out.
+    Files and folders that another process deletes meanwhile are omitted.
     """
     try:
         with os.scandir(folder) as scanned:
@@ -42,12 +42,12 @@ def local_items(folder: Path, prefix: str) -> Iterator[Item]:
         yield Item(prefix + name, size_bytes)
 
 
-def object_items(found: Mapping[str, Any], prefix: str, address: str) -> Iterator[Item]:
+def object_items(objects: Mapping[str, Any], prefix: str, address: str) -> Iterator[Item]:
     """Yield the objects that fsspec found below a prefix, in the order of their paths.
 
-    Raises UserError about `address` if the store lists a key elsewhere, or a size that is none.
+    Raises UserError about `address` if the store lists a key elsewhere, or an invalid size.
     """
-    for key in sorted(found):
+    for key in sorted(objects):
         path = key.lstrip("/")
         if not path.startswith(f"{prefix}/"):
             if path == prefix:
@@ -56,11 +56,11 @@ def object_items(found: Mapping[str, Any], prefix: str, address: str) -> Iterato
         path = path[len(prefix) + 1 :]
         # A console may have made an empty object for a folder.
         if path and not path.endswith("/"):
-            yield Item(path, checked_size(found[key].get("size"), f"{address}: {path}"))
+            yield Item(path, checked_size(objects[key].get("size"), f"{address}: {path}"))
 
 
 def checked_size(size: object, where: str) -> int:
-    """Return the size of an object as the store states it. Raises UserError if it is no number of bytes."""
+    """Return the size of an object as the store states it. Raises UserError if it is not a number of bytes."""
     if isinstance(size, bool) or not isinstance(size, int) or not 0 <= size < 2**53:
         raise UserError(where, "size", repr(size), "the size of an object, bytes")
     return size

@@ -27,7 +27,7 @@ def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
             yield LocalStore(aside)
         return
     check_empty(store)
-    # Blanks at the end of JSON mean nothing; they tell the claims of two writers apart.
+    # Blanks at the end of JSON have no meaning, so they can distinguish the claims of two writers.
     nonce = "".join(" \t"[int(bit)] for bit in f"{secrets.randbits(_NONCE_BITS):0{_NONCE_BITS}b}")
     try:
         store.write(claim, content + nonce.encode() + b"\n")

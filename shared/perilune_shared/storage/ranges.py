@@ -13,7 +13,7 @@ _MARGIN_BYTES = 2**14
 
 
 class Ranges(io.RawIOBase):
-    """An object as a file for reading. Other ranges than the kept and the fetched ones are read in blocks of 4 MiB."""
+    """An object as a file for reading. Bytes that are neither kept nor fetched are read in blocks of 4 MiB."""
 
     def __init__(self, read: Callable[[int, int], bytes], size_bytes: int):
         """`read` returns the bytes [start, end) of the object, by one request."""

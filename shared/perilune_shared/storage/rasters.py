@@ -139,7 +139,7 @@ def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
         try:
             with rasterio.Env(**_OPTIONS):
                 with warnings.catch_warnings():
-                    # A raster without a place is reported by whoever needs the place.
+                    # The caller that needs the place reports a raster without one.
                     warnings.simplefilter("ignore")
                     raster = rasterio.open(Path(folder) / path.name, driver=files.driver, sharing=False)
                 with raster:
@@ -165,7 +165,7 @@ def _label_in(head: bytes, driver: str) -> str:
 
 
 def _driver_of(head: bytes) -> str:
-    """GDAL's driver of a file that begins with `head`; empty if it is none of those that are known here."""
+    """GDAL's driver of a file that begins with `head`; empty if the format is unknown here."""
     for magic, driver in _MAGIC.items():
         if head.startswith(magic):
             return driver

@@ -22,10 +22,9 @@ from typing import Any, BinaryIO, cast
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
-from perilune_shared.storage.file_systems import OBJECT_STORES, file_system
 from perilune_shared.storage.items import Item, checked_size, local_items, object_items
+from perilune_shared.storage.object_stores import OBJECT_STORES, file_system, is_missing_bucket, store_faults
 from perilune_shared.storage.ranges import Ranges
-from perilune_shared.storage.store_faults import is_missing_bucket, store_faults
 
 _CHUNK_BYTES = 2**20
 _KINDS = "a path, s3://bucket/prefix, gs://bucket/prefix or memory://name"
@@ -234,22 +233,22 @@ class ObjectStore(Store):
 
     def list(self, prefix: str = "") -> Iterator[Item]:
         top = self._key(prefix) if prefix else self._prefix
-        found: dict[str, Any] = {}
+        objects: dict[str, Any] = {}
         with store_faults(self.address):
             try:
-                found = self._system.find(top, detail=True)
+                objects = self._system.find(top, detail=True)
             except FileNotFoundError as error:
                 if is_missing_bucket(error):
                     raise
-        yield from object_items(found, self._prefix, self.address)
+        yield from object_items(objects, self._prefix, self.address)
 
     def size(self, path: str) -> int | None:
         with store_faults(self.at(path)):
             try:
-                found = self._system.info(self._key(path))
+                info = self._system.info(self._key(path))
             except FileNotFoundError:
                 return None
-        return checked_size(found.get("size"), self.at(path)) if found.get("type") == "file" else None
+        return checked_size(info.get("size"), self.at(path)) if info.get("type") == "file" else None
 
     def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
         if end is not None and end <= start:
@@ -307,10 +306,10 @@ class ObjectStore(Store):
                 return
 
     def delete_below(self, prefix: str) -> None:
-        found = [self._key(item.path) for item in self.list(prefix)]
+        keys = [self._key(item.path) for item in self.list(prefix)]
         with store_faults(self.at(prefix)):
-            if found:  # many in one request, where the store allows it
-                self._system.rm(found)
+            if keys:  # many in one request, where the store allows it
+                self._system.rm(keys)
 
 
 def open_store(address: Address) -> Store:
@@ -321,9 +320,9 @@ def open_store(address: Address) -> Store:
     if isinstance(address, Store):
         return address
     text = os.fspath(address)
-    kind, found, prefix = text.partition("://")
-    if not found or kind == "file":
-        return LocalStore(Path(prefix if found else text))
+    kind, separator, prefix = text.partition("://")
+    if not separator or kind == "file":
+        return LocalStore(Path(prefix if separator else text))
     prefix = prefix.strip("/")
     if kind not in OBJECT_STORES:
         raise UserError(text, "address", f"{kind}://", _KINDS)

@@ -24,11 +24,11 @@ def items_of(buffer: bytes, number: int) -> Iterator[Fields]:
 
     Raises ValueError if the struct is damaged.
     """
-    at, found = 0, 0
+    at, field_id = 0, 0
     try:
         while buffer[at]:
-            found, kind, at = _field_head(buffer, at, found)
-            if found != number:
+            field_id, kind, at = _field_head(buffer, at, field_id)
+            if field_id != number:
                 _, at = _value(kind, buffer, at, 0)
                 continue
             length, inner, at = _list_head(buffer, at)

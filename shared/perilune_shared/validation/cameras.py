@@ -52,7 +52,7 @@ def _body_poses(dataset: Dataset, rows: pd.DataFrame) -> np.ndarray:
     rotation = matrix_from_quaternion(np.stack(rows["rotation_wxyz"].to_list()))
     records = [dataset.info.camera_of(name) for name in rows["camera"]]
     mounted = np.array([record.rotation_camera_from_body for record in records])
-    place = np.array([record.position_in_body_m for record in records])
+    position_in_body = np.array([record.position_in_body_m for record in records])
     site_from_body = np.einsum("nji,njk->nik", rotation, mounted)
-    body = position - np.einsum("nij,nj->ni", site_from_body, place)
+    body = position - np.einsum("nij,nj->ni", site_from_body, position_in_body)
     return np.hstack([body, site_from_body.reshape(len(rows), 9)])

@@ -73,7 +73,7 @@ _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
 MOST_OF_COLUMN = 1000
 """Maximum number of faults of one column that are listed; others are counted."""
 _MAX_PLAUSIBLE = 1e12
-"""Largest plausible value of any length, time or size, far above that of any trajectory."""
+"""Largest plausible value of any length, time or size, far above the values of any trajectory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,13 +206,13 @@ def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Itera
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem):
         return
-    own = pc.equal(rows["scene_id"], scene)
+    named_so = pc.equal(rows["scene_id"], scene)
     if trajectory and "trajectory_id" in rows.column_names:
-        own = pc.and_(own, pc.equal(rows["trajectory_id"], trajectory))
+        named_so = pc.and_(named_so, pc.equal(rows["trajectory_id"], trajectory))
     if "frame_id" in rows.column_names:
         prefix = f"{scene}/{trajectory}/" if trajectory else f"{scene}/"
-        own = pc.and_(own, pc.starts_with(rows["frame_id"], prefix))
-    others = np.flatnonzero(~np.asarray(own, bool))
+        named_so = pc.and_(named_so, pc.starts_with(rows["frame_id"], prefix))
+    others = np.flatnonzero(~np.asarray(named_so, bool))
     if len(others):
         row = first_row + int(others[0])
         yield Fault.of(where, row, "part", "a row of another scene or trajectory", f"only rows of {stem}")

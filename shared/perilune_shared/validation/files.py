@@ -113,18 +113,18 @@ def _named_files(dataset: Dataset, table: str, kinds: Sequence[ImageKind | Scene
         columns = [f"{kind}_{name}" for kind in kinds for name in ("path", "bytes", "sha256")]
         rows = dataset.table(table, columns)
         for kind in kinds:
-            own = rows.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
+            of_kind = rows.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
             # Files of other types stay unexpected, even if a row names them.
             fits = pc.and_(
-                pc.ends_with(own["path"], SUFFIXES[kind]),
-                pc.invert(pc.match_substring_regex(own["path"], "^(manifest|shards|index)/")),
+                pc.ends_with(of_kind["path"], SUFFIXES[kind]),
+                pc.invert(pc.match_substring_regex(of_kind["path"], "^(manifest|shards|index)/")),
             )
-            pieces.append(own.filter(pc.fill_null(fits, False)))
+            pieces.append(of_kind.filter(pc.fill_null(fits, False)))
     return pa.concat_tables([piece.replace_schema_metadata() for piece in pieces], promote_options="permissive")
 
 
 def _named_by_format(dataset: Dataset) -> set[str]:
-    """Return the paths of all files that a dataset may have, except those of frames and scenes."""
+    """Return the paths of all files that a dataset may have, except files of frames and scenes."""
     parts = {path for table in TABLES for path in dataset.parts(table)}
     shards = set(dataset.shards()) if dataset.info.images == "packed" else set()
     return parts | shards | EXTRA_NAMES
@@ -135,8 +135,8 @@ def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[
 
     An unknown folder is one fault. Memory does not grow with the number of unknown files.
     """
-    own = {INFO_NAME, *_LOCKS, *(part.path for part in info.index)}
-    folders = {path.rpartition("/")[0] for paths in (known, own) for path in paths}
+    fixed = {INFO_NAME, *_LOCKS, *(part.path for part in info.index)}
+    folders = {path.rpartition("/")[0] for paths in (known, fixed) for path in paths}
     folders |= {index.FOLDER, *(f"manifest/{table}" for table in TABLES)}
     folders |= {str(parent) for folder in folders for parent in PurePosixPath(folder).parents}
     sizes: dict[str, int] = {}
@@ -147,7 +147,7 @@ def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[
         path = item.path
         if path in known:
             sizes[path] = item.size_bytes
-        elif path not in own and not (not info.complete and _is_of_rendering(path)):
+        elif path not in fixed and not (not info.complete and _is_of_rendering(path)):
             folder = path.rpartition("/")[0]
             unknown = path if folder in folders else _top_unknown(folder, folders)
             # The files of a folder follow each other.
@@ -188,19 +188,21 @@ def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]
 
     The file of these faults is the folder of the index.
     """
-    place = pc.index_in(named["path"], rows["path"].combine_chunks())
-    if place.null_count:
-        missing = named["path"].filter(pc.is_null(place))[0].as_py()
+    rows_in_index = pc.index_in(named["path"], rows["path"].combine_chunks())
+    if rows_in_index.null_count:
+        missing = named["path"].filter(pc.is_null(rows_in_index))[0].as_py()
         expected = f"every {table.removesuffix('s')} of the table {table}"
         yield Fault.of(index.FOLDER, None, "path", f"no {missing}", expected)
-    named, place = named.filter(pc.is_valid(place)), place.drop_null()
+    named, rows_in_index = named.filter(pc.is_valid(rows_in_index)), rows_in_index.drop_null()
     for name in ("bytes", "sha256"):
-        found = rows[name].take(place)
-        equal = pc.fill_null(pc.equal(found, named[name]), False)
+        recorded = rows[name].take(rows_in_index)
+        equal = pc.fill_null(pc.equal(recorded, named[name]), False)
         row = pc.index(equal, False).as_py()
         if row >= 0:
             path, expected = named["path"][row].as_py(), named[name][row].as_py()
-            yield Fault.of(index.FOLDER, None, name, f"{found[row].as_py()} for {path}", f"{expected}, as in {table}")
+            yield Fault.of(
+                index.FOLDER, None, name, f"{recorded[row].as_py()} for {path}", f"{expected}, as in {table}"
+            )
 
 
 def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progress: Progress) -> Iterator[Fault]:

@@ -52,26 +52,23 @@ def _file_faults(dataset: Dataset, frame: dict, kind: str, row: int, where: str)
             column = f"{kind}_bytes" if error.field == "size" else f"{kind}_path"
             yield Fault.of(relative, row, column, error.found, error.expected)
         return
-    sha256 = hashlib.sha256(content).hexdigest()
     if len(content) != frame[f"{kind}_bytes"]:
         yield Fault.of(relative, row, f"{kind}_bytes", len(content), frame[f"{kind}_bytes"])
     elif kind != "png":
-        if sha256 != frame[f"{kind}_sha256"]:
+        if hashlib.sha256(content).hexdigest() != frame[f"{kind}_sha256"]:
             yield Fault.of(relative, row, f"{kind}_sha256", "a different SHA-256", frame[f"{kind}_sha256"])
     else:
-        yield from png_faults(dataset, content, len(content), sha256, frame, row, relative)
+        yield from png_faults(dataset, content, frame, row, relative)
 
 
-def png_faults(
-    dataset: Dataset, head: bytes, n_bytes: int, sha256: str, frame: dict, row: int, where: str
-) -> Iterator[Fault]:
-    """Check a PNG's size, hash and header, given its first bytes; `where` is the file to report."""
-    if n_bytes != frame["png_bytes"]:
-        yield Fault.of(where, row, "png_bytes", n_bytes, frame["png_bytes"])
-    if sha256 != frame["png_sha256"]:
+def png_faults(dataset: Dataset, png: bytes, frame: dict, row: int, where: str) -> Iterator[Fault]:
+    """Check size, hash and header of a PNG against its row of `frames`; `where` is the file to report."""
+    if len(png) != frame["png_bytes"]:
+        yield Fault.of(where, row, "png_bytes", len(png), frame["png_bytes"])
+    if hashlib.sha256(png).hexdigest() != frame["png_sha256"]:
         yield Fault.of(where, row, "png_sha256", "a different SHA-256", frame["png_sha256"])
     try:
-        header = png_header(head)
+        header = png_header(png)
     except ValueError as error:
         yield Fault.of(where, row, "png_path", error, "a grey PNG")
         return

@@ -1,6 +1,5 @@
 """Check a dataset's shards against the manifest: names, rows, labels and images."""
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterator
 
@@ -74,7 +73,7 @@ def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_
         if frame["split"] != split:
             yield Fault.of(where, row, "split", frame["split"], f"{split}, as in the name of the shard")
         png = known["image"][row - first_row]["bytes"].as_py() or b""
-        yield from png_faults(dataset, png, len(png), hashlib.sha256(png).hexdigest(), frame, row, where)
+        yield from png_faults(dataset, png, frame, row, where)
 
 
 def _manifest_rows(dataset: Dataset, rows: pa.Table) -> tuple[pa.Table, pa.Table]:
@@ -82,7 +81,9 @@ def _manifest_rows(dataset: Dataset, rows: pa.Table) -> tuple[pa.Table, pa.Table
     keys = rows.group_by(["scene_id", "trajectory_id"]).aggregate([]).to_pylist()
     tables = []
     for name in ("frames", "labels"):
-        found = [dataset.table(name, scene_id=key["scene_id"], trajectory_id=key["trajectory_id"]) for key in keys]
+        of_trajectories = [
+            dataset.table(name, scene_id=key["scene_id"], trajectory_id=key["trajectory_id"]) for key in keys
+        ]
         empty = TABLES[name].empty_table().replace_schema_metadata()
-        tables.append(pa.concat_tables([empty, *found]))
+        tables.append(pa.concat_tables([empty, *of_trajectories]))
     return tables[0], tables[1]

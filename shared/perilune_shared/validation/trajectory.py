@@ -1,6 +1,7 @@
-"""Check one trajectory: its frames against scene and camera, its labels against craters and poses."""
+"""Check one trajectory: frames against scene and camera, labels against craters and poses, times of measurements."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -19,24 +20,32 @@ _LABEL_ROUNDING = 2.0**-23
 """Relative error of a float32, with a margin of 2."""
 _SUN_TOLERANCE = 1e-9
 _FARTHEST_M = 1e9
+_TIME_TOLERANCE_S = 1e-6
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _BOX = ("bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px")
 
 
-def trajectory_faults(
-    info: DatasetInfo,
-    scene: dict,
-    craters: pa.Table,
-    trajectory: dict,
-    frames: pa.Table,
-    labels: pa.Table,
-    where: dict[str, str],
-) -> Iterator[Fault]:
-    """Yield the faults of a trajectory.
+@dataclass(frozen=True, slots=True)
+class TrajectoryRows:
+    """A trajectory of a dataset and the rows that belong to it."""
 
-    `scene` and `trajectory` are rows of these tables; the other tables have the trajectory's rows, and the craters of
-    the scene. `where` gives the file of each table.
-    """
+    scene: dict
+    """Row of the table `scenes`."""
+    craters: pa.Table
+    """Craters of the scene."""
+    trajectory: dict
+    """Row of the table `trajectories`."""
+    frames: pa.Table
+    """Frames of the trajectory."""
+    labels: pa.Table
+    """Labels of these frames."""
+    where: dict[str, str]
+    """Files to report, by the names of the tables `frames` and `labels`."""
+
+
+def trajectory_faults(info: DatasetInfo, rows: TrajectoryRows) -> Iterator[Fault]:
+    """Yield the faults of a trajectory: of its frames against scene and camera, of its labels against their source."""
+    frames, where = rows.frames, rows.where
     names = frames["camera"].unique().to_pylist()
     if info.cameras is not None and (len(names) != 1 or names[0] not in info.cameras):
         if names:
@@ -44,9 +53,9 @@ def trajectory_faults(
             yield Fault.of(where["frames"], None, "camera", names, expected)
         return
     camera = info.camera_of(names[0] if names else None)
-    yield from _frames(info, camera, scene, trajectory, frames, where["frames"])
-    if len(labels):
-        yield from _labels(camera, info.row_time_s(scene["recipe"]), craters, frames, labels, where)
+    yield from _frames(info, camera, rows.scene, rows.trajectory, frames, where["frames"])
+    if len(rows.labels):
+        yield from _labels(camera, info.row_time_s(rows.scene["recipe"]), rows.craters, frames, rows.labels, where)
 
 
 def _frames(
@@ -65,9 +74,9 @@ def _frames(
         yield Fault.of("dataset.json", None, "split_by", info.split_by, f"frame: {key} is in several splits")
     index = frames["frame_index"].to_numpy()
     ids = frames["frame_id"].to_pylist()
-    for row, (frame_id, place) in enumerate(zip(ids, index.tolist(), strict=True)):
-        if frame_id != f"{key}/{place:06d}":
-            yield Fault.of(where, row, "frame_id", frame_id, f"{key}/{place:06d}")
+    for row, (frame_id, number) in enumerate(zip(ids, index.tolist(), strict=True)):
+        if frame_id != f"{key}/{number:06d}":
+            yield Fault.of(where, row, "frame_id", frame_id, f"{key}/{number:06d}")
             break
     time = frames["time_s"].to_numpy()
     order = np.argsort(index)
@@ -101,10 +110,10 @@ def _labels(
     craters: pa.Table,
     frames: pa.Table,
     labels: pa.Table,
-    places: dict[str, str],
+    files: dict[str, str],
 ) -> Iterator[Fault]:
     """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
-    where = places["labels"]
+    where = files["labels"]
     frame_of = _row_numbers(labels["frame_id"], frames["frame_id"])
     crater_of = _row_numbers(labels["crater_id"], craters["crater_id"])
     for name, found_at in (("frame_id", frame_of), ("crater_id", crater_of)):
@@ -143,7 +152,7 @@ def _labels(
     if len(odd):
         found = f"a pose that matches none of {n_labels[odd[0]]} labels"
         yield Fault.of(
-            places["frames"],
+            files["frames"],
             int(odd[0]),
             "position_m+rotation_wxyz",
             found,
@@ -193,11 +202,37 @@ def _projected(
 
 def _row_numbers(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
     """Return the row number of each value in the column `within` (M,); -1 if it is missing."""
-    found = pc.index_in(values, within.combine_chunks())
-    return pc.fill_null(found, -1).to_numpy().astype(np.int64)
+    numbers = pc.index_in(values, within.combine_chunks())
+    return pc.fill_null(numbers, -1).to_numpy().astype(np.int64)
 
 
 def _vectors(column: pa.ChunkedArray) -> Array:
     """Return a column of fixed-size lists as an array (N, k)."""
     flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
     return flat.reshape(len(column), -1)
+
+
+def measurement_faults(table: str, rows: pa.Table, trajectory: dict) -> Iterator[Fault]:
+    """Yield the faults of the rows of `inertial` or `ranges` of a trajectory; `trajectory` is its row.
+
+    Times must increase, for each grade, from 0 to the duration of the trajectory. The intervals of inertial
+    measurements must follow each other without gaps.
+    """
+    where, key = f"manifest/{table}", f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
+    grades = rows["grade"].unique().to_pylist() if "grade" in rows.column_names else [None]
+    for grade in grades:
+        of_grade = rows if grade is None else rows.filter(pc.equal(rows["grade"], grade))
+        time = of_grade["time_s"].to_numpy()
+        if (np.diff(time) <= 0).any():
+            yield Fault.of(where, None, "time_s", f"not increasing in {key}", "increasing times")
+        last = float(time.max())
+        if last > trajectory["duration_s"] + _TIME_TOLERANCE_S:
+            expected = f"at most {trajectory['duration_s']}, the duration of {key}"
+            yield Fault.of(where, None, "time_s", last, expected)
+        if grade is None:
+            continue
+        begin = np.concatenate([[0.0], time[:-1]])
+        wrong = np.flatnonzero(np.abs(time - begin - of_grade["interval_s"].to_numpy()) > _TIME_TOLERANCE_S)
+        if len(wrong):
+            found = f"{of_grade['interval_s'][int(wrong[0])].as_py()} s before {time[wrong[0]]} s in {key}"
+            yield Fault.of(where, None, "interval_s", found, f"{time[wrong[0]] - begin[wrong[0]]}, without a gap")

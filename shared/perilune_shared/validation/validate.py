@@ -23,9 +23,8 @@ from perilune_shared.validation.cameras import camera_faults
 from perilune_shared.validation.faults import Fault, FaultList, part_faults
 from perilune_shared.validation.files import file_faults
 from perilune_shared.validation.images import image_faults
-from perilune_shared.validation.measurements import measurement_faults
 from perilune_shared.validation.shards import shard_faults
-from perilune_shared.validation.trajectory import trajectory_faults
+from perilune_shared.validation.trajectory import TrajectoryRows, measurement_faults, trajectory_faults
 
 _TOLERANCE_DEG = 1e-9
 _EMPTY_IN_PLANS = ("craters", "boulders", "labels", *OPTIONAL_TABLES)
@@ -43,28 +42,28 @@ def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
 
 
 def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
-    found = FaultList()
-    found.extend(file_faults(dataset, progress))
+    faults = FaultList()
+    faults.extend(file_faults(dataset, progress))
     if not dataset.info.complete:
         expected = "a finished dataset; run `make dataset` again to resume"
-        found.add(Fault.of("dataset.json", None, "complete", "False", expected))
+        faults.add(Fault.of("dataset.json", None, "complete", "False", expected))
     for name in TABLES:
         for part in dataset.parts(name):
-            found.extend(part_faults(dataset, part, name))
+            faults.extend(part_faults(dataset, part, name))
     try:
-        found.extend(_table_faults(dataset, progress))
+        faults.extend(_table_faults(dataset, progress))
     except UserError as error:
-        if not len(found):
-            found.add(Fault.from_error("manifest", None, error))
+        if not len(faults):
+            faults.add(Fault.from_error("manifest", None, error))
     try:
         if dataset.info.images == "files":
-            found.extend(image_faults(dataset, progress))
+            faults.extend(image_faults(dataset, progress))
         elif dataset.info.images == "packed":
-            found.extend(shard_faults(dataset, progress))
+            faults.extend(shard_faults(dataset, progress))
     except UserError as error:
-        if not len(found):
-            found.add(Fault.from_error("images", None, error))
-    return found.faults()
+        if not len(faults):
+            faults.add(Fault.from_error("images", None, error))
+    return faults.faults()
 
 
 def _table_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
@@ -167,10 +166,11 @@ def _scene_faults(
         labels = dataset.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
         seen["frames"] += len(frames)
         seen["labels"] += len(labels)
-        places = {name: _file_of(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
+        files = {name: _file_of(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
         for name, rows in (("frames", frames), ("labels", labels)):
-            yield from _repeated_keys(dataset, name, rows.select(KEYS[name]), places[name])
-        faults = trajectory_faults(dataset.info, row, craters, trajectory, frames, labels, places)
+            yield from _repeated_keys(dataset, name, rows.select(KEYS[name]), files[name])
+        of_trajectory = TrajectoryRows(row, craters, trajectory, frames, labels, files)
+        faults = trajectory_faults(dataset.info, of_trajectory)
         yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", reported)
         for name in OPTIONAL_TABLES:
             rows = dataset.table(name, scene_id=scene_id, trajectory_id=trajectory_id)
@@ -179,8 +179,8 @@ def _scene_faults(
                 yield from measurement_faults(name, rows, trajectory)
 
 
-def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, reported: set[tuple[str, str]]) -> Iterator[Fault]:
-    """Convert row numbers within a scene or trajectory (prefix `own` of its frame_ids) to row numbers of the file.
+def _in_file(dataset: Dataset, faults: Iterator[Fault], name: str, reported: set[tuple[str, str]]) -> Iterator[Fault]:
+    """Convert row numbers within a scene or trajectory to row numbers of the file; `name` begins its frame_ids.
 
     Skips faults of files and columns already in `reported`.
     """
@@ -192,8 +192,8 @@ def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, reported: set[
             part = dataset.open_part(fault.file, PurePosixPath(fault.file).parent.name)
             key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
             keys = part.read([key])[key]
-            found = pc.starts_with(keys, own) if key == "frame_id" else pc.equal(keys, own)
-            fault = replace(fault, row=int(np.flatnonzero(found)[fault.row]))
+            of_key = pc.starts_with(keys, name) if key == "frame_id" else pc.equal(keys, name)
+            fault = replace(fault, row=int(np.flatnonzero(of_key)[fault.row]))
         yield fault
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.helpers.scenes import config_with, round_craters
 
-from perilune_render.config.counterfactual import CounterfactualConfig
+from perilune_render.config.derived import CounterfactualConfig
 from perilune_render.config.terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.labels.frame_labels import RimCircles

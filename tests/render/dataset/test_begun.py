@@ -14,8 +14,8 @@ from perilune_render.dataset.begin import begin_or_resume, new_info
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.regenerate import png_outlier_share, regenerate
 from perilune_render.flight.plan import make_plan
-from perilune_render.jobs import steps
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs import run
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
@@ -39,13 +39,13 @@ def begun(tmp_path):
     plan = make_plan(config, "detect")
     plan = replace(plan, trajectories=tuple(replace(descent, is_drawn=False) for descent in plan.trajectories))
     job = Job(plan, config, new_info(config, plan, recipe_of(config, "detect", "tiny")), "configuration")
-    steps.prepare(job, open_store(tmp_path), lambda scene_id: None)
+    run.prepare(job, open_store(tmp_path), lambda scene_id: None)
     return job, tmp_path
 
 
 def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
     job, out = begun
-    steps.prepare(job, open_store(out), lambda scene_id: None)
+    run.prepare(job, open_store(out), lambda scene_id: None)
     (descent,) = job.plan.trajectories
     moved = replace(descent.flight, position_m=descent.flight.position_m + 1.0)
     for other in (
@@ -56,8 +56,8 @@ def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
         replace(descent, seed=descent.seed + 1),
     ):
         changed = replace(job, plan=replace(job.plan, trajectories=(other,)))
-        with pytest.raises(UserError, match=r"plan\.json: plan: got that of another dataset"):
-            steps.prepare(changed, open_store(out), lambda scene_id: None)
+        with pytest.raises(UserError, match=r"plan\.json: plan: got the plan of another dataset"):
+            run.prepare(changed, open_store(out), lambda scene_id: None)
 
 
 def test_a_manifest_is_not_rendered_into_itself(tmp_path):
@@ -72,7 +72,7 @@ def test_a_folder_that_another_process_writes_is_left_alone(begun):
     job, out = begun
     before = sorted(out.rglob("*"))
     with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
-        render_job(job, out, Progress(), Here)
+        render_job(job, out, Progress(), InProcess)
     assert sorted(out.rglob("*")) == before
 
 

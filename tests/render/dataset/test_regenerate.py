@@ -25,7 +25,7 @@ from perilune_shared.dataset.schema import complete
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
@@ -71,7 +71,7 @@ def test_after_merge_subset_and_split_the_bytes_are_the_same(quick, tmp_path):
     subset(whole, tmp_path / "a", ["frame_index < 3"], images="none")
     subset(whole, tmp_path / "b", ["frame_index > 5"], images="none")
     merge([open_dataset(tmp_path / name) for name in "ab"], tmp_path / "m")
-    split_dataset(open_dataset(tmp_path / "m"), tmp_path / "s", by="frame")
+    split_dataset(open_dataset(tmp_path / "m"), tmp_path / "s", Split(by="frame"))
     pack(open_dataset(tmp_path / "s"), tmp_path / "p")
     ids = ["scene-0001/trajectory-0000/000002", "scene-0002/trajectory-0000/000007"]
     outcomes = again(tmp_path / "p", tmp_path / "out", ids)
@@ -106,7 +106,9 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(quick, plan, tmp_path):
     """Names, splits and gaps are the manifest's; frames and labels are those of the whole dataset."""
     cut = ["frame_index % 3 == 1", "split != 'val'"]
     subset(open_dataset(quick / "detect"), tmp_path / "hashed", cut, images="plan")
-    split_dataset(open_dataset(tmp_path / "hashed"), tmp_path / "s", by="trajectory", val_share=0, test_share=0.5)
+    split_dataset(
+        open_dataset(tmp_path / "hashed"), tmp_path / "s", Split(by="trajectory", val_share=0, test_share=0.5)
+    )
     made = run("dataset", "--workers", 0, "--manifest", tmp_path / "s", "--out", tmp_path / "out")
     assert made.returncode == 0, made.stderr
     n = len(open_dataset(tmp_path / "s").table("frames"))

@@ -2,17 +2,17 @@
 
 import threading
 
+import pyarrow.parquet as pq
 import pytest
 from tests.helpers.flat_engine import FlatEngine
 from tests.helpers.scenes import config_with, flat_scene, round_craters
 
 from perilune_render.config.dataset import CameraConfig, KindConfig
-from perilune_render.dataset.trajectory import render_trajectory
+from perilune_render.dataset.trajectory import SceneSetting, render_trajectory
 from perilune_render.dataset.work import committed
 from perilune_render.engines.frame_source import FrameSource
 from perilune_render.flight.plan import make_plan
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_shared.dataset.parts import read_part
 from perilune_shared.storage.store import open_store
 
 N_FRAMES = 6
@@ -39,8 +39,8 @@ def render(out, fails_at=None, advance=lambda: None):
     plan, scene = make_plan(CONFIG, "detect"), flat_scene(3000, 41, round_craters([(10, 0, 60, 0.1)]))
     engine = WatchingEngine(plan, out, fails_at)
     source = FrameSource.of(engine, CONFIG, plan.camera, RimCircles.of_scene(scene))
-    given = plan.trajectories[0], scene, CONFIG, CONFIG.detect.instruments, advance
-    assert render_trajectory(open_store(out), source, *given) == []
+    of_scene = SceneSetting(scene, CONFIG, CONFIG.detect.instruments)
+    assert render_trajectory(open_store(out), source, plan.trajectories[0], of_scene, advance) == []
     return engine
 
 
@@ -56,7 +56,7 @@ def test_a_frame_is_written_while_the_next_one_is_rendered(tmp_path):
     assert any(n_files < place for place, n_files in enumerate(engine.n_files))
     assert len(done) == N_FRAMES and all(n_files > place for place, n_files in enumerate(done))
     assert committed(open_store(tmp_path)) == {"scene-0000.trajectory-0000"}
-    rows = read_part(frames_part(tmp_path), "frames")
+    rows = pq.read_table(frames_part(tmp_path))
     assert rows["frame_index"].to_pylist() == list(range(N_FRAMES))
     assert rows["png_bytes"].to_pylist() == [(tmp_path / path).stat().st_size for path in rows["png_path"].to_pylist()]
 

@@ -1,7 +1,7 @@
 import numpy as np
 
 from perilune_render.config.dataset import FlightConfig, InstrumentsConfig
-from perilune_render.flight.altimeter import measure_ranges, measure_ranges_of_frames, range_to_ground_m
+from perilune_render.flight.instruments import measure_ranges, measure_ranges_of_frames, range_to_ground_m
 from perilune_render.flight.motion import draw_motion
 from perilune_render.flight.trajectories import fly
 from perilune_render.terrain.interpolation import value_at

@@ -3,7 +3,7 @@ import pytest
 from tests.sampling import every
 
 from perilune_render.config.dataset import FlightConfig
-from perilune_render.flight.inertial import GRADES, measured, true_increments
+from perilune_render.flight.instruments import GRADES, measured, true_increments
 from perilune_render.flight.motion import draw_motion
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_shared.geometry.gravity import gravity_mps2

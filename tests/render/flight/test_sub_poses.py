@@ -181,7 +181,9 @@ def test_channels_of_the_hazard_map_are_those_of_the_place_that_each_row_shows(s
     one, config = shot((300, -200, -400), turn), config_of(row_time_s=1e-3)
     with open_engine(scene, config, camera.covering_pinhole(), SUN) as engine:
         source, exr_camera = FrameSource.of(engine, config, camera, CIRCLES), engine.camera
-        channels = SceneOutputs(hazard=PlaceMap(), has_channels=True).beside(source.take(one), source.places_m).channels
+        channels = (
+            SceneOutputs(hazard=PlaceMap(), has_channels=True).of_frame(source.take(one), source.places_m).channels
+        )
     times_s, rows = row_times_s(64, 1e-3), sensor_rows(camera, exr_camera)
     height, width = rows.shape
     for row, column in ((1, 2), (height // 2, 5), (height - 2, width - 1)):

@@ -1,7 +1,7 @@
 import numpy as np
 
 from perilune_render.config.dataset import FlightConfig
-from perilune_render.flight.smooth_process import SmoothProcess
+from perilune_render.flight.motion import SmoothProcess
 from perilune_render.flight.trajectories import fly
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 

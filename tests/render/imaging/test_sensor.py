@@ -6,7 +6,7 @@ import pytest
 
 from perilune_render.config.dataset import SensorConfig
 from perilune_render.imaging.radiance import Radiance
-from perilune_render.imaging.sensor import FixedPattern, develop, expected, expose, motion_px, psf_kernel
+from perilune_render.imaging.sensor import FixedPattern, expected, expose, motion_px, psf_kernel, read_out
 from perilune_shared.geometry.camera import Camera
 
 CAMERA = Camera(200, 160, 220.0, 220.0, 100.0, 80.0)
@@ -44,7 +44,8 @@ def photograph(light, config, frame=0, camera=CAMERA, exr_camera=None, velocity=
     pattern = FixedPattern.draw(config, camera, seed)
     rng = np.random.default_rng(frame)
     exr_camera = exr_camera or camera
-    image = develop(scene(light, exr_camera), config, camera, exr_camera, np.array(velocity), pattern, rng)
+    exposure = expose(scene(light, exr_camera), config, camera, exr_camera, np.array(velocity))
+    image = read_out(exposure, config, pattern, rng)
     assert image.shape == (camera.height_px, camera.width_px)
     return image.astype(float)
 
@@ -112,7 +113,7 @@ def test_grey_values_fill_the_bits(bits, kind):
     pattern = FixedPattern.draw(config, CAMERA, 1)
     light = np.linspace(0, 0.6, 200)
     rng = np.random.default_rng(1)
-    image = develop(scene(light), config, CAMERA, CAMERA, np.zeros(3), pattern, rng)
+    image = read_out(expose(scene(light), config, CAMERA, CAMERA, np.zeros(3)), config, pattern, rng)
     assert image.dtype == kind and image.min() == 0 and image.max() == 2**bits - 1
     assert len(np.unique(image)) > 0.6 * min(2**bits, 5_000)
     assert image[:, 100].mean() == pytest.approx(light[100] * 1e5 / 30_000 * (2**bits - 1), rel=0.01, abs=0.5)

@@ -4,7 +4,7 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render.config.dataset import DatasetConfig
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_shared.config.resolve import resolve
@@ -45,5 +45,5 @@ def files_of():
 def whole(job, files_of, tmp_path_factory):
     """Files of the job's dataset, rendered in this process without interruption."""
     out = tmp_path_factory.mktemp("whole")
-    render_job(job, out, Progress(disable=True), Here)
+    render_job(job, out, Progress(disable=True), InProcess)
     return files_of(out)

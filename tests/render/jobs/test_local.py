@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from perilune_render.dataset.work import committed
 from perilune_render.jobs import local, worker
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.local import LocalWorkers
 from perilune_render.jobs.run import RenderingFailed, render_job
 from perilune_render.jobs.scene_renderer import SceneRenderer
@@ -74,7 +74,7 @@ def test_a_trajectory_that_always_fails_is_named_and_all_others_are_rendered(job
     assert failed.value.errors == {"scene-0000/trajectory-0001": "worker killed by SIGKILL"}
     dataset = open_dataset(tmp_path)
     assert not dataset.info.complete and len(committed(dataset.store)) == 3
-    render_job(job, tmp_path, Progress(disable=True), Here)
+    render_job(job, tmp_path, Progress(disable=True), InProcess)
     assert files_of(tmp_path) == whole and validate(open_dataset(tmp_path)) == []
 
 

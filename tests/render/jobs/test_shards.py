@@ -13,7 +13,7 @@ from tests.helpers import in_process
 
 from perilune_render.cli.main import main
 from perilune_render.jobs.estimate import estimate
-from perilune_render.jobs.in_process import Here
+from perilune_render.jobs.in_process import InProcess
 from perilune_render.jobs.run import Shard
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
@@ -21,7 +21,7 @@ RENDER = str(Path(sys.executable).parent / "perilune-render")
 
 def test_shards_share_out_every_trajectory_once():
     for n_trajectories, count in ((343, 64), (5, 8), (4, 1)):
-        places = [place for k in range(count) for place in Shard(k + 1, count).places(n_trajectories)]
+        places = [place for k in range(count) for place in Shard(k + 1, count).indices(n_trajectories)]
         assert places == list(range(n_trajectories))
 
 
@@ -38,7 +38,7 @@ def test_shards_in_random_order_and_at_the_same_time_give_the_same_bytes(options
     assert early.returncode == 2 and "trajectories not rendered, first scene-000" in early.stderr
     state = in_process.call(main, "status", tmp_path).stdout
     n_done = int(re.search(r"trajectories +(\d) of 4 done, 0 running, 0 failed", state)[1])
-    assert n_done == 4 - len(Shard(numbers[2], 3).places(4)) and f"{12 * n_done} of 48" in state
+    assert n_done == 4 - len(Shard(numbers[2], 3).indices(4)) and f"{12 * n_done} of 48" in state
     assert in_process.call(main, *command, "--shard", f"{numbers[2]}/3").returncode == 0
     assert in_process.call(main, *command, "--finish").returncode == 0
     assert files_of(tmp_path / "detect") == whole
@@ -81,7 +81,7 @@ def test_the_state_shows_running_and_failed_trajectories(tmp_path):
 
 
 def test_the_dry_run_knows_frames_and_bytes_and_writes_nothing(job, whole, tmp_path):
-    found = estimate(job, tmp_path / "out", Progress(disable=True), Here, 0)
+    found = estimate(job, tmp_path / "out", Progress(disable=True), InProcess, 0)
     assert found.n_frames == 48 and 0 < found.seconds < 600 and not list(tmp_path.iterdir())
     n_bytes = sum(len(content) for path, content in whole.items() if "/" in path)
     assert abs(found.n_bytes / n_bytes - 1) < 0.25

@@ -12,7 +12,7 @@ from tests.helpers.scenes import config_with, flat_scene, round_craters
 from perilune_render.cli.main import main
 from perilune_render.config.dataset import CameraConfig, KindConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.trajectory import render_trajectory
+from perilune_render.dataset.trajectory import SceneSetting, render_trajectory
 from perilune_render.dataset.work import write_scene
 from perilune_render.engines.frame_source import FrameSource
 from perilune_render.jobs.job import Job
@@ -55,7 +55,8 @@ class Flat:
             trajectories = tables.trajectory_table(self.job.plan.of_scene(plan.scene_id))
             write_scene(self.out, plan.scene_id, {**rows, "trajectories": trajectories})
             config, trajectory = self.job.config, self.job.plan.trajectories[place]
-            render_trajectory(self.out, source, trajectory, self.scene, config, config.nav.instruments)
+            of_scene = SceneSetting(self.scene, config, config.nav.instruments)
+            render_trajectory(self.out, source, trajectory, of_scene)
             work.done(place)
             report.done(place, [])
 

@@ -8,8 +8,8 @@ import pytest
 from perilune_render.config.dataset import LabelsConfig, SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
-from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
-from perilune_render.labels.pixels import REACH, Rims, centred_in, contrasts, rim_shares, sunlit_fractions
+from perilune_render.labels.frame_labels import GreyAndSun, RimCircles, crater_index, label_frame, with_contrast
+from perilune_render.labels.pixels import REACH, Circles, Rims, centred_in, contrasts, rim_shares, sunlit_fractions
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
@@ -49,9 +49,9 @@ def contrast(ratio, sun, sensor=None, **scene):
     camera = scene.get("camera", CAMERA)
     pose = scene.get("position", ABOVE), scene.get("rotation", ROTATION_CAMERA_FROM_BODY)
     circles = replace(CRATER, radius_m=np.array([scene.get("radius", RADIUS_M)]))
-    labels = label_frame(circles, camera, *pose, radiance, 2, 50)
+    labels = label_frame(circles, camera, *pose, radiance, (2, 50))
     assert labels.crater_id.tolist() == [5] and np.isnan(labels.contrast).all()
-    shown = Shown(*expected(expose(radiance, sensor, camera, camera, np.zeros(3)), sensor), sun)
+    shown = GreyAndSun(*expected(expose(radiance, sensor, camera, camera, np.zeros(3)), sensor), sun)
     return float(with_contrast(labels, circles, camera, *pose, shown).contrast[0])
 
 
@@ -69,7 +69,7 @@ def test_the_bound_grows_with_the_image_and_what_it_leaves_out_is_counted():
     assert LabelsConfig(max_radius_px=50.0).bounds_px(1024) == (2.0, 50.0)
     radiance = shaded(0.1, sun_direction(70, 30))
     for largest_px, count in ((50, 0), (5, 1)):
-        found = label_frame(CRATER, CAMERA, ABOVE, ROTATION_CAMERA_FROM_BODY, radiance, 2, largest_px)
+        found = label_frame(CRATER, CAMERA, ABOVE, ROTATION_CAMERA_FROM_BODY, radiance, (2, largest_px))
         assert (len(found.crater_id), found.n_above) == (1 - count, count)
 
 
@@ -199,7 +199,7 @@ def test_craters_that_may_have_a_label_are_selected():
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     radius = rng.uniform(0, 20, 20000)
     position, rotation = np.array([3.0, -2.0, 1.0]), np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    found, places = centred_in(CAMERA, position, rotation, centre, normal, radius, 4.0)
+    found, places = centred_in(CAMERA, position, rotation, Circles(centre, normal, radius), 4.0)
     exact = camera_from_site(centre, position, rotation)
     np.testing.assert_array_equal(places, exact[found])
     inside = CAMERA.inside(CAMERA.project(exact))

@@ -17,7 +17,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.attach import attach
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack
-from perilune_shared.editing.subset import subset
+from perilune_shared.editing.subset import Limit, subset
 from perilune_shared.validation.validate import validate
 
 CAMERA = {"width_px": 48, "height_px": 48, "horizontal_fov_deg": 40}
@@ -128,7 +128,7 @@ def test_frames_are_regenerated_with_all_their_files(folder):
 
 
 def test_tools_copy_the_files_or_leave_them_out(made, tmp_path):
-    subset(made, tmp_path / "one", n_frames=1)
+    subset(made, tmp_path / "one", limit=Limit(n_frames=1))
     one = open_dataset(tmp_path / "one")
     assert validate(one) == [] and len(files_of(one)) == 4
     merge([made, one], tmp_path / "merged")

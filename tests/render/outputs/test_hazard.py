@@ -11,8 +11,7 @@ from tests.helpers.scenes import flat_scene
 from perilune_render.config.outputs import HazardConfig
 from perilune_render.engines.heightfield.query import heights_m
 from perilune_render.engines.heightfield.surface import surface_of
-from perilune_render.outputs.hazard import LAYERS, check_hazard, hazard_map
-from perilune_render.outputs.hazard_raster import hazard_tiff
+from perilune_render.outputs.hazard import LAYERS, check_hazard, hazard_map, hazard_tiff
 from perilune_render.terrain.boulders import Boulders, highest_points
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import sun_direction

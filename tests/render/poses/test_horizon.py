@@ -142,7 +142,7 @@ def test_craters_beyond_the_horizon_and_before_the_sky_are_not_visible(smooth):
     pose = np.array([0, 0, HEIGHT_M]), level_view(12.0)
     with open_engine(smooth, config_of(), CAMERA, SUN) as engine:
         radiance = engine.render(*pose, 0, 0)
-    labels = label_frame(circles, CAMERA, *pose, radiance, 0.1, 1e6)
+    labels = label_frame(circles, CAMERA, *pose, radiance, (0.1, 1e6))
     assert labels.crater_id.tolist() == [0, 1, 2]
     assert labels.visible_fraction[0] > 0.9
     assert labels.visible_fraction[1:].tolist() == [0, 0]

@@ -7,11 +7,12 @@ import numpy as np
 from tests.render.server.conftest import FIELD_OF_VIEW_DEG, SIZE, Client
 
 from perilune_render.poses.plan import trajectory_seed
+from perilune_render.server.connection import Limits
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.native.serve import Native
 from perilune_render.server.pangu.serve import greets, serve_pangu
 from perilune_render.server.pangu.session import Session
-from perilune_render.server.serve import Interface, Limits, Server
+from perilune_render.server.serve import Interface, Server
 from perilune_shared.client import SceneClient
 from perilune_shared.geometry.frames import sun_direction
 
@@ -22,16 +23,16 @@ READY = b"\x04\x1c\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER"
 class Both:
     """A server of both interfaces in a thread."""
 
-    def __init__(self, world, limits=Limits(message_s=2.0)):  # noqa: B008
+    def __init__(self, simulated, limits=Limits(message_s=2.0)):  # noqa: B008
         self.notes: list[str] = []
         fov = float(np.radians(FIELD_OF_VIEW_DEG))
-        start = (*SIZE, fov, sun_direction(100, 25), trajectory_seed(world.scene.seed, 0))
+        start = (*SIZE, fov, sun_direction(100, 25), trajectory_seed(simulated.scene.seed, 0))
 
         async def handle(connection):
-            await serve_pangu(connection, lambda: Session(world, *start), self.server.stop)
+            await serve_pangu(connection, lambda: Session(simulated, *start), self.server.stop)
 
         self.pangu = Interface("PANGU", "127.0.0.1", 0, handle, greets, limits)
-        native = Native(Grounds(world), limits, self.notes.append, [self.pangu])
+        native = Native(Grounds(simulated), limits, self.notes.append, [self.pangu])
         self.native = native.interface("127.0.0.1", 0)
         self.server = Server(native.interfaces, self.notes.append)
         self.server.begin()

@@ -13,10 +13,11 @@ from perilune_render.config.terrain import TerrainConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import scene_view
 from perilune_render.poses.plan import scene_seed, trajectory_seed
+from perilune_render.server.connection import Limits
 from perilune_render.server.pangu.serve import greets, serve_pangu
 from perilune_render.server.pangu.session import Conventions, Session
-from perilune_render.server.serve import Interface, Limits, Server
-from perilune_render.server.world import World
+from perilune_render.server.serve import Interface, Server
+from perilune_render.server.simulation import SimulatedScene
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.frames import sun_direction
 
@@ -25,7 +26,7 @@ FIELD_OF_VIEW_DEG = 40.0
 
 
 @pytest.fixture(scope="session")
-def world():
+def simulated():
     views = (ViewConfig(height_m=150, reach_m=200), ViewConfig(height_m=1000, reach_m=500))
     config = config_with(
         camera=CameraConfig(width_px=SIZE[0], height_px=SIZE[1], horizontal_fov_deg=FIELD_OF_VIEW_DEG),
@@ -34,9 +35,9 @@ def world():
         scene=SceneConfig(sun_azimuth_deg=100, sun_elevation_deg=25, views=views),
     )
     pinhole = camera_of(config.camera)
-    with World(grow_scene(config, scene_view(config.scene, pinhole), scene_seed(config)), config) as world:
-        world.prepare()  # kernels are compiled here, not while a client waits
-        yield world
+    with SimulatedScene(grow_scene(config, scene_view(config.scene, pinhole), scene_seed(config)), config) as simulated:
+        simulated.prepare()  # kernels are compiled here, not while a client waits
+        yield simulated
 
 
 class Client:
@@ -91,17 +92,17 @@ class Client:
 class Running:
     """A server in a thread."""
 
-    def __init__(self, world, limits=Limits(message_s=2.0), conventions=Conventions(), note=None):  # noqa: B008
+    def __init__(self, simulated, limits=Limits(message_s=2.0), conventions=Conventions(), note=None):  # noqa: B008
         self.notes: list[str] = []
         start = (
             *SIZE,
             float(np.radians(FIELD_OF_VIEW_DEG)),
             sun_direction(100, 25),
-            trajectory_seed(world.scene.seed, 0),
+            trajectory_seed(simulated.scene.seed, 0),
         )
 
         async def handle(connection):
-            await serve_pangu(connection, lambda: Session(world, *start, conventions), self.server.stop)
+            await serve_pangu(connection, lambda: Session(simulated, *start, conventions), self.server.stop)
 
         self.interface = Interface("PANGU", "127.0.0.1", 0, handle, greets, limits)
         self.server = Server([self.interface], note or self.notes.append)
@@ -122,8 +123,8 @@ class Running:
 
 
 @pytest.fixture(scope="session")
-def server(world):
-    with Running(world) as running:
+def server(simulated):
+    with Running(simulated) as running:
         yield running
 
 

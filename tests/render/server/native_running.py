@@ -2,9 +2,10 @@
 
 import threading
 
+from perilune_render.server.connection import Limits
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.native.serve import Native, native_address
-from perilune_render.server.serve import Limits, Server
+from perilune_render.server.serve import Server
 
 
 class NativeRunning:

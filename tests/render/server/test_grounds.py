@@ -10,7 +10,7 @@ from tests.render.server.native_running import NativeRunning
 from perilune_render.flight.plan import make_plan
 from perilune_render.poses.plan import scene_seed
 from perilune_render.server.grounds import MOST_KEPT, Grounds, served_scene
-from perilune_render.server.world import World
+from perilune_render.server.simulation import SimulatedScene
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.client import SceneClient
 from perilune_shared.errors import UserError
@@ -20,8 +20,8 @@ N_SCENES = MOST_KEPT + 3
 
 
 @pytest.fixture(scope="module")
-def grounds(world):
-    return Grounds(world, N_SCENES)
+def grounds(simulated):
+    return Grounds(simulated, N_SCENES)
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +45,10 @@ def test_no_dataset_has_the_terrain_of_a_further_scene():
         assert not served & (planned | {scene_seed(config)})
 
 
-def test_a_prepared_world_opens_no_engine_for_the_first_client(world, monkeypatch):
-    with World(world.scene, world.config) as own:
+def test_a_prepared_scene_opens_no_engine_for_the_first_client(simulated, monkeypatch):
+    with SimulatedScene(simulated.scene, simulated.config) as own:
         own.prepare()
-        monkeypatch.setattr("perilune_render.server.world.open_engine", None)
+        monkeypatch.setattr("perilune_render.server.simulation.open_engine", None)
         running = NativeRunning(Grounds(own))
         try:
             with SceneClient(running.address) as client:
@@ -59,8 +59,8 @@ def test_a_prepared_world_opens_no_engine_for_the_first_client(world, monkeypatc
             running.close()
 
 
-def test_a_further_scene_is_that_of_its_seed_under_a_drawn_sun(address, world):
-    planned = served_scene(world.config, 1)
+def test_a_further_scene_is_that_of_its_seed_under_a_drawn_sun(address, simulated):
+    planned = served_scene(simulated.config, 1)
     with SceneClient(address) as client:
         assert client.scene().n_scenes == N_SCENES
         ground = client.ground(1)
@@ -68,12 +68,12 @@ def test_a_further_scene_is_that_of_its_seed_under_a_drawn_sun(address, world):
             planned.sun_azimuth_deg,
             planned.sun_elevation_deg,
         )
-        span = world.config.nav.sun.elevation_deg
+        span = simulated.config.nav.sun.elevation_deg
         assert span.low <= ground.sun_elevation_deg <= span.high
-        own, craters = grow_scene(world.config, world.scene.view, planned.seed), client.craters(1)
+        own, craters = grow_scene(simulated.config, simulated.scene.view, planned.seed), client.craters(1)
         assert (craters["diameter_m"] == own.craters.diameter_m).all()
         assert len(craters["x_m"]) != len(client.craters()["x_m"])
-        assert ground.content_sha256 != client.ground(0).content_sha256 == world.content_sha256
+        assert ground.content_sha256 != client.ground(0).content_sha256 == simulated.content_sha256
         assert client.heights([30.0], [40.0], scene=1) != client.heights([30.0], [40.0])
         stated = (ground.sun_azimuth_deg, ground.sun_elevation_deg)
         lit = client.frame((0, 0, 500), DOWN, index=0, scene=1, sun_deg=stated).image
@@ -93,26 +93,26 @@ def test_clients_on_other_scenes_do_not_change_a_clients_frames(address, grounds
         assert len(grounds._kept) == MOST_KEPT
 
 
-def test_a_client_has_one_scene_in_the_queue(world):
-    grounds = Grounds(world, 100)
-    assert [grounds.world(number, "first") for number in (1, 2, 3)] == [None] * 3
+def test_a_client_has_one_scene_in_the_queue(simulated):
+    grounds = Grounds(simulated, 100)
+    assert [grounds.simulated(number, "first") for number in (1, 2, 3)] == [None] * 3
     assert list(grounds._waiting) == [1]
-    assert grounds.world(4, "second") is None
+    assert grounds.simulated(4, "second") is None
     assert list(grounds._waiting) == [1, 4]
     for number in range(50, 64):
-        grounds.world(number, number)
-    assert grounds.world(99, "another") is None
+        grounds.simulated(number, number)
+    assert grounds.simulated(99, "another") is None
     assert 99 not in grounds._waiting and len(grounds._waiting) == 16
-    assert grounds.world(0, "another") is world
+    assert grounds.simulated(0, "another") is simulated
 
 
-def test_a_scene_that_cannot_be_generated_is_an_error_for_those_who_ask_for_it(world, monkeypatch):
-    grounds = Grounds(world, 3)
+def test_a_scene_that_cannot_be_generated_is_an_error_for_those_who_ask_for_it(simulated, monkeypatch):
+    grounds = Grounds(simulated, 3)
     monkeypatch.setattr(Grounds, "_grown", lambda self, number: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        while grounds.world(1, "client") is None:
+        while grounds.simulated(1, "client") is None:
             pass
-    assert grounds.world(0, "client") is world
+    assert grounds.simulated(0, "client") is simulated
     assert grounds._waiting == {}
 
 

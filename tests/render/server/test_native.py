@@ -17,8 +17,8 @@ DOWN = (0.0, 1.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def address(world):
-    running = NativeRunning(Grounds(world))
+def address(simulated):
+    running = NativeRunning(Grounds(simulated))
     yield running.address
     running.close()
 
@@ -29,11 +29,11 @@ def scene(address):
         yield client
 
 
-def test_a_client_learns_what_is_rendered(scene, world):
+def test_a_client_learns_what_is_rendered(scene, simulated):
     found = scene.scene()
     assert (found.camera.width_px, found.camera.height_px) == (64, 48)
     assert found.sun_elevation_deg == 25
-    assert found.extent_m == world.scene.grid.extent_m
+    assert found.extent_m == simulated.scene.grid.extent_m
 
 
 def test_a_frame_has_the_arrays_that_were_asked_for(scene):
@@ -65,13 +65,13 @@ def test_absurd_velocities_are_refused(scene):
             scene.frame((0, 0, 500), DOWN, velocity_mps=velocity)
 
 
-def test_craters_are_those_of_the_ground(scene, world):
+def test_craters_are_those_of_the_ground(scene, simulated):
     found = scene.craters()
-    assert found["crater_id"].tolist() == world.scene.crater_id.tolist()
-    assert (found["diameter_m"] == world.scene.craters.diameter_m).all()
+    assert found["crater_id"].tolist() == simulated.scene.crater_id.tolist()
+    assert (found["diameter_m"] == simulated.scene.craters.diameter_m).all()
 
 
-def test_heights_are_those_of_the_ground(scene, world):
+def test_heights_are_those_of_the_ground(scene, simulated):
     found = scene.heights([0, 10, 1e6], [0, -20, 0])
     assert abs(found[0]) < 1
     assert np.isnan(found[2])

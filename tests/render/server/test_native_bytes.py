@@ -11,7 +11,7 @@ from tests.render.server.native_running import NativeRunning
 from perilune_render.cli.main import main
 from perilune_render.cli.options import resolved_config
 from perilune_render.server.grounds import Grounds
-from perilune_render.server.world import open_world
+from perilune_render.server.simulation import open_simulation
 from perilune_shared.client import SceneClient
 from perilune_shared.dataset.manifest import open_dataset
 
@@ -54,7 +54,11 @@ def made_and_served(tmp_path_factory):
     done = in_process.call(main, "frames", *command, "--workers", 0)
     assert done.returncode == 0, done.stderr
     config = resolved_config("tiny", scene, None, None, None, given_scene=True)
-    with open_world(config) as world, NativeRunning(Grounds(world)) as running, SceneClient(running.address) as client:
+    with (
+        open_simulation(config) as simulated,
+        NativeRunning(Grounds(simulated)) as running,
+        SceneClient(running.address) as client,
+    ):
         served = [
             client.frame(
                 row[1:4],

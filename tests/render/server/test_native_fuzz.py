@@ -86,10 +86,14 @@ def message(rng):
 
 
 @pytest.mark.parametrize("n_messages", [1200, pytest.param(5000, marks=pytest.mark.slow)])
-def test_malformed_messages_are_answered_in_time_and_others_get_the_same_frames(world, n_messages):
+def test_malformed_messages_are_answered_in_time_and_others_get_the_same_frames(simulated, n_messages):
     rng = random.Random(SEED)
     answers = {"error": 0, "result": 0}
-    with NativeRunning(Grounds(world, 2)) as running, SceneClient(running.address) as good, zmq.Context() as context:
+    with (
+        NativeRunning(Grounds(simulated, 2)) as running,
+        SceneClient(running.address) as good,
+        zmq.Context() as context,
+    ):
         before = good.frame((0, 0, 500), DOWN, index=0, labels=True)
         for n in range(n_messages):
             if n % PER_CONNECTION == 0:

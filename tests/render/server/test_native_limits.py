@@ -10,9 +10,9 @@ import pytest
 import zmq
 from tests.render.server.native_running import NativeRunning
 
+from perilune_render.server.connection import Limits
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.native import serve, zmtp
-from perilune_render.server.serve import Limits
 from perilune_shared.client import SceneClient
 from perilune_shared.errors import UserError
 
@@ -50,10 +50,10 @@ def until(condition):
         time.sleep(0.01)
 
 
-def test_a_client_that_does_not_read_is_disconnected_and_holds_up_nobody(world, monkeypatch):
+def test_a_client_that_does_not_read_is_disconnected_and_holds_up_nobody(simulated, monkeypatch):
     monkeypatch.setattr(serve, "answer", lambda grounds, content, client: [b"{}", bytes(2_000_000)])
     with (
-        NativeRunning(Grounds(world), Limits(message_s=1.0)) as running,
+        NativeRunning(Grounds(simulated), Limits(message_s=1.0)) as running,
         dealers(running.address, 1, RCVHWM=1, RCVBUF=100_000) as (slow,),
         dealers(running.address, 1) as (good,),
     ):
@@ -64,9 +64,9 @@ def test_a_client_that_does_not_read_is_disconnected_and_holds_up_nobody(world, 
         until(lambda: any("read no reply, in time" in note for note in running.notes))
 
 
-def test_requests_before_the_reply_are_answered_in_order(world, monkeypatch):
+def test_requests_before_the_reply_are_answered_in_order(simulated, monkeypatch):
     monkeypatch.setattr(serve, "answer", lambda grounds, content, client: [content])
-    with NativeRunning(Grounds(world)) as running, dealers(running.address, 1) as (hasty,):
+    with NativeRunning(Grounds(simulated)) as running, dealers(running.address, 1) as (hasty,):
         for n in range(200):
             hasty.send_multipart([b"", str(n).encode()])
         for n in range(200):
@@ -86,17 +86,17 @@ def test_requests_before_the_reply_are_answered_in_order(world, monkeypatch):
         [bytes(100_000)] * 50,
     ],
 )
-def test_messages_of_more_parts_are_refused_and_not_sent_back(world, parts):
-    with NativeRunning(Grounds(world)) as running, dealers(running.address, 1) as (socket,):
+def test_messages_of_more_parts_are_refused_and_not_sent_back(simulated, parts):
+    with NativeRunning(Grounds(simulated)) as running, dealers(running.address, 1) as (socket,):
         *envelope, reply = reply_of(socket, parts)
         assert f"got {len(parts)} parts" in json.loads(reply)["error"]
         assert envelope == ([b""] if parts[0] == b"" else [])
         assert json.loads(reply_of(socket, [b"", SCENE])[-1])["n_scenes"] == 1
 
 
-def test_a_request_above_the_largest_size_ends_that_connection_alone(world):
+def test_a_request_above_the_largest_size_ends_that_connection_alone(simulated):
     with (
-        NativeRunning(Grounds(world)) as running,
+        NativeRunning(Grounds(simulated)) as running,
         dealers(running.address, 1) as (socket,),
         SceneClient(running.address) as good,
     ):
@@ -106,8 +106,8 @@ def test_a_request_above_the_largest_size_ends_that_connection_alone(world):
         assert json.loads(reply_of(socket, [SCENE])[-1])["n_scenes"] == 1  # connected again
 
 
-def test_clients_above_the_limit_are_served_once_another_left(world):
-    with NativeRunning(Grounds(world), Limits(clients=3)) as running:
+def test_clients_above_the_limit_are_served_once_another_left(simulated):
+    with NativeRunning(Grounds(simulated), Limits(clients=3)) as running:
         with dealers(running.address, 64) as sockets:
             for socket in sockets:
                 socket.send(SCENE)
@@ -137,9 +137,9 @@ def test_clients_above_the_limit_are_served_once_another_left(world):
                 assert client.scene().n_scenes == 1
 
 
-def test_a_place_is_freed_by_idling(world):
+def test_a_place_is_freed_by_idling(simulated):
     with (
-        NativeRunning(Grounds(world), Limits(clients=1, idle_s=1.0)) as running,
+        NativeRunning(Grounds(simulated), Limits(clients=1, idle_s=1.0)) as running,
         SceneClient(running.address) as idle,
         SceneClient(running.address, timeout_s=20) as other,
     ):
@@ -151,7 +151,7 @@ def test_a_place_is_freed_by_idling(world):
         assert idle.scene().n_scenes == 1  # connected again
 
 
-def test_a_full_queue_of_scenes_is_a_reason_to_ask_again(world, monkeypatch):
+def test_a_full_queue_of_scenes_is_a_reason_to_ask_again(simulated, monkeypatch):
     monkeypatch.setattr("perilune_render.server.grounds.MOST_WAITING", 1)
     begin = threading.Event()
     grown = Grounds._grown
@@ -161,7 +161,7 @@ def test_a_full_queue_of_scenes_is_a_reason_to_ask_again(world, monkeypatch):
         return grown(self, number)
 
     monkeypatch.setattr(Grounds, "_grown", slow)
-    grounds = Grounds(world, 5)
+    grounds = Grounds(simulated, 5)
     with (
         NativeRunning(grounds) as running,
         SceneClient(running.address) as first,
@@ -174,20 +174,20 @@ def test_a_full_queue_of_scenes_is_a_reason_to_ask_again(world, monkeypatch):
         assert second.frame((0, 0, 500), DOWN, scene=2).image.shape == (48, 64)
 
 
-def test_an_error_of_the_server_is_noted(world, monkeypatch):
+def test_an_error_of_the_server_is_noted(simulated, monkeypatch):
     monkeypatch.setattr(serve, "answer", lambda *_: 1 / 0)
-    with NativeRunning(Grounds(world)) as running:
+    with NativeRunning(Grounds(simulated)) as running:
         with SceneClient(running.address) as client, pytest.raises(UserError, match="ZeroDivisionError"):
             client.scene()
         assert "perilune_shared.client: ZeroDivisionError: division by zero" in running.notes
 
 
-def test_an_address_of_ip_version_6(world):
+def test_an_address_of_ip_version_6(simulated):
     with socket.socket(socket.AF_INET6) as probe:
         try:
             probe.bind(("::1", 0))
         except OSError:
             pytest.skip("this machine has no IPv6")
-    with NativeRunning(Grounds(world), host="::1") as running, SceneClient(running.address) as client:
+    with NativeRunning(Grounds(simulated), host="::1") as running, SceneClient(running.address) as client:
         assert running.address.startswith("tcp://[::1]:")
         assert client.scene().camera.width_px == 64

@@ -39,8 +39,8 @@ FRAMES = {
 
 
 @pytest.fixture(scope="module")
-def both(world):
-    with Both(world) as running:
+def both(simulated):
+    with Both(simulated) as running:
         yield running
 
 
@@ -103,8 +103,8 @@ def test_what_is_not_zeromq_is_closed_at_once(both):
         assert time.monotonic() - begun < 1
 
 
-def test_many_connections_without_a_word_do_not_lock_clients_out(world):
-    with Both(world) as both:
+def test_many_connections_without_a_word_do_not_lock_clients_out(simulated):
+    with Both(simulated) as both:
         held = [both.connected(name) for name in ("native", "pangu") for _ in range(300)]
         time.sleep(1.2)
         both.check()
@@ -112,7 +112,7 @@ def test_many_connections_without_a_word_do_not_lock_clients_out(world):
             connection.close()
 
 
-def test_health_names_an_interface_that_does_not_answer(world, monkeypatch):
+def test_health_names_an_interface_that_does_not_answer(simulated, monkeypatch):
     async def silent(reader, writer):
         await asyncio.sleep(60)
 
@@ -120,7 +120,7 @@ def test_health_names_an_interface_that_does_not_answer(world, monkeypatch):
         return False
 
     monkeypatch.setattr("perilune_render.server.native.serve._HEALTH_S", 0.3)
-    with Both(world) as both, SceneClient(both.address, timeout_s=20) as scene:
+    with Both(simulated) as both, SceneClient(both.address, timeout_s=20) as scene:
         both.check()
         for greets in (silent, wrong):
             both.pangu.greets = greets
@@ -128,8 +128,8 @@ def test_health_names_an_interface_that_does_not_answer(world, monkeypatch):
                 scene.health()
 
 
-def test_health_is_answered_with_all_clients_of_pangu_connected(world):
-    with Both(world) as both:
+def test_health_is_answered_with_all_clients_of_pangu_connected(simulated):
+    with Both(simulated) as both:
         held = [both.connected("pangu") for _ in range(both.pangu.limits.clients)]
         for connection in held:
             connection.sendall(bytes.fromhex("00000114 00000008 00000001 41"))
@@ -143,14 +143,14 @@ def test_health_is_answered_with_all_clients_of_pangu_connected(world):
 
 
 @pytest.mark.parametrize("fault", ["stopped", "interrupted", "ended"])
-def test_the_end_of_the_connections_ends_the_server_with_an_error(world, fault):
+def test_the_end_of_the_connections_ends_the_server_with_an_error(simulated, fault):
     def interrupted():
         raise KeyboardInterrupt
 
     def ended():
         raise SystemExit(3)
 
-    with Both(world) as both:
+    with Both(simulated) as both:
         loop = both.server._loop
         if fault == "stopped":
             loop.call_soon_threadsafe(loop.stop)
@@ -163,16 +163,16 @@ def test_the_end_of_the_connections_ends_the_server_with_an_error(world, fault):
         assert isinstance(both.failure, UserError) and "connections: got ended by" in str(both.failure)
 
 
-def test_a_port_that_stops_listening_ends_the_server_with_an_error(world):
-    with Both(world) as both:
+def test_a_port_that_stops_listening_ends_the_server_with_an_error(simulated):
+    with Both(simulated) as both:
         both.check()
         both.server._loop.call_soon_threadsafe(both.native.listening.close)
         both.thread.join(20)
         assert isinstance(both.failure, UserError) and "perilune_shared.client" in str(both.failure)
 
 
-def test_an_error_in_a_connection_is_noted(world, monkeypatch):
-    with Both(world) as both:
+def test_an_error_in_a_connection_is_noted(simulated, monkeypatch):
+    with Both(simulated) as both:
         monkeypatch.setattr("perilune_render.server.native.zmtp._head", lambda *_: 1 / 0)
         send(both, "native", GREETING + READY, wait_s=1)
         deadline = time.monotonic() + 10

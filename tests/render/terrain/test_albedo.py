@@ -2,7 +2,7 @@ import numpy as np
 from tests.helpers.scenes import config_with, round_craters
 
 from perilune_render.flight.view import view_envelope
-from perilune_render.terrain.albedo import add_patches, add_rays, brightness
+from perilune_render.terrain.albedo import RayLaw, add_patches, add_rays, brightness
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import grow_scene
@@ -23,15 +23,15 @@ def test_fresh_craters_are_bright_and_darken_as_they_wear():
 def test_rays_run_outwards_from_the_largest_fresh_crater_and_end():
     craters = round_craters([(0, 0, 50, 0.15, 1e-4), (200, 200, 20, 0.15, 1e-4), (-200, 0, 80, 0.15, 0.05)])
     albedo = np.ones(GRID.n_vertices)
-    add_rays(albedo, GRID, craters, 1, 1.0, 3)
+    add_rays(albedo, GRID, craters, RayLaw(1, 1.0), 3)
     near = ring(albedo, 60.0)
     # Some directions are bright, others untouched; beyond nine radii nothing is.
     assert near.max() > 1.1 and (near < 1.01).mean() > 0.2 and ring(albedo, 229.0).max() == 1
     assert value_at(albedo, GRID, -130.0, 0.0) < 1.2 and value_at(albedo, GRID, 200.0, 215.0) == 1
     again = np.ones(GRID.n_vertices)
-    add_rays(again, GRID, craters, 1, 1.0, 3)
+    add_rays(again, GRID, craters, RayLaw(1, 1.0), 3)
     assert np.array_equal(albedo, again)
-    add_rays(again, GRID, craters, 0, 1.0, 3)
+    add_rays(again, GRID, craters, RayLaw(0, 1.0), 3)
     assert np.array_equal(albedo, again)
 
 

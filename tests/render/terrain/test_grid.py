@@ -80,7 +80,7 @@ def test_lines_find_exactly_the_vertices_of_a_window(grid):
     for _ in range(200):
         (x0, x1), (y0, y1) = np.sort(rng.uniform(-10, 10, (2, 2)), axis=1)
         found = []
-        for row in lines[: lines_in(x0, x1, y0, y1, grid.n_half, grid.half_widths_m, lines)]:
+        for row in lines[: lines_in((x0, x1, y0, y1), grid.n_half, grid.half_widths_m, lines)]:
             k = np.arange(int(row[5]))
             index = int(row[4]) + k
             assert np.allclose(x[index], row[0] + k * row[2]) and np.allclose(y[index], row[1] + k * row[3])

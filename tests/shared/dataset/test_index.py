@@ -12,11 +12,11 @@ from perilune_shared.dataset.index import INDEX, frame_rows, index_rows, read_in
 from perilune_shared.dataset.info_file import read_info
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import IndexPart
-from perilune_shared.dataset.parts import Written
+from perilune_shared.dataset.parts import WrittenFile
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
 
-_ROWS = index_rows([Written.of("b.txt", b"1"), Written.of("a/b.txt", b"22"), Written.of("a-b.txt", b"")])
+_ROWS = index_rows([WrittenFile.of("b.txt", b"1"), WrittenFile.of("a/b.txt", b"22"), WrittenFile.of("a-b.txt", b"")])
 
 
 @pytest.fixture

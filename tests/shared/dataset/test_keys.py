@@ -11,7 +11,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.parts import Part
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
@@ -40,7 +40,7 @@ def test_every_command_refuses_broken_keys(name, victim, tmp_path):
     dataset = open_dataset(victim)
     for work in (
         lambda: subset(dataset, tmp_path / "o", ["diameter_m > 1"]),
-        lambda: split_dataset(dataset, tmp_path / "o", val_share=0.5, test_share=0),
+        lambda: split_dataset(dataset, tmp_path / "o", Split(val_share=0.5, test_share=0)),
         lambda: merge([dataset, dataset], tmp_path / "o"),
         lambda: pack(dataset, tmp_path / "o"),
         lambda: read_labels(dataset),

@@ -14,8 +14,8 @@ from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.migrate import migrate
 from perilune_shared.editing.pack import pack, unpack
-from perilune_shared.editing.split import split_dataset
-from perilune_shared.editing.subset import subset
+from perilune_shared.editing.split import Split, split_dataset
+from perilune_shared.editing.subset import Limit, subset
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
 from perilune_shared.validation.validate import validate
@@ -108,9 +108,9 @@ def step(pool: Pool, key: tuple, folder: Path, earlier: list[tuple[tuple, Path]]
     elif name == "where":
         made = pool.of(new, lambda out: subset(open_dataset(folder), out, detail))
     elif name == "frames":
-        made = pool.of(new, lambda out: subset(open_dataset(folder), out, n_frames=detail[0]))
+        made = pool.of(new, lambda out: subset(open_dataset(folder), out, limit=Limit(n_frames=detail[0])))
     elif name == "split":
-        made = pool.of(new, lambda out: split_dataset(open_dataset(folder), out, detail[0], 0.2, 0.2, detail[1]))
+        made = pool.of(new, lambda out: split_dataset(open_dataset(folder), out, Split(detail[0], 0.2, 0.2, detail[1])))
     elif name == "migrate":
         new = ("old", detail[0])
         made = pool.of(new, lambda out: migrate(OLD / detail[0], out))

@@ -12,7 +12,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.merge import merge
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
@@ -55,7 +55,7 @@ def test_merging_a_dataset_with_itself_changes_nothing(drawn, tmp_path):
 
 
 def test_a_frame_with_two_splits_keeps_the_first(drawn, tmp_path):
-    split_dataset(open_dataset(drawn), tmp_path / "f", by="frame", seed=3)
+    split_dataset(open_dataset(drawn), tmp_path / "f", Split(by="frame", seed=3))
     made = merged(tmp_path / "m", tmp_path / "f", drawn)
     assert made.info.split_by == "frame"
     theirs = open_dataset(tmp_path / "f").table("frames", ["frame_id", "split"]).sort_by("frame_id")

@@ -9,7 +9,7 @@ from perilune_shared.editing.attach import attach
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack, unpack
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.editing.writer import new_dataset
 from perilune_shared.errors import UserError
@@ -19,7 +19,7 @@ from perilune_shared.validation.validate import validate
 TOOLS = {
     "subset": lambda source, out: subset(source, out, where=["split == 'train'"]),
     "merge": lambda source, out: merge([source, source], out),
-    "split": lambda source, out: split_dataset(source, out, by="frame", val_share=0.2, test_share=0.2),
+    "split": lambda source, out: split_dataset(source, out, Split(by="frame", val_share=0.2, test_share=0.2)),
     "pack": lambda source, out: pack(source, out, shard_mb=0.001),
     "unpack": lambda source, out: unpack(source, out),
     "manifest": lambda source, out: subset(source, out, images="none"),

@@ -15,7 +15,7 @@ from perilune_shared.editing.attach import attach
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.migrate import migrate
 from perilune_shared.editing.pack import pack, unpack
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.export.croissant import metadata_of
@@ -192,7 +192,7 @@ def test_diff_names_the_differences(drawn, tmp_path):
     source = open_dataset(drawn)
     assert differences(source, source) == []
     subset(source, tmp_path / "s", ["split != 'val'", "radius_px > 4"])
-    split_dataset(open_dataset(tmp_path / "s"), tmp_path / "t", by="frame")
+    split_dataset(open_dataset(tmp_path / "s"), tmp_path / "t", Split(by="frame"))
     found = {(each.place, each.column): each for each in differences(source, open_dataset(tmp_path / "t"))}
     assert found["scenes", ""].rows == 1 and found["scenes", ""].second == "-"
     n_small = source.table("labels", ["radius_px"], split="train").to_pandas()["radius_px"].le(4).sum()

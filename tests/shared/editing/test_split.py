@@ -8,7 +8,7 @@ from tests.helpers.hostile import edit, rewrite
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.merge import merge
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
 
@@ -16,7 +16,7 @@ from perilune_shared.validation.validate import validate
 @pytest.mark.parametrize("by", ["scene", "trajectory", "frame"])
 def test_split(drawn, tmp_path, by):
     source = open_dataset(drawn)
-    split_dataset(source, tmp_path / "s", by=by, val_share=0.2, test_share=0.2, seed=5)
+    split_dataset(source, tmp_path / "s", Split(by=by, val_share=0.2, test_share=0.2, seed=5))
     made = open_dataset(tmp_path / "s")
     assert validate(made) == [] and made.info.split_by == ("frame" if by == "frame" else "scene")
     frames = made.table("frames").to_pandas()
@@ -25,15 +25,15 @@ def test_split(drawn, tmp_path, by):
     order = {"frame_id": "ascending"}.items()
     before = source.table("frames", unchanged).sort_by(list(order))
     assert made.table("frames", unchanged).sort_by(list(order)).equals(before)
-    split_dataset(source, tmp_path / "t", by=by, val_share=0.2, test_share=0.2, seed=6)
+    split_dataset(source, tmp_path / "t", Split(by=by, val_share=0.2, test_share=0.2, seed=6))
     assert not open_dataset(tmp_path / "t").table("frames", ["split"]).equals(made.table("frames", ["split"]))
 
 
 def test_too_few_units_are_refused(drawn, tmp_path):
     with pytest.raises(UserError, match="5 terrains"):
-        split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.4)
+        split_dataset(open_dataset(drawn), tmp_path / "s", Split(val_share=0.5, test_share=0.4))
     with pytest.raises(UserError, match="shares"):
-        split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.5)
+        split_dataset(open_dataset(drawn), tmp_path / "s", Split(val_share=0.5, test_share=0.5))
 
 
 @pytest.mark.parametrize("by", ["trajectory", "frame"])
@@ -46,7 +46,7 @@ def test_a_flight_under_two_names_stays_in_one_split(tmp_path, by):
     rewrite(root, "labels", lambda rows: rows.clear())
     seal(root)
     for seed in range(4):
-        split_dataset(open_dataset(root), tmp_path / f"{seed}", by, 0.2, 0.2, seed=seed, images="none")
+        split_dataset(open_dataset(root), tmp_path / f"{seed}", Split(by, 0.2, 0.2, seed=seed), images="none")
         made = open_dataset(tmp_path / f"{seed}")
         frames = made.table("frames").to_pandas()
         flight = frames["trajectory_id"].str.removesuffix("b") + frames["scene_id"]
@@ -75,7 +75,7 @@ def test_one_terrain_under_two_names_stays_in_one_split(drawn, tmp_path):
         sources.append(open_dataset(root))
     merge(sources, tmp_path / "m", images="none")
     for seed in range(4):
-        split_dataset(open_dataset(tmp_path / "m"), tmp_path / f"s{seed}", "scene", 0.2, 0.2, seed=seed)
+        split_dataset(open_dataset(tmp_path / "m"), tmp_path / f"s{seed}", Split("scene", 0.2, 0.2, seed=seed))
         frames = open_dataset(tmp_path / f"s{seed}").table("frames", ["scene_id", "split"]).to_pandas()
         assert frames["scene_id"].nunique() == 10
         assert frames.groupby(frames["scene_id"].str[:4])["split"].nunique().max() == 1

@@ -5,8 +5,8 @@ import pytest
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import unpack
-from perilune_shared.editing.split import split_dataset
-from perilune_shared.editing.subset import subset
+from perilune_shared.editing.split import Split, split_dataset
+from perilune_shared.editing.subset import Limit, subset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
 
@@ -40,14 +40,14 @@ def test_labels_selected_by_crater(drawn, tmp_path):
 
 
 def test_subset_by_number_of_frames(drawn, tmp_path):
-    made = subset_of(drawn, tmp_path / "s", n_frames=19)
+    made = subset_of(drawn, tmp_path / "s", limit=Limit(n_frames=19))
     rows = made.table("trajectories").to_pydict()
     assert rows["scene_id"] == ["s000", "s001", "s002"] and rows["n_frames"] == [8, 8, 3]
     assert made.info.counts.frames == 19
 
 
 def test_subset_by_size(drawn, tmp_path):
-    made = subset_of(drawn, tmp_path / "s", "frame_index > 0", megabytes=0.1)
+    made = subset_of(drawn, tmp_path / "s", "frame_index > 0", limit=Limit(megabytes=0.1))
     n_bytes = sum(made.table("frames", ["png_bytes"])["png_bytes"].to_pylist())
     assert 0.09e6 < n_bytes <= 0.1e6
     assert min(made.table("frames", ["frame_index"])["frame_index"].to_pylist()) == 1
@@ -59,10 +59,10 @@ def test_a_plan_keeps_hashes_without_derived_rows(drawn, tmp_path):
     assert made.table("frames", ["png_sha256"]).num_rows == 40 and made.table("frames")["png_sha256"].null_count == 0
 
 
-@pytest.mark.parametrize("options", [{"n_frames": 0}, {"megabytes": -1.0}, {"megabytes": 1e-5}])
-def test_an_empty_subset_is_refused(drawn, tmp_path, options):
+@pytest.mark.parametrize("limit", [Limit(n_frames=0), Limit(megabytes=-1.0), Limit(megabytes=1e-5)])
+def test_an_empty_subset_is_refused(drawn, tmp_path, limit):
     with pytest.raises(UserError):
-        subset_of(drawn, tmp_path / "s", **options)
+        subset_of(drawn, tmp_path / "s", limit=limit)
     with pytest.raises(UserError, match="none left"):
         subset_of(drawn, tmp_path / "s", "frame_index > 99")
     assert list(tmp_path.iterdir()) == []
@@ -89,7 +89,7 @@ def test_editing_a_frame_of_a_subset_leaves_its_source_unchanged(little, tmp_pat
 
 
 def split_of(source, out):
-    split_dataset(open_dataset(source), out, val_share=0.5, test_share=0.0)
+    split_dataset(open_dataset(source), out, Split(val_share=0.5, test_share=0.0))
     return open_dataset(out)
 
 

@@ -26,7 +26,6 @@ from perilune_shared.console.progress import NO_PROGRESS
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import NOT_STATED
-from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
@@ -150,7 +149,7 @@ def test_the_page_warns_of_terrain_in_two_splits(tmp_path):
 def test_text_from_a_dataset_is_escaped(crowded, card, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/scenes/all.parquet"
-    rows = read_part(part, "scenes").to_pylist()
+    rows = pq.read_table(part).to_pylist()
     rows = [{**row, "photometry": EVIL, "dem_source": EVIL[::-1]} for row in rows]
     pq.write_table(pa.Table.from_pylist(rows, schema=TABLES["scenes"]), part)
     dataset = open_dataset(root)

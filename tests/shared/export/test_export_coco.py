@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 
 from perilune_shared.cli.main import app
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.coco import area_of, clip_to_image, export_coco
@@ -183,7 +182,7 @@ def test_a_failed_export_leaves_no_files(crowded, tmp_path):
 def test_a_path_outside_the_dataset_is_refused(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/frames/all.parquet"
-    rows = read_part(part, "frames").to_pylist()
+    rows = pq.read_table(part).to_pylist()
     rows[3]["png_path"] = "../../etc/passwd"
     pq.write_table(pa.Table.from_pylist(rows, schema=TABLES["frames"]), part)
     with pytest.raises(UserError, match="inside the dataset"):

@@ -1,11 +1,11 @@
-"""Text of other people in Markdown, HTML, CSV and on the terminal."""
+"""Text of other people in Markdown, CSV and on the terminal."""
 
 import pandas as pd
 import pytest
-from tests.helpers.pages import Elements, shown
+from tests.helpers.pages import shown
 
 from perilune_shared.console import terminal
-from perilune_shared.export.foreign_text import code_span, for_csv, for_html, for_markdown, write_csv
+from perilune_shared.export.foreign_text import code_span, for_csv, for_markdown, write_csv
 
 HOSTILE = [
     "<script>alert(1)</script>",
@@ -38,13 +38,6 @@ def test_markdown_keeps_what_a_name_says() -> None:
         assert shown(for_markdown(name)).text.strip() == name
     assert for_markdown("scene 0.5, 3 px") == "scene 0.5, 3 px"
     assert code_span("small-none") == "`small-none`"
-
-
-@pytest.mark.parametrize("text", HOSTILE)
-def test_html_has_no_element_of_a_name(text: str) -> None:
-    found = Elements()
-    found.feed(f'<p title="{for_html(text)}">{for_html(text)}</p>')
-    assert found.names == ["p"]
 
 
 @pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", " =1", "＝1", "'=1", '"=1', "\t=1", "|cmd", "%0"])

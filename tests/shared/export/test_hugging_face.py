@@ -10,7 +10,7 @@ from PIL import Image
 from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.split import Split, split_dataset
 from perilune_shared.export.card import write_card
 from perilune_shared.export.hugging_face import export_hugging_face
 from perilune_shared.export.rows import by_selection
@@ -79,7 +79,7 @@ def test_shards_are_read_by_pandas_polars_and_duckdb(crowded_packed):
 def source(request, crowded, crowded_packed, tmp_path):
     """Datasets with frames as files, with packed frames, and with several splits in one part."""
     if request.param == "split by frame":
-        split_dataset(open_dataset(crowded), tmp_path / "mixed", "frame", 0.2, 0.2)
+        split_dataset(open_dataset(crowded), tmp_path / "mixed", Split("frame", 0.2, 0.2))
         return open_dataset(tmp_path / "mixed")
     return open_dataset(crowded if request.param == "files" else crowded_packed)
 

@@ -10,8 +10,8 @@ from perilune_shared.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
+from perilune_shared.storage.object_stores import store_faults
 from perilune_shared.storage.store import open_store
-from perilune_shared.storage.store_faults import store_faults
 from perilune_shared.validation.validate import validate
 
 

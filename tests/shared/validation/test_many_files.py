@@ -9,7 +9,7 @@ from tests.helpers.hostile import command
 from perilune_shared.dataset import index
 from perilune_shared.dataset.index import index_rows, read_index, seal
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.parts import Written
+from perilune_shared.dataset.parts import WrittenFile
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
@@ -29,7 +29,7 @@ def test_unknown_files_are_counted(victim, capsys, monkeypatch):
 
 def test_missing_files_are_counted(victim):
     dataset = open_dataset(victim)
-    absent = index_rows(Written(f"manifest/labels/s{number:04d}.parquet", 1, "0" * 64) for number in range(_MANY))
+    absent = index_rows(WrittenFile(f"manifest/labels/s{number:04d}.parquet", 1, "0" * 64) for number in range(_MANY))
     rows = read_index(dataset.store, dataset.info)
     seal(dataset.store, dataset.info, pa.concat_tables([rows, absent]))
     faults = validate(open_dataset(victim))
@@ -52,6 +52,6 @@ def test_an_index_has_a_maximum_of_all_rows(victim, monkeypatch):
     dataset = open_dataset(victim)
     with pytest.raises(UserError, match="rows: got more than 5"):
         read_index(dataset.store, dataset.info)
-    rows = index_rows(Written(f"frames/{number}.png", 1, "0" * 64) for number in range(6))
+    rows = index_rows(WrittenFile(f"frames/{number}.png", 1, "0" * 64) for number in range(6))
     with pytest.raises(UserError, match="pack the frames"):
         seal(dataset.store, dataset.info, rows)

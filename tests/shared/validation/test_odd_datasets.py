@@ -17,8 +17,8 @@ from perilune_shared.dataset.schema import complete
 from perilune_shared.editing.attach import attach
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack, unpack
-from perilune_shared.editing.split import split_dataset
-from perilune_shared.editing.subset import subset
+from perilune_shared.editing.split import Split, split_dataset
+from perilune_shared.editing.subset import Limit, subset
 from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
@@ -96,7 +96,7 @@ def test_a_dataset_without_rows_is_refused_in_one_line(victim, tmp_path):
     for table in ("scenes", "trajectories", "frames", "labels", "craters", "boulders"):
         replaced(victim, table, rows_of(victim, table).slice(0, 0))
     with pytest.raises(UserError, match="none"):
-        subset(open_dataset(victim), tmp_path / "out", n_frames=3)
+        subset(open_dataset(victim), tmp_path / "out", limit=Limit(n_frames=3))
     with pytest.raises(UserError, match="none"):
         write_card(open_dataset(victim), tmp_path / "page.md", Progress())
 
@@ -155,7 +155,7 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
     subset(open_dataset(victim), tmp_path / "same")
     assert open_dataset(tmp_path / "same").info.split_by == "trajectory"
     with pytest.raises(UserError, match="got 1 terrain,"):
-        split_dataset(open_dataset(victim), tmp_path / "split", by="scene", val_share=0.5, test_share=0)
+        split_dataset(open_dataset(victim), tmp_path / "split", Split(by="scene", val_share=0.5, test_share=0))
 
 
 def test_a_damaged_table_is_not_copied(drawn, tmp_path):
@@ -189,7 +189,7 @@ def test_a_trajectory_developed_twice_is_one_trajectory(drawn, tmp_path):
     rows = pq.read_table(part).to_pandas().assign(recipe=key)
     pq.write_table(complete("scenes", pa.Table.from_pandas(rows, preserve_index=False)), part)
     seal(other)
-    split_dataset(open_dataset(other), tmp_path / "split", val_share=0.2, test_share=0.2, seed=1)
+    split_dataset(open_dataset(other), tmp_path / "split", Split(val_share=0.2, test_share=0.2, seed=1))
     merge([open_dataset(drawn), open_dataset(tmp_path / "split")], tmp_path / "m")
     made = open_dataset(tmp_path / "m")
     assert made.info.counts.scenes == 10 and made.info.split_by == "frame" and validate(made) == []

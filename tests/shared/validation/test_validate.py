@@ -14,10 +14,11 @@ from tests.helpers import in_process
 from perilune_shared.cli.main import main
 from perilune_shared.dataset import manifest
 from perilune_shared.dataset.manifest import count_rows, open_dataset
-from perilune_shared.dataset.parts import read_part, write_part
+from perilune_shared.dataset.parts import Part, write_part
 from perilune_shared.dataset.schema import OPTIONAL_TABLES, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
+from perilune_shared.storage.store import open_store
 from perilune_shared.validation.faults import part_faults
 from perilune_shared.validation.validate import validate
 
@@ -133,11 +134,11 @@ def test_another_schema_version_is_refused(quick_detect):
     table = pq.read_table(path)
     pq.write_table(table.replace_schema_metadata({"perilune.table": "frames", "perilune.schema_version": "0"}), path)
     with pytest.raises(UserError, match="migrate"):
-        read_part(path, "frames")
+        Part(open_store(path.parent), path.name, "frames").read()
 
 
 def test_parts_are_never_rewritten(quick_detect):
-    rows = read_part(sorted((quick_detect / "manifest/scenes").glob("*.parquet"))[0], "scenes")
+    rows = open_dataset(quick_detect).table("scenes")
     with pytest.raises(FileExistsError):
         write_part(quick_detect, "scenes", "all", rows)
     write_part(quick_detect, "scenes", "scene-0009", rows[:1])

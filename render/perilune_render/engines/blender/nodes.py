@@ -47,11 +47,11 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
                 operation, inputs = "MULTIPLY_ADD", (*first.factors, second)
         node = self.tree.nodes.new("ShaderNodeMath")
         node.operation = operation
-        for place, value in zip(node.inputs, inputs, strict=False):
+        for socket, value in zip(node.inputs, inputs, strict=False):
             if isinstance(value, Symbol):
-                self.tree.links.new(value.socket, place)
+                self.tree.links.new(value.socket, socket)
             elif isinstance(value, numbers.Real):
-                place.default_value = float(value)
+                socket.default_value = float(value)
             else:
                 return NotImplemented
         return Symbol(self.tree, node.outputs[0], inputs if operation == "MULTIPLY" else ())

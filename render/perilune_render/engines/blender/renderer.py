@@ -112,9 +112,9 @@ class Renderer:
     ) -> Radiance:
         """Render one frame: radiance factor averaged over each pixel, and depth of the ray through its centre.
 
-        With dataset.render.exr the normal is also that of this ray, else the mean over the pixel's samples.
-        `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable frame, and RuntimeError if
-        the Renderer is closed.
+        With dataset.render.exr this ray also gives the normal; otherwise the normal is the mean over the pixel's
+        samples. `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable frame, and
+        RuntimeError if the Renderer is closed.
         """
         with self._rendering(float(position_m[2]), approach_deg) as path:
             blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
@@ -140,9 +140,9 @@ class Renderer:
                 blender_stage.aim(self.stage, *pose)
                 with rows_only(self.stage, first, last, self.camera.height_px):
                     band = self._through(path, seed)
-                own = pixels[first:last]
+                in_band = pixels[first:last]
                 for name in ("radiance_factor", "depth_m", "normal", "sunlit"):
-                    getattr(whole, name)[first:last][own] = getattr(band, name)[own]
+                    getattr(whole, name)[first:last][in_band] = getattr(band, name)[in_band]
             return whole
 
     def _through(self, path: Path, seed: int) -> Radiance:

@@ -19,7 +19,7 @@ _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 _EARTH_ANGULAR_DIAMETER_DEG = 1.9
 """Angular diameter of the Earth from the Moon's mean distance."""
 _EARTHSHINE = 0.1 / 1361
-"""Irradiance of the full Earth over that of the Sun."""
+"""Irradiance of the full Earth over the irradiance of the Sun."""
 
 
 def clear() -> bpy.types.Scene:
@@ -68,7 +68,7 @@ def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.ty
     mesh.attributes[".corner_vert"].data.foreach_set("value", np.ascontiguousarray(faces, np.int32).ravel())
     mesh.polygons.add(len(faces))
     mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, faces.shape[1], dtype=np.int32))
-    # Cycles reads no edges, and finding those of 6 million vertices takes 2 s. Blender does so if a mesh has none.
+    # Blender finds the edges of a mesh that has none, which takes 2 s for 6 million vertices. Cycles reads no edges.
     mesh.edges.add(1)
     mesh.update()
     return mesh

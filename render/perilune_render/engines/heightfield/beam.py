@@ -1,5 +1,4 @@
-"""Where the rays of a block of pixels begin, the height above which none of them can hit anything, and the part of the
-mesh below.
+"""Where the rays of a block of pixels begin: the height above which none hits anything, and the mesh part below.
 
 A raster of squares has the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays of
 a block of pixels fill a pyramid. It is followed downwards, layer after layer: as long as the ground and the boulders
@@ -10,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS, Ground, place_of
+from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS, Ground, vertex_xy
 from perilune_render.provenance.kernels import njit
 
 BLOCK_PX = 4
@@ -26,7 +25,7 @@ _THINNEST_M = 0.5
 _LEAST_FALL = -1e-3
 """Vertical component of a ray, whose component along the camera's axis is 1, above which it does not surely fall."""
 _MARGIN_M = 0.01
-"""Of heights; covers the rounding of the rays."""
+"""Margin of heights and places for the rounding of the rays, metres."""
 
 
 class Tops(NamedTuple):
@@ -41,7 +40,7 @@ class Tops(NamedTuple):
 
 
 def tops_of(ground: Ground) -> Tops:
-    """The raster of a ground; takes some hundredths of a second for ten million vertices."""
+    """The raster of a ground; takes a few hundredths of a second for ten million vertices."""
     edge_m = float(ground.half_widths_m[-1])
     level = np.full((_SQUARES, _SQUARES), -np.inf, np.float32)
     _fill(ground, level, edge_m, _SQUARES / (2 * edge_m))
@@ -70,7 +69,7 @@ def _fill(ground, raster, edge, scale):
                 for k in range(4):
                     for i in (low_row, last_row):
                         for j in (low_column, last_column):
-                            x, y = place_of(part, i, j, k, n, ground.half_widths_m)
+                            x, y = vertex_xy(part, i, j, k, n, ground.half_widths_m)
                             x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
                 top = ground.top_m[first + row * n_columns + column]
                 i0, i1, j0, j1 = _squares(x0, x1, y0, y1, edge, scale)
@@ -97,27 +96,28 @@ def _highest(tops, x0, x1, y0, y1):
         level += 1
     width = _SQUARES >> level
     first = (_SQUARES * _SQUARES - width * width) * 4 // 3
-    found = -np.inf
+    highest = -np.inf
     for j in range(j0 >> level, (j1 >> level) + 1):
         for i in range(i0 >> level, (i1 >> level) + 1):
-            found = max(found, float(tops.top_m[first + j * width + i]))
-    return found
+            highest = max(highest, float(tops.top_m[first + j * width + i]))
+    return highest
 
 
 @njit(**WITHOUT_COUNTS)
-def begin_m(tops, ground, origin, basis, u0, u1, v0, v1):
+def begin_m(tops, ground, origin, basis, rectangle):
     """Height at which the rays through a rectangle of the image may begin, metres; inf if not all of them fall.
 
-    The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above this height no ray through u0..u1
-    and v0..v1 hits anything.
+    The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above this height no ray through the
+    rectangle (u0, u1, v0, v1), pixels, hits anything.
     """
+    u0, u1, v0, v1 = rectangle
     x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf
     for k in range(4):
         u, v = u0 if k & 1 == 0 else u1, v0 if k & 2 == 0 else v1
         dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
         if dz > _LEAST_FALL:
             return np.inf
-        # Horizontal way of the ray for a metre of height.
+        # Horizontal distance that the ray covers for a metre of height.
         x = (u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]) / dz
         y = (u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]) / dz
         x_low, x_high, y_low, y_high = min(x_low, x), max(x_high, x), min(y_low, y), max(y_high, y)
@@ -126,24 +126,26 @@ def begin_m(tops, ground, origin, basis, u0, u1, v0, v1):
     for _ in range(_LAYERS):
         if layer < _THINNEST_M:
             break
-        # Heights relative to the origin are negative: the smallest coordinate has the largest way.
+        # Heights relative to the origin are negative, so the largest ratio gives the smallest coordinate.
         top, bottom = z - origin[2], z - layer - origin[2]
         x0, x1 = min(top * x_high, bottom * x_high), max(top * x_low, bottom * x_low)
         y0, y1 = min(top * y_high, bottom * y_high), max(top * y_low, bottom * y_low)
-        found = _highest(tops, origin[0] + x0, origin[0] + x1, origin[1] + y0, origin[1] + y1)
-        if found < z - layer:
+        highest = _highest(tops, origin[0] + x0, origin[0] + x1, origin[1] + y0, origin[1] + y1)
+        if highest < z - layer:
             z -= layer
         else:
-            z, layer = min(z, found), layer / 2
+            z, layer = min(z, highest), layer / 2
     return z + _MARGIN_M
 
 
 @njit(**WITHOUT_COUNTS)
-def only_part(ground, origin, basis, u0, u1, v0, v1, begin):
-    """Part of the mesh that has the whole way of all rays of `begin_m` from the height `begin` to below the ground.
+def only_part(ground, origin, basis, rectangle, begin):
+    """The part of the mesh in which all rays of `begin_m` stay from the height `begin` to below the ground.
 
-    0 for the inner square, 1 to 4 for the sectors, -1 if there are several, or if the ways are not known.
+    0 for the inner square, 1 to 4 for the sectors; -1 if there are several, or if not all rays fall. `begin` is in
+    metres.
     """
+    u0, u1, v0, v1 = rectangle
     if begin > min(ground.highest_m, origin[2]):
         return -1
     x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf

@@ -13,7 +13,7 @@ from perilune_render.config.dataset import DatasetConfig
 from perilune_render.engines.heightfield.beam import tops_of
 from perilune_render.engines.heightfield.horizon import NOWHERE, Horizon, horizon_of
 from perilune_render.engines.heightfield.light import disc_places, reflected
-from perilune_render.engines.heightfield.shade import see
+from perilune_render.engines.heightfield.shade import Tile, View, see
 from perilune_render.engines.heightfield.surface import Surface, surface_of
 from perilune_render.flight.sub_poses import Pose, RowPoses
 from perilune_render.imaging.radiance import Radiance
@@ -31,7 +31,7 @@ _RAYS_AT_ONCE = 8192
 _LIT = 1e-4
 """Radiance factor above which a pixel counts as sunlit."""
 _RAYS_PER_VERTEX = 0.3
-"""Rays, in numbers of vertices, after which the horizon is made: without it they have taken as long as it takes."""
+"""Rays per vertex of the ground after which the horizon is computed: for fewer it costs more time than it saves."""
 
 
 class HeightfieldEngine:
@@ -83,10 +83,10 @@ class HeightfieldEngine:
         The first sample of a pixel is at its centre. `approach_deg` is not used: the ground is one mesh.
         """
         shape = self.camera.height_px, self.camera.width_px
-        found = Radiance.empty(shape)
+        image = Radiance.empty(shape)
         pose = position_m, rotation_camera_from_site
-        self._cast(found, slice(0, shape[0]), pose, self._drawn(seed), self._horizon_now())
-        return found
+        self._cast(image, slice(0, shape[0]), pose, self._drawn(seed), self._horizon_now())
+        return image
 
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
         """Render one frame with a pose for each row of the sensor; a depth is along the axis at its row's pose."""
@@ -111,24 +111,24 @@ class HeightfieldEngine:
         return moved, rng.random(shape, np.float32)
 
     def _cast(
-        self, found: Radiance, rows: slice, pose: Pose, drawn: tuple[np.ndarray, np.ndarray], horizon: Horizon
+        self, image: Radiance, rows: slice, pose: Pose, drawn: tuple[np.ndarray, np.ndarray], horizon: Horizon
     ) -> None:
-        """Render rows of an image from one pose into `found`, in tiles by all threads."""
+        """Render rows of an image from one pose into `image`, in tiles by all threads."""
         position_m, rotation_camera_from_site = pose
         moved, disc = drawn
         origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
         basis, plane = rays_of(self.camera) @ rotation_camera_from_site, np.stack(plane_basis(self.sun))
+        view = View(origin, basis, self._far_m, self.sun, plane, horizon)
         ground, rocks = self.surface.ground, self.surface.rocks
 
         def cast(first: tuple[int, int]) -> None:
             last_row = min(first[0] + tile_rows, rows.stop)
             tile = slice(first[0], last_row), slice(first[1], first[1] + _TILE_PX)
-            places, suns = moved[:, *tile], disc_places(disc[:, *tile], self._disc_rad)
-            angles = np.empty((5, *places.shape[:3]), np.float32)
-            light = horizon, origin, basis, self.sun, plane
-            see(ground, rocks, self.tops, *light, self._far_m, first, places, suns, found.depth_m, found.normal, angles)
+            moves, suns = moved[:, *tile], disc_places(disc[:, *tile], self._disc_rad)
+            angles = np.empty((5, *moves.shape[:3]), np.float32)
+            see(ground, rocks, self.tops, view, Tile(first, moves, suns, image.depth_m, image.normal, angles))
             seen = reflected(self._law, angles).mean(axis=0)
-            found.radiance_factor[tile], found.sunlit[tile] = seen, seen > _LIT
+            image.radiance_factor[tile], image.sunlit[tile] = seen, seen > _LIT
 
         tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
         columns = range(0, self.camera.width_px, _TILE_PX)
@@ -140,7 +140,7 @@ class HeightfieldEngine:
             cast(each)
 
     def _horizon_now(self) -> Horizon:
-        """The horizon for a frame; `NOWHERE` as long as it costs less. Frames are the same with any horizon."""
+        """The horizon for a frame; `NOWHERE` while this costs less time. Frames do not depend on it."""
         self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
         if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
             self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))
@@ -148,6 +148,6 @@ class HeightfieldEngine:
 
 
 def rays_of(camera: Camera) -> Array:
-    """Rows (3, 3): how a ray of a camera without distortion changes with u, with v, and the ray at u = v = 0."""
+    """Basis (3, 3) of the rays of a camera without distortion: change per pixel of u and of v, ray at u = v = 0."""
     start, right, down = camera.rays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     return np.stack([right - start, down - start, start])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perilune_render.engines.heightfield.surface import WITHOUT_COUNTS, Ground, place_of, vertex
+from perilune_render.engines.heightfield.surface import WITHOUT_COUNTS, Ground, vertex_index, vertex_xy
 from perilune_render.provenance.kernels import njit
 from perilune_shared.geometry.frames import Array
 
@@ -25,9 +25,9 @@ _NEAR = 4
 _WIDEST = 0.2
 """Largest tangent of half the disc's range of azimuths for which one square at each side of the near part suffices."""
 _MARGIN = 1e-3
-"""Of slopes; covers the rounding of the rays."""
+"""Margin of slopes for the rounding of the rays."""
 _MARGIN_M = 0.01
-"""Of heights, metres."""
+"""Margin of heights, metres."""
 
 
 class Horizon(NamedTuple):
@@ -69,7 +69,7 @@ def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
     n = int(np.ceil(2 * edge_m / pitch_m))
     empty = Horizon(np.full((n, n), -np.inf, np.float32), along_x, along_y, edge_m, 1 / pitch_m)
     steep = np.zeros((n, n), np.bool_)
-    _fill(ground, empty, lowest - _MARGIN, float(np.sin(turn)), empty.clear_m, steep)
+    _fill(ground, empty, lowest - _MARGIN, float(np.sin(turn)), steep)
     highest, steep = _widened(empty.clear_m), _widened(steep)
     near = steep.copy()
     for k in range(1, _NEAR):
@@ -89,15 +89,17 @@ def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
 
 def _widened(raster: np.ndarray) -> np.ndarray:
     """The largest value (N, M) of each square and its two neighbours across the Sun's azimuth."""
-    found = raster.copy()
-    found[:, 1:] = np.maximum(found[:, 1:], raster[:, :-1])
-    found[:, :-1] = np.maximum(found[:, :-1], raster[:, 1:])
-    return found
+    widened = raster.copy()
+    widened[:, 1:] = np.maximum(widened[:, 1:], raster[:, :-1])
+    widened[:, :-1] = np.maximum(widened[:, :-1], raster[:, 1:])
+    return widened
 
 
 @njit(**WITHOUT_COUNTS)
-def _fill(ground, raster, steepest, turned, highest, steep):
-    """Write the highest point of the ground in each square, and whether a facet there is steep or has boulders.
+def _fill(ground, raster, steepest, turned, steep):
+    """Write into `raster.clear_m` the highest point of each square, and into `steep` whether it is rough.
+
+    A square is rough if it touches a cell with a boulder or a steep facet.
 
     A facet is steep if its slope along a direction within an angle of the Sun's azimuth, of sine `turned`, is larger
     than `steepest`.
@@ -106,19 +108,19 @@ def _fill(ground, raster, steepest, turned, highest, steep):
     for part in range(5):
         for row in range(2 * n if part == 0 else len(ground.half_widths_m) - 1):
             for column in range(2 * n):
-                _add_cell(ground, raster, part, row, column, steepest, turned, highest, steep)
+                _add_cell(ground, raster, (part, row, column), steepest, turned, steep)
 
 
 @njit(**WITHOUT_COUNTS)
-def _add_cell(ground, raster, part, row, column, steepest, turned, highest, steep):
+def _add_cell(ground, raster, cell, steepest, turned, steep):
     """Add one cell to the squares that its bounds along and across the Sun's azimuth touch; see `_fill`."""
-    n, half = ground.n_half, ground.half_widths_m
-    v0, v1 = vertex(part, row, column, 0, n), vertex(part, row, column, 1, n)
-    v2, v3 = vertex(part, row, column, 2, n), vertex(part, row, column, 3, n)
-    x0, y0 = place_of(part, row, column, 0, n, half)
-    x1, y1 = place_of(part, row, column, 1, n, half)
-    x2, y2 = place_of(part, row, column, 2, n, half)
-    x3, y3 = place_of(part, row, column, 3, n, half)
+    (part, row, column), n, half, highest = cell, ground.n_half, ground.half_widths_m, raster.clear_m
+    v0, v1 = vertex_index(part, row, column, 0, n), vertex_index(part, row, column, 1, n)
+    v2, v3 = vertex_index(part, row, column, 2, n), vertex_index(part, row, column, 3, n)
+    x0, y0 = vertex_xy(part, row, column, 0, n, half)
+    x1, y1 = vertex_xy(part, row, column, 1, n, half)
+    x2, y2 = vertex_xy(part, row, column, 2, n, half)
+    x3, y3 = vertex_xy(part, row, column, 3, n, half)
     a0, b0 = x0 * raster.along_x + y0 * raster.along_y, y0 * raster.along_x - x0 * raster.along_y
     a1, b1 = x1 * raster.along_x + y1 * raster.along_y, y1 * raster.along_x - x1 * raster.along_y
     a2, b2 = x2 * raster.along_x + y2 * raster.along_y, y2 * raster.along_x - x2 * raster.along_y
@@ -126,8 +128,9 @@ def _add_cell(ground, raster, part, row, column, steepest, turned, highest, stee
     z0, z1 = float(ground.vertex[v0, 2]), float(ground.vertex[v1, 2])
     z2, z3 = float(ground.vertex[v2, 2]), float(ground.vertex[v3, 2])
     top = max(max(z0, z1), max(z2, z3))
-    against = _against(a1 - a0, b1 - b0, z1 - z0, a2 - a0, b2 - b0, z2 - z0, turned)
-    against = max(against, _against(a2 - a0, b2 - b0, z2 - z0, a3 - a0, b3 - b0, z3 - z0, turned))
+    edge_1, edge_2, edge_3 = (a1 - a0, b1 - b0, z1 - z0), (a2 - a0, b2 - b0, z2 - z0), (a3 - a0, b3 - b0, z3 - z0)
+    against = _against(edge_1, edge_2, turned)
+    against = max(against, _against(edge_2, edge_3, turned))
     rough = against > steepest
     if ground.vertex[v0, 3] < 0:
         # The first level of the pyramid has the boulders' tops too.
@@ -149,8 +152,9 @@ def _add_cell(ground, raster, part, row, column, steepest, turned, highest, stee
 
 
 @njit(inline="always", **WITHOUT_COUNTS)
-def _against(a1, b1, z1, a2, b2, z2, turned):
-    """Upper bound on a triangle's slope along directions near the axis a; its edges are (a1, b1, z1), (a2, b2, z2)."""
+def _against(first, second, turned):
+    """Upper bound on a triangle's slope along directions near the axis a, from two of its edges (a, b, z)."""
+    (a1, b1, z1), (a2, b2, z2) = first, second
     area = a1 * b2 - a2 * b1
     slope_a, slope_b = (z1 * b2 - z2 * b1) / area, (a1 * z2 - a2 * z1) / area
     return slope_a + turned * (abs(slope_a) + abs(slope_b))

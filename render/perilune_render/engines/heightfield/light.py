@@ -72,9 +72,9 @@ def _factors(p: HapkeParameters) -> _Factors:
 
 def disc_places(drawn: np.ndarray, radius_rad: np.float32) -> np.ndarray:
     """Uniform places (..., 2) on the Sun's disc at unit distance, for uniform random numbers (..., 2), float32."""
-    places = np.empty(drawn.shape, np.float32)
-    _fill_disc(drawn, radius_rad, places)
-    return places
+    points = np.empty(drawn.shape, np.float32)
+    _fill_disc(drawn, radius_rad, points)
+    return points
 
 
 def reflected(law: str, angles: np.ndarray) -> np.ndarray:
@@ -82,20 +82,20 @@ def reflected(law: str, angles: np.ndarray) -> np.ndarray:
     mu0, mu, cos_phase, albedo, lit = angles
     if law not in HAPKE:
         return reflectance_factor(law, mu0, mu, cos_phase) * albedo * lit
-    found = np.empty(mu0.shape, np.float32)
-    _hapke(_factors(HAPKE[law]), angles.reshape(5, -1), found.reshape(-1))
-    return found
+    factor = np.empty(mu0.shape, np.float32)
+    _hapke(_factors(HAPKE[law]), angles.reshape(5, -1), factor.reshape(-1))
+    return factor
 
 
 @njit(**WITHOUT_COUNTS)
-def _fill_disc(drawn, radius_rad, places):
+def _fill_disc(drawn, radius_rad, points):
     n_samples, height, width, _ = drawn.shape
     turn = np.float32(2 * np.pi)
     for s in range(n_samples):
         for i in range(height):
             for j in range(width):
                 length, angle = np.tan(radius_rad * np.sqrt(drawn[s, i, j, 0])), turn * drawn[s, i, j, 1]
-                places[s, i, j, 0], places[s, i, j, 1] = length * np.cos(angle), length * np.sin(angle)
+                points[s, i, j, 0], points[s, i, j, 1] = length * np.cos(angle), length * np.sin(angle)
 
 
 @njit(**INLINED)
@@ -107,9 +107,9 @@ def _slopes(f, cosine):
 
 
 @njit(**WITHOUT_COUNTS)
-def _hapke(f, angles, found):
-    """`photometry.hapke` times albedo and cosine of incidence of each sample: angles (5, N), found (N,)."""
-    for k in range(len(found)):
+def _hapke(f, angles, result):
+    """`photometry.hapke` times albedo and cosine of incidence of each sample: angles (5, N), result (N,)."""
+    for k in range(len(result)):
         mu0, mu, cos_phase = angles[0, k], angles[1, k], angles[2, k]
         cos_l, cos_s = min(mu0, mu), max(mu0, mu)
         sin_l, e1_l, e2_l = _slopes(f, cos_l)
@@ -136,4 +136,4 @@ def _hapke(f, angles, found):
         half_tangent = np.sqrt(_TWO / min(cos_phase + _ONE, _TWO) - _ONE)
         surge = f.surge / (half_tangent + f.h_s) + _ONE
         factor = product / total * (shadowing * f.albedo) * (phase * surge + multiple)
-        found[k] = factor * angles[3, k] * angles[4, k]
+        result[k] = factor * angles[3, k] * angles[4, k]

@@ -13,12 +13,12 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        place = builder.bitcast(builder.gep(data, [args[1]]), cgutils.voidptr_t)
+        address = builder.bitcast(builder.gep(data, [args[1]]), cgutils.voidptr_t)
         ir, number = cgutils.ir, cgutils.int32_t
         kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         # To read, keep in all caches, data.
-        builder.call(function, [place, number(0), number(3), number(1)])
+        builder.call(function, [address, number(0), number(3), number(1)])
         return context.get_dummy_value()
 
     return types.void(array, index), generate

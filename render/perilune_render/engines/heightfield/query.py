@@ -3,6 +3,7 @@
 import numpy as np
 
 from perilune_render.engines.heightfield.cast import first_hit
+from perilune_render.engines.heightfield.cell import NO_FACET, Ray
 from perilune_render.engines.heightfield.shade import ground_at, rock_normal
 from perilune_render.engines.heightfield.surface import Surface
 from perilune_render.provenance.kernels import njit
@@ -10,7 +11,7 @@ from perilune_shared.geometry.frames import Array
 
 
 def first_hits(surface: Surface, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
-    """First hits of rays from places (N, 3), O_L, along directions (N, 3).
+    """First hits of rays from points (N, 3), O_L, metres, along directions (N, 3).
 
     Returns the distances (N,) in lengths of the directions, infinite where a ray hits nothing, and the unit normals of
     the facets (N, 3), 0 there. Start above the surface, whose underside is hit too. Without `boulders` rays hit only
@@ -22,14 +23,14 @@ def first_hits(surface: Surface, origins_m: Array, directions: Array, *, boulder
 def first_returns(
     surface: Surface, origins_m: Array, directions: Array, *, boulders: bool = True
 ) -> tuple[Array, Array, Array]:
-    """Distances and normals as `first_hits`, and the albedo factors (N,) there: 1 on boulders, 0 where nothing is."""
+    """Distances and normals as `first_hits`, and the albedo factors (N,): 1 on boulders, 0 where a ray hits nothing."""
     origins = np.ascontiguousarray(origins_m - np.array([*surface.centre_m, 0.0]), np.float64)
     rocks = surface.rocks if boulders else surface.rocks._replace(cell_start=np.zeros_like(surface.rocks.cell_start))
     return _hits(surface.ground, rocks, origins, np.ascontiguousarray(directions, np.float64))
 
 
 def heights_m(surface: Surface, x_m: Array, y_m: Array, *, boulders: bool = True) -> Array:
-    """Heights (N,) of the surface at places (N,) of O_L, metres; NaN off the ground."""
+    """Heights (N,) of the surface at points (N,) of O_L, metres; NaN off the ground."""
     above = surface.ground.highest_m + 1.0
     start = np.stack([x_m, y_m, np.full(len(x_m), above)], axis=1)
     distance, _ = first_hits(surface, start, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)), boulders=boulders)
@@ -38,20 +39,18 @@ def heights_m(surface: Surface, x_m: Array, y_m: Array, *, boulders: bool = True
 
 @njit()
 def _hits(ground, rocks, origins, directions):
-    """See `first_returns`; places are relative to the grid's centre."""
+    """See `first_returns`; points are relative to the grid's centre."""
     distance, normal, albedo = np.empty(len(origins)), np.zeros((len(origins), 3)), np.zeros(len(origins))
     for k in range(len(origins)):
-        ox, oy, oz = origins[k]
+        x, y, z = origins[k]
         dx, dy, dz = directions[k]
-        t, rock, face, part, row, column, triangle = first_hit(
-            ground, rocks, None, ox, oy, oz, dx, dy, dz, 0.0, np.inf, (-1, -1, -1, -1, -1)
-        )
+        t, facet = first_hit(ground, rocks, None, Ray(x, y, z, dx, dy, dz, NO_FACET), (0.0, np.inf))
         distance[k] = t
-        if rock >= 0:
-            normal[k, 0], normal[k, 1], normal[k, 2] = rock_normal(rocks, rock, face)
+        if facet.rock >= 0:
+            normal[k, 0], normal[k, 1], normal[k, 2] = rock_normal(rocks, facet.rock, facet.face)
             albedo[k] = 1.0
         elif t < np.inf:
-            shading = ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy)
+            shading = ground_at(ground, facet, x + t * dx, y + t * dy)
             normal[k, 0], normal[k, 1], normal[k, 2] = shading[4], shading[5], shading[6]
             albedo[k] = shading[3]
     return distance, normal, albedo

@@ -20,7 +20,7 @@ class Rocks(NamedTuple):
     """Outer unit normal and distance from the centre of each face, for a rock of diameter 1 (F, 4)."""
     cell_start: np.ndarray
     """Index in `cell_rock` of each cell's first boulder, and their number (C + 1,) int64: cells of the inner square by
-    y and x, then those of the sectors by side, ring and place."""
+    y and x, then cells of the sectors by side, ring and spoke."""
     cell_rock: np.ndarray
     """Indices of the boulders in each cell (M,) int64."""
 
@@ -59,22 +59,26 @@ def cells_of_rocks(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cells of the boulders with these `Rocks.rows`: `cell_start`, `cell_rock`, and the largest height in each cell.
 
-    The heights are those of the inner square (2 n, 2 n) and of the sectors (4, R, 2 n), float32.
+    The heights have two arrays: inner square (2 n, 2 n) and sectors (4, R, 2 n), float32.
     """
     n, n_rings = n_half, len(half_widths_m) - 1
     inner, sectors = np.full((2 * n, 2 * n), -np.inf, np.float32), np.full((4, n_rings, 2 * n), -np.inf, np.float32)
     counts = np.zeros(inner.size + sectors.size + 1, np.int64)
     nothing = np.zeros(0, np.int64)
-    _fill(rows, n, half_widths_m, inner, sectors, counts, nothing, False)
+    _fill(rows, n, half_widths_m, (inner, sectors), counts, nothing)
     starts = np.concatenate([[0], np.cumsum(counts[:-1])]).astype(np.int64)
     numbers = np.empty(int(starts[-1]), np.int64)
-    _fill(rows, n, half_widths_m, inner, sectors, starts[:-1].copy(), numbers, True)
+    _fill(rows, n, half_widths_m, (inner, sectors), starts[:-1].copy(), numbers)
     return starts, numbers, inner, sectors
 
 
 @njit()
-def _fill(rows, n, half_widths, inner, sectors, place, numbers, write):
-    """Count the boulders of each cell in `place`, or write them into `numbers` at `place`, which moves on."""
+def _fill(rows, n, half_widths, tops, position, numbers):
+    """Write the boulders of each cell into `numbers` from `position` of the cell on, and advance that position.
+
+    With empty `numbers`, count them in `position`. Raise `tops` of the inner square and of the sectors to the boulders.
+    """
+    (inner, sectors), write = tops, len(numbers) > 0
     step = half_widths[0] / n
     n_rings = len(half_widths) - 1
     for k in range(len(rows)):
@@ -87,8 +91,8 @@ def _fill(rows, n, half_widths, inner, sectors, place, numbers, write):
                 inner[j, i] = max(inner[j, i], top)
                 cell = j * 2 * n + i
                 if write:
-                    numbers[place[cell]] = k
-                place[cell] += 1
+                    numbers[position[cell]] = k
+                position[cell] += 1
         for side in range(4):
             if side == 0:
                 along, d = x, -y
@@ -113,5 +117,5 @@ def _fill(rows, n, half_widths, inner, sectors, place, numbers, write):
                     sectors[side, ring, t] = max(sectors[side, ring, t], top)
                     cell = 4 * n * n + (side * n_rings + ring) * 2 * n + t
                     if write:
-                        numbers[place[cell]] = k
-                    place[cell] += 1
+                        numbers[position[cell]] = k
+                    position[cell] += 1

@@ -1,20 +1,86 @@
-"""What each ray of an image sees: the hit, its shading, and whether the Sun reaches it."""
+r"""What each ray of an image sees: the hit, its shading, and whether the Sun reaches it.
+
+        camera               Sun
+            \       ^       /
+             \      |      /
+    1. view   \     |     /  4. shadow ray, to a random point of the Sun's disc
+       ray     \    |    /
+                \   |   +    3. its start, lifted where the ray grazes the facet
+                 \  |
+        __________\_|__________ facet, with its shading normal (2)
+
+`see` renders a tile of the image, block by block of BLOCK_PX pixels:
+
+- `begin_m` and `only_part` find for all rays of a block where they may begin, and the part of the mesh below;
+- `_read_ahead` asks for the memory that the rays will need;
+- `_see` casts the ray of one sample (1), shades its hit by `ground_at` or `rock_normal` (2), moves the start of a
+  grazing shadow ray by `lift_at` (3), and casts the shadow ray (4), unless the hit is surely lit.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from perilune_render.engines.heightfield.beam import BLOCK_PX, begin_m, only_part
 from perilune_render.engines.heightfield.cast import any_ring_at, first_hit, first_hit_anywhere, first_hit_in_part
-from perilune_render.engines.heightfield.horizon import surely_lit
+from perilune_render.engines.heightfield.cell import NO_FACET, Ray
+from perilune_render.engines.heightfield.horizon import Horizon, surely_lit
 from perilune_render.engines.heightfield.prefetch import prefetch
-from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS, place_of, ring_vertex, vertex
+from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS, ring_vertex, vertex_index, vertex_xy
 from perilune_render.provenance.kernels import njit
+from perilune_shared.geometry.frames import Array
 
 _LIFT = 1e-4
-"""Start of a shadow ray, metres. Its own triangle and boulder are left out; a ray from an edge of its triangle must not
-hit the next one by rounding."""
+"""Distance from the hit at which a shadow ray begins, metres. It cannot hit its own triangle or boulder, but from an
+edge of its triangle it could hit the next one by rounding."""
 _TERMINATOR = 0.1
 """Cosine between ground and Sun below which Cycles moves the start of a shadow ray from the facet to the curved
 surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
+
+
+class View(NamedTuple):
+    """Camera and Sun of an image. Places are relative to the grid's centre, vectors are in O_L."""
+
+    origin: Array
+    """Position of the camera, metres (3,)."""
+    basis: Array
+    """The ray at image coordinates (u, v), pixels, is u basis[0] + v basis[1] + basis[2], with z = 1 along the camera's
+    axis (3, 3)."""
+    far_m: float
+    """Depth at which rays end, metres."""
+    sun: Array
+    """Unit vector to the centre of the Sun's disc (3,)."""
+    plane: Array
+    """The ray to the point (p, q) of the disc is along sun + p plane[0] + q plane[1] (2, 3)."""
+    horizon: Horizon
+    """Where the ground is surely lit by this Sun."""
+
+
+class Tile(NamedTuple):
+    """A tile of the image: S samples in each of h x w pixels, and the arrays that take what they see."""
+
+    first: tuple[int, int]
+    """Row and column of the tile's first pixel."""
+    moved: np.ndarray
+    """Places of the samples from their pixels' centres, pixels (S, h, w, 2)."""
+    disc: np.ndarray
+    """Points (p, q) of the Sun's disc for the samples' shadow rays (S, h, w, 2)."""
+    depth: np.ndarray
+    """Depth image, metres, of which the tile's pixels are written for the first sample; inf for a miss (H, W)."""
+    normal: np.ndarray
+    """Image of the unit shading normal, O_L, written likewise; 0 for a miss (H, W, 3)."""
+    angles: np.ndarray
+    """Written for each sample (5, S, h, w): mu0, mu, cosine of the phase angle, albedo, and the cosine of incidence of
+    the point of the disc, 0 in shadow."""
+
+
+class _Block(NamedTuple):
+    """Start of all rays of a block of pixels."""
+
+    begin_m: float
+    """Height at which they may begin, metres (`beam.begin_m`)."""
+    part: int
+    """Part of the mesh below them, -1 if it is not known (`beam.only_part`)."""
 
 
 @njit(inline="always", **WITHOUT_COUNTS)
@@ -30,19 +96,22 @@ def _normal(vertices, k):
 
 
 @njit(inline="always", **WITHOUT_COUNTS)
-def _corners(ground, part, row, column, triangle, x, y):
-    """Of a triangle: its vertices, the edges from the first to the others, their cross product's z, and the weights of
-    the second and third vertex at a place."""
+def _corners(ground, facet, x, y):
+    """Vertices of a triangle, edges from its first vertex, z of their cross product, and weights at (x, y).
+
+    The weights belong to the second and third vertex.
+    """
     n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
-    a, b = (1, 2) if triangle == 0 else (2, 3)
+    part, row, column = facet.part, facet.row, facet.column
+    a, b = (1, 2) if facet.triangle == 0 else (2, 3)
     v0, v1, v2 = (
-        vertex(part, row, column, 0, n),
-        vertex(part, row, column, a, n),
-        vertex(part, row, column, b, n),
+        vertex_index(part, row, column, 0, n),
+        vertex_index(part, row, column, a, n),
+        vertex_index(part, row, column, b, n),
     )
-    x0, y0 = place_of(part, row, column, 0, n, half)
-    x1, y1 = place_of(part, row, column, a, n, half)
-    x2, y2 = place_of(part, row, column, b, n, half)
+    x0, y0 = vertex_xy(part, row, column, 0, n, half)
+    x1, y1 = vertex_xy(part, row, column, a, n, half)
+    x2, y2 = vertex_xy(part, row, column, b, n, half)
     e1x, e1y, e1z = x1 - x0, y1 - y0, float(vertices[v1, 2] - vertices[v0, 2])
     e2x, e2y, e2z = x2 - x0, y2 - y0, float(vertices[v2, 2] - vertices[v0, 2])
     area = e1x * e2y - e1y * e2x
@@ -52,10 +121,10 @@ def _corners(ground, part, row, column, triangle, x, y):
 
 
 @njit(**INLINED)
-def ground_at(ground, part, row, column, triangle, x, y):
-    """Shading at a place of a triangle: unit normal, albedo, and the unit normal of the triangle."""
+def ground_at(ground, facet, x, y):
+    """Shading of a triangle at (x, y): unit normal, albedo, and the unit normal of the triangle."""
     vertices = ground.vertex
-    v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, area, v, w = _corners(ground, part, row, column, triangle, x, y)
+    v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, area, v, w = _corners(ground, facet, x, y)
     u = 1 - v - w
     fx, fy, fz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, area
     size = 1 / np.sqrt(fx * fx + fy * fy + fz * fz)
@@ -69,14 +138,14 @@ def ground_at(ground, part, row, column, triangle, x, y):
 
 
 @njit(**INLINED)
-def lift_at(ground, part, row, column, triangle, x, y):
-    """The vector by which Cycles lifts a grazing shadow ray at a place of a triangle from the facet.
+def lift_at(ground, facet, x, y):
+    """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle at (x, y), metres.
 
-    It is that to the lowest of the vertices' tangent planes, each raised over the triangle, or to half the height of a
-    quadratic patch that has the vertex normals.
+    It leads along the interpolated normal to the lowest of the vertices' tangent planes, each raised over the triangle,
+    or to half the height of a quadratic patch with these vertex normals, whichever is higher.
     """
     vertices = ground.vertex
-    v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, part, row, column, triangle, x, y)
+    v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, facet, x, y)
     u = 1 - v - w
     ax, ay, az = _normal(vertices, v0)
     bx, by, bz = _normal(vertices, v1)
@@ -113,36 +182,36 @@ def rock_normal(rocks, k, face):
 
 
 @njit(**INLINED)
-def _see(ground, rocks, horizon, view, drawn, begin, below, first, s, i, j, out):
-    """Cast the ray of one sample, which begins at the height `begin`, and its shadow ray; see `see`.
+def _see(ground, rocks, view, tile, block, sample):
+    """Cast the ray of one sample, (s, row, column) in the tile, and its shadow ray; see the module's sketch.
 
-    `below` is the part of the mesh below the ray, -1 if it is not known (`only_part`).
-    Returns the height of the hit, or `begin` if there is none.
+    Returns the height of the hit, metres; without a hit, the height at which the ray begins.
     """
-    (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles) = view, drawn, out
-    u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
-    dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
-    dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
-    dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
-    start = max((begin - origin[2]) / dz, 0.0) if begin < np.inf else 0.0
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    if below >= 0:
-        hit = first_hit_in_part(ground, rocks, below, ox, oy, oz, dx, dy, dz, start, far_m)
+    (s, i, j), horizon, angles, sun, plane = sample, view.horizon, tile.angles, view.sun, view.plane
+    u, v = _coordinates(tile, s, i, j)
+    dx, dy, dz = _direction(view.basis, u, v)
+    ray = Ray(view.origin[0], view.origin[1], view.origin[2], dx, dy, dz, NO_FACET)
+    begin = max((block.begin_m - ray.z) / dz, 0.0) if block.begin_m < np.inf else 0.0
+    # 1. The view ray.
+    if block.part >= 0:
+        t, facet = first_hit_in_part(ground, rocks, block.part, ray, (begin, view.far_m))
     else:
-        hit = first_hit_anywhere(ground, rocks, ox, oy, oz, dx, dy, dz, start, far_m)
-    t, rock, face, part, row, column, triangle = hit
+        t, facet = first_hit_anywhere(ground, rocks, ray, (begin, view.far_m))
+    # 2. Shading normal n, and normal f of the facet.
     nx, ny, nz, albedo, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
-    hit_z = z if t < np.inf else begin
-    if rock >= 0:
-        nx, ny, nz = rock_normal(rocks, rock, face)
+    x, y, z = ray.x + t * dx, ray.y + t * dy, ray.z + t * dz
+    hit_z = z if t < np.inf else block.begin_m
+    if facet.rock >= 0:
+        nx, ny, nz = rock_normal(rocks, facet.rock, facet.face)
         albedo = 1.0
     elif t < np.inf:
-        nx, ny, nz, albedo, fx, fy, fz = ground_at(ground, part, row, column, triangle, x, y)
+        nx, ny, nz, albedo, fx, fy, fz = ground_at(ground, facet, x, y)
     if s == 0:
-        at = first[0] + i, first[1] + j
-        depth[at], normal[at[0], at[1], 0], normal[at[0], at[1], 1], normal[at[0], at[1], 2] = t, nx, ny, nz
-    p, q = disc[s, i, j, 0], disc[s, i, j, 1]
+        row, column = tile.first[0] + i, tile.first[1] + j
+        tile.depth[row, column] = t
+        tile.normal[row, column, 0], tile.normal[row, column, 1], tile.normal[row, column, 2] = nx, ny, nz
+    # The direction l to a point of the Sun's disc. Photometry takes the disc's centre.
+    p, q = tile.disc[s, i, j, 0], tile.disc[s, i, j, 1]
     lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
     lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
     to_disc = 1 / np.sqrt(lx * lx + ly * ly + lz * lz)
@@ -156,26 +225,43 @@ def _see(ground, rocks, horizon, view, drawn, begin, below, first, s, i, j, out)
     angles[4, s, i, j] = 0.0
     if cosine <= 0:
         return hit_z
-    skip = (-1, -1, -1, -1, rock)
-    if rock < 0:
-        skip = (part, row, column, triangle, -1)
+    # 3. A shadow ray that grazes the ground begins above its facet, as in Cycles.
+    if facet.rock < 0:
         on_facet = fx * lx + fy * ly + fz * lz
-        moves = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
-        moves = min(max(moves, 0.0), 1.0)
-        if moves > 0:
-            mx, my, mz = lift_at(ground, part, row, column, triangle, x, y)
-            x, y, z = x + moves * mx, y + moves * my, z + moves * mz
+        share = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
+        share = min(max(share, 0.0), 1.0)
+        if share > 0:
+            mx, my, mz = lift_at(ground, facet, x, y)
+            x, y, z = x + share * mx, y + share * my, z + share * mz
         elif surely_lit(horizon, x, y, z):
             angles[4, s, i, j] = cosine
             return hit_z
-    if abs(first_hit(ground, rocks, horizon, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0]) == np.inf:
+    # 4. The shadow ray; its parameter is -inf where it reaches ground that is surely lit.
+    shadow_ray = Ray(x, y, z, lx, ly, lz, facet)
+    if abs(first_hit(ground, rocks, horizon, shadow_ray, (_LIFT, np.inf))[0]) == np.inf:
         angles[4, s, i, j] = cosine
     return hit_z
 
 
+@njit(inline="always", **WITHOUT_COUNTS)
+def _coordinates(tile, s, i, j):
+    """Image coordinates u and v of sample s of a tile's pixel (i, j)."""
+    u, v = tile.first[1] + j + 0.5 + tile.moved[s, i, j, 0], tile.first[0] + i + 0.5 + tile.moved[s, i, j, 1]
+    return u, v
+
+
+@njit(inline="always", **WITHOUT_COUNTS)
+def _direction(basis, u, v):
+    """Direction of the ray at image coordinates (u, v); see `View.basis`."""
+    dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
+    dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
+    dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
+    return dx, dy, dz
+
+
 @njit(**INLINED)
 def _read_ahead(ground, horizon, x, y):
-    """Begin to read what a ray needs that hits the ground near a place."""
+    """Begin to read what a ray needs that hits the ground near (x, y)."""
     n, half = ground.n_half, ground.half_widths_m
     i = int((x * horizon.along_x + y * horizon.along_y + horizon.edge_m) * horizon.per_m)
     j = int((y * horizon.along_x - x * horizon.along_y + horizon.edge_m) * horizon.per_m)
@@ -197,48 +283,40 @@ def _read_ahead(ground, horizon, x, y):
             side, along = (1, y) if x > 0 else (3, -y)
         else:
             side, along = (2, -x) if y > 0 else (0, x)
-        place = int((along / d + 1) * n)
-        prefetch(ground.vertex, 4 * ring_vertex(ring, side * 2 * n + place, n))
-        prefetch(ground.vertex, 4 * ring_vertex(ring + 1, side * 2 * n + place, n))
-        prefetch(ground.top_m, ground.level[1, 1] + (side * ((n_rings + 1) >> 1) + (ring >> 1)) * n + (place >> 1))
+        spoke = int((along / d + 1) * n)
+        prefetch(ground.vertex, 4 * ring_vertex(ring, side * 2 * n + spoke, n))
+        prefetch(ground.vertex, 4 * ring_vertex(ring + 1, side * 2 * n + spoke, n))
+        prefetch(ground.top_m, ground.level[1, 1] + (side * ((n_rings + 1) >> 1) + (ring >> 1)) * n + (spoke >> 1))
 
 
 @njit(**WITHOUT_COUNTS)
-def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, moved, disc, depth, normal, angles):
-    """Cast the rays of a tile of the image from `origin` (3,), and a shadow ray from each hit that may be dark.
+def see(ground, rocks, tops, view, tile):
+    """Cast the rays of a tile of the image, and a shadow ray from each hit that may be dark, into the tile's arrays.
 
-    The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2], with z = 1 along the camera's axis.
-    `tops` tells where the rays of a block of pixels begin. `first` is the tile's first row and column. `moved`
-    (S, h, w, 2) has the places of its samples, pixels from the pixel's centre. `disc` (S, h, w, 2) has places on the
-    Sun's disc: a ray there is along the unit vector `sun` (3,) to the centre, plus the place times `plane` (2, 3).
-    Writes for the first sample the depth (inf for a miss) and the unit shading normal into the images `depth` and
-    `normal`. Writes for each sample `angles` (5, S, h, w): mu0, mu, cosine of the phase angle, albedo, and the cosine
-    of incidence of the point of the disc, 0 in shadow.
-    The samples of a pixel come one after another, since they read the same memory.
+    `tops` tells where the rays of a block of pixels begin.
     """
-    n_samples, height, width, _ = moved.shape
+    n_samples, height, width, _ = tile.moved.shape
+    origin, basis, (first_row, first_column) = view.origin, view.basis, tile.first
     near_m = ground.highest_m
-    view, drawn, out = (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles)
     for row in range(0, height, BLOCK_PX):
         for column in range(0, width, BLOCK_PX):
             last_row, last_column = min(row + BLOCK_PX, height), min(column + BLOCK_PX, width)
-            u, v = first[1] + column, first[0] + row
-            last_u, last_v = u + last_column - column, v + last_row - row
-            begin = begin_m(tops, ground, origin, basis, u, last_u, v, last_v)
-            below = -1
+            left, top = first_column + column, first_row + row
+            rectangle = left, left + last_column - column, top, top + last_row - row
+            begin = begin_m(tops, ground, origin, basis, rectangle)
+            part = -1
             if begin < np.inf:
-                below = only_part(ground, origin, basis, u, last_u, v, last_v, begin)
-                # Close rays hit at similar heights, so the last hit says where memory will be read.
+                part = only_part(ground, origin, basis, rectangle, begin)
+                # Close rays hit at similar heights, so the last hit tells where memory will be read.
                 for i in range(row, last_row):
                     for j in range(column, last_column):
                         for s in range(n_samples):
-                            u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
-                            dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
-                            dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
-                            dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
+                            u, v = _coordinates(tile, s, i, j)
+                            dx, dy, dz = _direction(basis, u, v)
                             t = (near_m - origin[2]) / dz
-                            _read_ahead(ground, horizon, origin[0] + t * dx, origin[1] + t * dy)
+                            _read_ahead(ground, view.horizon, origin[0] + t * dx, origin[1] + t * dy)
+            # The samples of a pixel come one after another, since they read the same memory.
             for i in range(row, last_row):
                 for j in range(column, last_column):
                     for s in range(n_samples):
-                        near_m = _see(ground, rocks, horizon, view, drawn, begin, below, first, s, i, j, out)
+                        near_m = _see(ground, rocks, view, tile, _Block(begin, part), (s, i, j))

@@ -1,14 +1,15 @@
 """The ground as arrays for casting rays: heights, vertex normals, albedo, and a pyramid of largest heights.
 
-The mesh is that of Blender (`Grid.quads`, each quad split from its first to its third vertex), in two parts:
+Blender renders the same mesh: `Grid.quads`, each quad split from its first to its third vertex. It has two kinds of
+parts:
 
 - the inner square, a regular grid;
-- four sectors between the rings, one for each side (south y = -d, then x = d, y = d, x = -d). In a sector a place has
+- four sectors between the rings, one for each side (south y = -d, then x = d, y = d, x = -d). In a sector a point has
   two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines
-  d = half_widths[r], and the lines between neighbouring vertices of a ring are along / d = t / n_half - 1.
+  d = half_widths[r], spokes are the lines along / d = s / n_half - 1. They cross at the vertices.
 
 A cell is a quad. Level L of the pyramid, from 1, has the largest height of blocks of 2^L x 2^L cells, with the boulders
-that touch them. The time of a ray is mostly that of reading memory, so a vertex is four numbers side by side.
+that touch them. A ray spends most of its time on reading memory, so the four numbers of a vertex stand side by side.
 """
 
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ _MARGIN_M = 0.01
 
 
 class Ground(NamedTuple):
-    """Arrays of the ground, as arguments of compiled functions: few, since each is passed in eight parts."""
+    """Arrays of the ground, as an argument of compiled functions; few, since each is passed as eight numbers."""
 
     half_widths_m: Array
     """Half-widths of inner square and rings, ascending, metres (R + 1,)."""
@@ -40,7 +41,7 @@ class Ground(NamedTuple):
     """Of each vertex, in the grid's order (V, 4) float32: x and y of its unit normal, O_L; height, metres; albedo,
     negative if boulders touch the cell whose first vertex it is."""
     top_m: np.ndarray
-    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and place, metres: levels from 1
+    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and spoke, metres: levels from 1
     one after another, float32."""
     level: np.ndarray
     """Index in `top_m` at which each level of the inner square and of the sectors begins (2, L + 1) int64; the last
@@ -116,34 +117,34 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
 def _coarser(tops):
     """The largest values of blocks of 2 x 2 of `tops` (sides, rows, columns); fewer at the end of an odd length."""
     n_sides, n_rows, n_columns = tops.shape
-    found = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
+    coarse = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
     for side in range(n_sides):
         for row in range(n_rows):
             for column in range(n_columns):
-                top = found[side, row >> 1, column >> 1]
-                found[side, row >> 1, column >> 1] = max(top, tops[side, row, column])
-    return found
+                top = coarse[side, row >> 1, column >> 1]
+                coarse[side, row >> 1, column >> 1] = max(top, tops[side, row, column])
+    return coarse
 
 
 @njit(inline="always")
-def ring_vertex(ring, place, n):
-    """As `vertex_of_ring` for places up to 8 n, without a division."""
-    if place >= 8 * n:
-        place -= 8 * n
-    return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place if ring > 0 else vertex_of_ring(ring, place, n)
+def ring_vertex(ring, index, n):
+    """As `vertex_of_ring` for indices in the ring up to 8 n, without a division."""
+    if index >= 8 * n:
+        index -= 8 * n
+    return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + index if ring > 0 else vertex_of_ring(ring, index, n)
 
 
 @njit(**INLINED)
-def vertex(part, row, column, k, n):
+def vertex_index(part, row, column, k, n):
     """Index of vertex k (0 to 3, as in `Grid.quads`) of a cell, in the grid's order."""
     if part == 0:
         return (row + (1 if k >= 2 else 0)) * (2 * n + 1) + column + (1 if k == 1 or k == 2 else 0)
-    place = (part - 1) * 2 * n + column + (1 if k >= 2 else 0)
-    return ring_vertex(row + (1 if k == 1 or k == 2 else 0), place, n)
+    index = (part - 1) * 2 * n + column + (1 if k >= 2 else 0)
+    return ring_vertex(row + (1 if k == 1 or k == 2 else 0), index, n)
 
 
 @njit(**INLINED)
-def place_of(part, row, column, k, n, half_widths):
+def vertex_xy(part, row, column, k, n, half_widths):
     """x and y of vertex k of a cell, relative to the grid's centre."""
     if part == 0:
         step = half_widths[0] / n
@@ -165,21 +166,25 @@ def _raise_to_ground(height, n, inner_top, sector_top):
     for j in range(2 * n):
         for i in range(2 * n):
             for k in range(4):
-                inner_top[j, i] = max(inner_top[j, i], height[vertex(0, j, i, k, n)])
+                inner_top[j, i] = max(inner_top[j, i], height[vertex_index(0, j, i, k, n)])
     for side in range(4):
         for ring in range(sector_top.shape[1]):
             for t in range(2 * n):
                 for k in range(4):
-                    top = height[vertex(side + 1, ring, t, k, n)]
+                    top = height[vertex_index(side + 1, ring, t, k, n)]
                     sector_top[side, ring, t] = max(sector_top[side, ring, t], top)
 
 
 @njit()
-def _add_face(part, row, column, n, half_widths, height, points, total):
-    """Add to `total` (V, 3) at each vertex of a cell the normal of its face, weighted by the angle there."""
+def _add_face(cell, n, half_widths, height, points, total):
+    """Add to `total` (V, 3) at each vertex of a cell the normal of its face, weighted by the angle there.
+
+    `cell` is part, row and column; `points` (4, 3) is overwritten.
+    """
+    part, row, column = cell
     for k in range(4):
-        points[k, 0], points[k, 1] = place_of(part, row, column, k, n, half_widths)
-        points[k, 2] = height[vertex(part, row, column, k, n)]
+        points[k, 0], points[k, 1] = vertex_xy(part, row, column, k, n, half_widths)
+        points[k, 2] = height[vertex_index(part, row, column, k, n)]
     ax, ay, az = points[2, 0] - points[0, 0], points[2, 1] - points[0, 1], points[2, 2] - points[0, 2]
     bx, by, bz = points[3, 0] - points[1, 0], points[3, 1] - points[1, 1], points[3, 2] - points[1, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -194,7 +199,7 @@ def _add_face(part, row, column, n, half_widths, height, points, total):
         )
         sides = np.sqrt((ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz))
         angle = np.arccos(min(max((ux * vx + uy * vy + uz * vz) / sides, -1.0), 1.0)) / length
-        at = vertex(part, row, column, k, n)
+        at = vertex_index(part, row, column, k, n)
         total[at, 0] += angle * nx
         total[at, 1] += angle * ny
         total[at, 2] += angle * nz
@@ -206,11 +211,11 @@ def _write_normals(n, half_widths, height, vertices):
     total, points = np.zeros((len(height), 3)), np.empty((4, 3))
     for j in range(2 * n):
         for i in range(2 * n):
-            _add_face(0, j, i, n, half_widths, height, points, total)
+            _add_face((0, j, i), n, half_widths, height, points, total)
     for side in range(4):
         for ring in range(len(half_widths) - 1):
             for t in range(2 * n):
-                _add_face(side + 1, ring, t, n, half_widths, height, points, total)
+                _add_face((side + 1, ring, t), n, half_widths, height, points, total)
     for k in range(len(height)):
         length = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
         vertices[k, 0], vertices[k, 1] = total[k, 0] / length, total[k, 1] / length
@@ -222,8 +227,8 @@ def _mark_rocks(vertices, n, cell_start, n_rings):
     for cell in range(len(cell_start) - 1):
         if cell_start[cell] < cell_start[cell + 1]:
             if cell < 4 * n * n:
-                at = vertex(0, cell // (2 * n), cell % (2 * n), 0, n)
+                at = vertex_index(0, cell // (2 * n), cell % (2 * n), 0, n)
             else:
-                row, place = divmod(cell - 4 * n * n, 2 * n)
-                at = vertex(row // n_rings + 1, row % n_rings, place, 0, n)
+                row, spoke = divmod(cell - 4 * n * n, 2 * n)
+                at = vertex_index(row // n_rings + 1, row % n_rings, spoke, 0, n)
             vertices[at, 3] = -abs(vertices[at, 3])

@@ -12,7 +12,7 @@ from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.lens import camera_of
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
-from perilune_render.server.world import View, World
+from perilune_render.server.simulation import SimulatedScene, View
 from perilune_shared.client import CRATER_COLUMNS
 from perilune_shared.config.errors import expected_of, got_of
 from perilune_shared.config.resolve import Section
@@ -49,7 +49,7 @@ class GroundRequest(_OfScene):
 
 
 class FrameRequest(_OfScene):
-    """A frame; the fields are those of `perilune_shared.client.SceneClient.frame`."""
+    """A frame; `perilune_shared.client.SceneClient.frame` describes the fields."""
 
     request: Literal["frame"]
     position_m: _Three
@@ -87,11 +87,11 @@ _REQUESTS: dict[str, type[Section]] = {
 }
 _LENGTH_TOLERANCE = 0.01
 OF_CONNECTIONS: list[bytes] = []
-"""What `answer` returns for a request that the thread of the connections answers: that of health."""
+"""Returned by `answer` for a request for health, which the thread of the connections answers."""
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
-    """The parts of the reply to a request. Errors are replies too. Called in the thread of the worlds.
+    """The parts of the reply to a request. Errors are replies too. Called in the thread that renders.
 
     If the scene of the request is not in memory, the reply is `"ready": false` without arrays.
     """
@@ -99,12 +99,12 @@ def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
         request = _parsed(content)
         if isinstance(request, HealthRequest):
             return OF_CONNECTIONS
-        world = grounds.world(request.scene, client) if isinstance(request, _OfScene) else grounds.first
-        if world is None:
+        simulated = grounds.simulated(request.scene, client) if isinstance(request, _OfScene) else grounds.first
+        if simulated is None:
             return _reply({"ready": False}, {})
         if isinstance(request, SceneRequest):
             return _reply(_about(grounds), {})
-        return _answer(world, request)
+        return _answer(simulated, request)
     except UserError as error:
         return refusal(str(error))
 
@@ -132,24 +132,24 @@ def _parsed(content: bytes) -> Section:
         raise UserError("request", field, got_of(fault), expected_of(fault)) from None
 
 
-def _answer(world: World, request: Section) -> list[bytes]:
+def _answer(simulated: SimulatedScene, request: Section) -> list[bytes]:
     if isinstance(request, FrameRequest):
-        return _reply({}, _frame(world, request))
+        return _reply({}, _frame(simulated, request))
     if isinstance(request, HeightsRequest):
         if len(request.x_m) != len(request.y_m):
             raise UserError("request", "y_m", f"{len(request.y_m)} numbers", f"{len(request.x_m)}, as x_m")
-        heights = world.heights_m(np.array(request.x_m), np.array(request.y_m), boulders=request.boulders)
+        heights = simulated.heights_m(np.array(request.x_m), np.array(request.y_m), boulders=request.boulders)
         return _reply({}, {"height_m": heights})
     if isinstance(request, CratersRequest):
-        table = ground_tables("scene", world.scene)["craters"]
+        table = ground_tables("scene", simulated.scene)["craters"]
         return _reply({}, {name: table[name].to_numpy() for name in CRATER_COLUMNS})
-    stated = world.config.scene or SceneConfig()
+    stated = simulated.config.scene or SceneConfig()
     about = {
-        "dataset": world.config.name,
+        "dataset": simulated.config.name,
         "sun_azimuth_deg": stated.sun_azimuth_deg,
         "sun_elevation_deg": stated.sun_elevation_deg,
-        "dem_source": world.scene.dem_source,
-        "content_sha256": world.content_sha256,
+        "dem_source": simulated.scene.dem_source,
+        "content_sha256": simulated.content_sha256,
     }
     return _reply({"ready": True, "ground": about}, {})
 
@@ -168,26 +168,26 @@ def _about(grounds: Grounds) -> dict[str, Any]:
     return {"scene": about, "camera": asdict(camera_of(config.camera)), "n_scenes": grounds.n_scenes}
 
 
-def _frame(world: World, request: FrameRequest) -> dict[str, np.ndarray]:
-    """The arrays of a frame: that of `perilune-render frames` for the same pose and index."""
+def _frame(simulated: SimulatedScene, request: FrameRequest) -> dict[str, np.ndarray]:
+    """The arrays of a frame, which equals the frame of `perilune-render frames` for the same pose and index."""
     quaternion = np.array(request.rotation_wxyz)
     length = np.linalg.norm(quaternion)
     if abs(length - 1) > _LENGTH_TOLERANCE:
         raise UserError("request", "rotation_wxyz", f"length {length:.4g}", "a unit quaternion w, x, y, z")
     quaternion = quaternion / length
-    stated = world.config.scene or SceneConfig()
+    stated = simulated.config.scene or SceneConfig()
     sun = sun_direction(*(request.sun_deg or (stated.sun_azimuth_deg, stated.sun_elevation_deg)))
     rotation = matrix_from_quaternion(-quaternion if quaternion[0] < 0 else quaternion)
-    view = View(np.array(request.position_m), rotation, camera_of(world.config.camera), sun)
-    seed, moves = trajectory_seed(world.scene.seed, 0), (request.velocity_mps, request.angular_velocity_radps)
-    frame = world.frame(view, seed, request.index, *(np.array(one) for one in moves))
-    found = {"image": frame.image}
+    view = View(np.array(request.position_m), rotation, camera_of(simulated.config.camera), sun)
+    seed, moves = trajectory_seed(simulated.scene.seed, 0), (request.velocity_mps, request.angular_velocity_radps)
+    frame = simulated.frame(view, seed, request.index, *(np.array(motion) for motion in moves))
+    arrays = {"image": frame.image}
     if request.depth:
-        found |= {"depth_m": frame.radiance.depth_m, "normal": frame.radiance.normal}
+        arrays |= {"depth_m": frame.radiance.depth_m, "normal": frame.radiance.normal}
     if request.labels:
-        table = label_table("frame", world.labels(view, frame)).drop_columns("frame_id")
-        found |= {f"labels.{name}": table[name].to_numpy() for name in table.column_names}
-    return found
+        table = label_table("frame", simulated.labels(view, frame)).drop_columns("frame_id")
+        arrays |= {f"labels.{name}": table[name].to_numpy() for name in table.column_names}
+    return arrays
 
 
 def _reply(head: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[bytes]:

@@ -5,10 +5,11 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from perilune_render.server.connection import Connection, Limits
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.native import zmtp
 from perilune_render.server.native.answers import OF_CONNECTIONS, answer, refusal
-from perilune_render.server.serve import Connection, Interface, Limits, answers
+from perilune_render.server.serve import Interface, answers
 
 MOST_WITHOUT_PLACE = 256
 """Largest number of clients that are connected without a place, to learn that the server is busy."""
@@ -84,15 +85,15 @@ class Native:
     async def _health(self) -> list[bytes]:
         """The interfaces with their addresses, or an error that names the one that does not answer."""
         for each in self.interfaces:
-            place = f"{each.name} at {each.host}:{each.port}"
+            where = f"{each.name} at {each.host}:{each.port}"
             try:
                 async with asyncio.timeout(_HEALTH_S):
                     if not await answers(each):
-                        return refusal(f"{place}: does not answer")
+                        return refusal(f"{where}: does not answer")
             except TimeoutError:
-                return refusal(f"{place}: does not answer in {_HEALTH_S:g} s")
+                return refusal(f"{where}: does not answer in {_HEALTH_S:g} s")
             except (OSError, asyncio.IncompleteReadError) as error:
-                return refusal(f"{place}: does not answer: {error}")
+                return refusal(f"{where}: does not answer: {error}")
         return [
             json.dumps({"interfaces": {each.name: f"{each.host}:{each.port}" for each in self.interfaces}}).encode()
         ]

@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from perilune_render.server.serve import Connection, Dropped
+from perilune_render.server.connection import Connection, Dropped
 
 LARGEST_REQUEST_BYTES = 4_000_000
 """Largest size of one part of a message, bytes."""

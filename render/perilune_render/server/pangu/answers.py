@@ -1,6 +1,6 @@
 """The answer to each message of PANGU's protocol.
 
-`answer` is called in the thread of the world. Errors are answers too.
+`answer` is called in the thread that renders. Errors are answers too.
 """
 
 from collections.abc import Callable
@@ -10,15 +10,6 @@ import numpy as np
 from perilune_render.flight.pose_checks import LARGEST_MPS
 from perilune_render.server.pangu import measures
 from perilune_render.server.pangu import messages as m
-from perilune_render.server.pangu.replies import (
-    FAULTY,
-    REFUSED,
-    doubles,
-    error,
-    float_array,
-    valid_floats,
-    valid_points,
-)
 from perilune_render.server.pangu.session import CAMERAS, Session, check_camera
 from perilune_render.server.pangu.view import (
     camera_from_angles,
@@ -26,7 +17,17 @@ from perilune_render.server.pangu.view import (
     rotation_from_quaternion,
     sun_from_angles,
 )
-from perilune_render.server.pangu.wire import double_bytes, unsigned
+from perilune_render.server.pangu.wire import (
+    FAULTY,
+    REFUSED,
+    double_bytes,
+    doubles,
+    error,
+    float_array,
+    unsigned,
+    valid_floats,
+    valid_points,
+)
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 

@@ -6,11 +6,10 @@ A ray that begins under the surface, and one that hits the back of a facet, hits
 import numpy as np
 
 from perilune_render.server.pangu import messages as m
-from perilune_render.server.pangu.replies import float_array
 from perilune_render.server.pangu.session import Session, check_camera, picture
 from perilune_render.server.pangu.view import rotation_from_quaternion
-from perilune_render.server.pangu.wire import float_bytes, unsigned
-from perilune_render.server.world import World
+from perilune_render.server.pangu.wire import float_array, float_bytes, unsigned
+from perilune_render.server.simulation import SimulatedScene
 from perilune_shared.geometry.frames import Array
 
 RANGE_WIDTH = 256
@@ -18,7 +17,9 @@ RANGE_WIDTH = 256
 _MOST_HEIGHTS = 1_000_000
 
 
-def seen(world: World, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
+def seen(
+    simulated: SimulatedScene, origins_m: Array, directions: Array, *, boulders: bool = True
+) -> tuple[Array, Array]:
     """Distances (N,) and cosines of incidence (N,) of rays from places (1 or N, 3) along directions (N, 3).
 
     Distances are in lengths of the directions; infinite, with cosine 0, where a ray hits nothing. Raises ValueError
@@ -27,24 +28,24 @@ def seen(world: World, origins_m: Array, directions: Array, *, boulders: bool = 
     length = np.linalg.norm(directions, axis=1)
     if (length == 0).any():
         raise ValueError("a direction of length 0")
-    surface_m = world.heights_m(origins_m[:, 0], origins_m[:, 1], boulders=boulders)
+    surface_m = simulated.heights_m(origins_m[:, 0], origins_m[:, 1], boulders=boulders)
     under = origins_m[:, 2] < surface_m  # beside the ground the surface is NaN: not under it
     origins = np.broadcast_to(origins_m, directions.shape)
-    distance, normal = world.hits(origins, directions, boulders=boulders)
+    distance, normal = simulated.hits(origins, directions, boulders=boulders)
     cosine = -np.einsum("ij,ij->i", normal, directions) / length
     front = np.isfinite(distance) & ~under & (cosine > 0)
     return np.where(front, distance, np.inf), np.where(front, cosine, 0.0)
 
 
 def elevations(session: Session, places_m: Array) -> Array:
-    """Heights (N,) of places (N, 3) above the surface below them; infinite where none is."""
-    distance, _ = seen(session.world, places_m, np.tile([0.0, 0.0, -1.0], (len(places_m), 1)))
+    """Heights (N,) of places (N, 3) above the surface below them; infinite without a surface below."""
+    distance, _ = seen(session.simulated, places_m, np.tile([0.0, 0.0, -1.0], (len(places_m), 1)))
     return distance
 
 
 def points(session: Session, directions: Array) -> Array:
-    """Points (N, 3) of the surface seen from the camera in directions (N, 3) of the world; not finite where none is."""
-    distance, _ = seen(session.world, session.position_m[None], directions)
+    """Points (N, 3) of the surface seen from the camera in directions (N, 3) of O_L; not finite without a hit."""
+    distance, _ = seen(session.simulated, session.position_m[None], directions)
     with np.errstate(invalid="ignore"):
         return session.position_m + distance[:, None] * directions
 
@@ -53,22 +54,22 @@ def looked_up(session: Session, places: Array) -> Array:
     """Points (N, 3) in places (N, 2) of the image: (0, 0) is its bottom left corner, (1, 1) the top right one."""
     view = session.view()
     pixels = np.stack([places[:, 0] * session.width_px, (1 - places[:, 1]) * session.height_px], axis=1)
-    found = points(session, view.camera.rays(pixels) @ view.rotation_camera_from_site)
+    hits = points(session, view.camera.rays(pixels) @ view.rotation_camera_from_site)
     outside = ((places < 0) | (places > 1)).any(axis=1)
-    return np.where(outside[:, None], np.inf, found)
+    return np.where(outside[:, None], np.inf, hits)
 
 
 def pulse(session: Session, values: list, items: object) -> bytes:
     """Answer to GetLidarPulseResult: range and cosine of incidence, both 0 for a miss."""
     origin, direction = np.array([values[:3]]), np.array([values[3:]])
-    distance, cosine = seen(session.world, origin, direction)
+    distance, cosine = seen(session.simulated, origin, direction)
     range_m = distance[0] * np.linalg.norm(direction) if np.isfinite(distance[0]) else 0.0
     return unsigned(m.LIDAR_PULSE) + float_bytes([range_m, cosine[0]])
 
 
 def surface(session: Session, boulders: bool, places_m: Array) -> Array:
     """Heights (N,) of the surface in places (N, 2); NaN off the ground."""
-    return session.world.heights_m(places_m[:, 0], places_m[:, 1], boulders=boulders)
+    return session.simulated.heights_m(places_m[:, 0], places_m[:, 1], boulders=boulders)
 
 
 def _grid(nx: int, ny: int, dx: float, dy: float) -> tuple[Array, Array]:
@@ -84,8 +85,8 @@ def patch(session: Session, values: list, items: object) -> bytes:
     boulders, cx, cy, nx, ny, spacing, angle = values
     x, y = _grid(nx, ny, spacing, spacing)
     c, s = np.cos(angle), np.sin(angle)
-    places = np.stack([cx + c * x - s * y, cy + s * x + c * y], axis=-1).reshape(-1, 2)
-    return float_array(surface(session, boulders, places))
+    grid = np.stack([cx + c * x - s * y, cy + s * x + c * y], axis=-1).reshape(-1, 2)
+    return float_array(surface(session, boulders, grid))
 
 
 def view_as_dem(session: Session, values: list, items: object) -> bytes:
@@ -96,7 +97,7 @@ def view_as_dem(session: Session, values: list, items: object) -> bytes:
     x, y = _grid(nx, ny, dx, -dy)
     across, down, forward = session.rotation_camera_from_site
     origins = session.position_m + x[..., None] * across - y[..., None] * down
-    distance, _ = seen(session.world, origins.reshape(-1, 3), np.tile(forward, (nx * ny, 1)), boulders=boulders)
+    distance, _ = seen(session.simulated, origins.reshape(-1, 3), np.tile(forward, (nx * ny, 1)), boulders=boulders)
     return float_array(reference - distance)
 
 
@@ -104,7 +105,7 @@ def range_image(session: Session, values: list, items: object) -> bytes:
     """Answer to GetRangeImage."""
     offset, scale = values
     view = session.view()
-    depth_m = session.world.radiance(view).depth_m
+    depth_m = session.simulated.radiance(view).depth_m
     ranges = depth_m * np.linalg.norm(view.camera.rays(view.camera.pixel_centres()), axis=-1)
     share = np.clip((ranges - offset) * scale, 0, 1) if scale else np.zeros_like(ranges)
     return picture(np.floor(share * (RANGE_WIDTH - 1) + 0.5).astype(np.uint8))
@@ -119,11 +120,11 @@ def snapshot(session: Session, values: list, items: object) -> bytes:
     """Answer to GetLidarSnapshot. Raises UserError if the camera is not above the surface."""
     check_camera(values[0])
     position, rotation = np.array(values[1:4]), rotation_from_quaternion(np.array(values[4:]))
-    session.world.check(position)
+    session.simulated.check(position)
     camera = session.view().camera
     rays = camera.rays(camera.pixel_centres()).reshape(-1, 3) @ rotation
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    distance, cosine = seen(session.world, position[None], rays)
+    distance, cosine = seen(session.simulated, position[None], rays)
     hit = np.isfinite(distance)
     data = np.stack([np.where(hit, distance, 0.0), cosine, hit], axis=1).astype(">f4").tobytes()
     return unsigned(m.RAW_IMAGE, 0, 0, camera.width_px, camera.height_px, len(data)) + data

@@ -42,7 +42,7 @@ FIRST_SETTING = 256
 
 _SCAN = "the scans of a lidar are not simulated"
 _NO_OBJECT = "there are no moving objects"
-_LIGHT = "has no effect: the Sun is the only light, and its radiance is that of the configuration"
+_LIGHT = "has no effect: the Sun is the only light, and the configuration sets its radiance"
 _SKY = "has no effect: the sky is black"
 
 _ALL = (
@@ -79,7 +79,7 @@ _ALL = (
     Message(30, "GetViewpointByCamera", "u", note="image of camera 0 or 1; of size 0 for others"),
     Message(31, "GetViewAsDEM", "ub2u3f", note="heights towards the camera on a grid across its axis"),
     Message(32, "GetLidarMeasurementD", "25d", effect="refused", note=_SCAN),
-    Message(33, "GetTimeTag", "", note="when the last image that was sent had been asked for"),
+    Message(33, "GetTimeTag", "", note="time of the request for the last image that was sent"),
     Message(34, "GetLidarMeasurementS", "25f", effect="refused", note=_SCAN),
     Message(35, "GetLidarSnapshot", "u7d", note="range, cosine of incidence and hit of each pixel"),
     Message(256, "SetViewpointByDegreesS", "6f"),

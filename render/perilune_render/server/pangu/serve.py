@@ -7,12 +7,21 @@ from collections.abc import Callable
 
 import numpy as np
 
+from perilune_render.server.connection import Connection
 from perilune_render.server.pangu import messages as m
 from perilune_render.server.pangu.answers import answer
-from perilune_render.server.pangu.replies import FAULTY, REFUSED, error
 from perilune_render.server.pangu.session import Session
-from perilune_render.server.pangu.wire import doubles_from, expanded, floats_from, read_fields, size_of, unsigned
-from perilune_render.server.serve import Connection
+from perilune_render.server.pangu.wire import (
+    FAULTY,
+    REFUSED,
+    doubles_from,
+    error,
+    expanded,
+    floats_from,
+    read_fields,
+    size_of,
+    unsigned,
+)
 
 _MAJOR, _LARGEST_MINOR = divmod(m.VERSION, 256)
 

@@ -7,7 +7,7 @@ import numpy as np
 from perilune_render.server.pangu import messages as m
 from perilune_render.server.pangu.view import RollSense, SunZero, camera_from_angles, rotation_from_angles
 from perilune_render.server.pangu.wire import unsigned
-from perilune_render.server.world import View, World
+from perilune_render.server.simulation import SimulatedScene, View
 from perilune_shared.geometry.frames import Array
 
 CAMERAS = (0, 1)
@@ -31,7 +31,7 @@ class Conventions:
 class Session:
     """State of one client."""
 
-    world: World
+    simulated: SimulatedScene
     """The scene."""
     width_px: int
     """Width of all images, pixels."""
@@ -56,9 +56,9 @@ class Session:
     n_images: int = 0
     """Number of images so far: the index of the next one's noise."""
     asked_us: float = 0.0
-    """When the present message had arrived, microseconds since 1970."""
+    """Time at which the current message arrived, microseconds since 1970."""
     time_tag_us: float | None = None
-    """When the last image that was sent had been asked for, microseconds since 1970; None before the first."""
+    """Time of the request for the last image that was sent, microseconds since 1970; None before the first."""
 
     def view(self) -> View:
         """The current view."""
@@ -67,10 +67,10 @@ class Session:
 
     def image(self) -> bytes:
         """The image of the current view, as a message."""
-        frame = self.world.frame(self.view(), self.seed, self.n_images, self.velocity_mps)
+        frame = self.simulated.frame(self.view(), self.seed, self.n_images, self.velocity_mps)
         self.n_images += 1
         self.time_tag_us = self.asked_us
-        grey = frame.image if frame.image.dtype == np.uint8 else frame.image >> (self.world.config.sensor.bits - 8)
+        grey = frame.image if frame.image.dtype == np.uint8 else frame.image >> (self.simulated.config.sensor.bits - 8)
         return picture(grey.astype(np.uint8))
 
 

@@ -1,13 +1,17 @@
-"""Numbers and texts of PANGU's wire protocol 1.20, which are not those of IEEE 754 or of C.
+"""Bytes of PANGU's protocol 1.20: numbers, texts, errors, and numbers that may be invalid.
 
-Integers have 32 bits, most significant byte first. A float is the word of IEEE 754 rotated left by 9 bits, so that the
-fraction is on top, then the sign, then the exponent. A double is the same with 12 bits, sent with its low half first.
+The formats are neither those of IEEE 754 nor those of C. Integers have 32 bits, most significant byte first. A float is
+the word of IEEE 754 rotated left by 9 bits: the fraction is on top, then the sign, then the exponent. A double is
+rotated by 12 bits and sent with its low half first.
 """
 
 import struct
 from collections.abc import Sequence
 
 import numpy as np
+
+from perilune_render.server.pangu import messages as m
+from perilune_shared.geometry.frames import Array
 
 SIZES = {"u": 4, "i": 4, "b": 1, "f": 4, "d": 8}
 """Bytes of each type: unsigned and signed integer, bool, float, double."""
@@ -79,15 +83,49 @@ def read_fields(layout: str, data: bytes) -> list[float | int | bool]:
 
 def expanded(layout: str) -> str:
     """A layout with each type written out, "u3f" as "ufff"."""
-    found, digits = "", ""
+    letters, digits = "", ""
     for letter in layout:
         if letter.isdigit():
             digits += letter
         else:
-            found, digits = found + letter * int(digits or 1), ""
-    return found
+            letters, digits = letters + letter * int(digits or 1), ""
+    return letters
 
 
 def size_of(layout: str) -> int:
     """Number of bytes of a layout."""
     return sum(SIZES[kind] for kind in expanded(layout))
+
+
+REFUSED, FAULTY = 1, 2
+"""Codes of errors: a request that this server does not serve, and one with impossible values."""
+
+
+def error(code: int, text: str) -> bytes:
+    """An error as a message."""
+    return unsigned(m.ERROR, code) + text_bytes(text[:900] or "error")
+
+
+def valid_floats(values: Array) -> bytes:
+    """Floats, each with a bool that says whether it is valid (finite)."""
+    good = np.isfinite(values)
+    words = float_bytes(np.where(good, values, 0.0))
+    return b"".join(words[4 * k : 4 * k + 4] + (b"\1" if good[k] else b"\0") for k in range(len(values)))
+
+
+def valid_points(points: Array) -> bytes:
+    """Points (N, 3), each with a bool that says whether it is valid (finite)."""
+    good = np.isfinite(points).all(axis=1)
+    words = float_bytes(np.where(good[:, None], points, 0.0).ravel())
+    return b"".join(words[12 * k : 12 * k + 12] + (b"\1" if good[k] else b"\0") for k in range(len(points)))
+
+
+def doubles(values: Array, *, valid: bool) -> bytes:
+    """Doubles (N,), each with a bool that says whether it is valid: `valid` for all."""
+    words = double_bytes(values)
+    return b"".join(words[8 * k : 8 * k + 8] + (b"\1" if valid else b"\0") for k in range(len(values)))
+
+
+def float_array(values: Array) -> bytes:
+    """Floats (N,) as a message; those that are not finite are invalid."""
+    return unsigned(m.FLOAT_ARRAY, len(values)) + valid_floats(values)

@@ -6,9 +6,19 @@ import numpy as np
 
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.craters.profile import REACH
+from perilune_shared.geometry.frames import Array
 
 _PLANE_REACH = 1.3
 """Radius of the ground that the plane is fitted to, fresh crater radii."""
+
+
+class Window(NamedTuple):
+    """The vertices around a crater."""
+
+    lines: Array
+    """Lines of vertices, as `perilune_render.terrain.grid.lines_in` writes them (at least `n_lines`, 7)."""
+    n_lines: int
+    """Number of lines that are used."""
 
 
 class _Plane(NamedTuple):
@@ -27,13 +37,13 @@ class _Plane(NamedTuple):
 
 
 @njit(inline="always")
-def _fit_plane(height, x, y, radius, lines, count):
+def _fit_plane(height, x, y, radius, window):
     """Least-squares plane of the ground around (x, y); returns whether it has enough vertices, and the plane."""
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
     square_r = radius**2
-    for line in range(count):
-        dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x, y, _PLANE_REACH * radius)
+    for line in range(window.n_lines):
+        dx, dy, step_x, step_y, first, start, stop = _chord(window.lines, line, x, y, _PLANE_REACH * radius)
         for p in range(start, stop):
             px, py = dx + p * step_x, dy + p * step_y
             square = px * px + py * py

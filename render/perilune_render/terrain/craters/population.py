@@ -97,14 +97,15 @@ class Craters:
         fresh_depth_m: Array,
         age_myr: Array,
         wear_m2: Array,
-        profile: str = "fassett_thomson",
-        origin: str = "primary",
     ) -> "Craters":
-        """Circular craters with bowl-shaped floors, in the given order; arrays (N,)."""
+        """Circular primary craters with bowl-shaped floors and rims of Fassett & Thomson, in the given order.
+
+        The arrays (N,) are the fields of these names.
+        """
         n = len(x_m)
-        rim = fresh_rim_height_m(diameter_m, fresh_depth_m, profile)
+        rim = fresh_rim_height_m(diameter_m, fresh_depth_m)
         even = np.zeros((n, 6))
-        kind = np.full(n, ORIGINS.index(origin))
+        kind = np.full(n, ORIGINS.index("primary"))
         not_flat = np.zeros(n, bool)
         unknown = [np.full(n, np.nan) for _ in range(3)]
         return cls(
@@ -146,7 +147,8 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     age = rng.random(n) * oldest
     fresh = fresh_depth_m(diameter, config.depth)
     depth = np.maximum(fresh + 0.02 * diameter * np.clip(rng.normal(size=n), -2, 2), 0.08 * diameter)
-    x, y, age, clustered = _cluster(x, y, age, oldest, diameter, reach, config.secondary_share, rng)
+    single = _Single(x, y, diameter, age, oldest, reach)
+    x, y, age, clustered = _clustered(single, config.secondary_share, rng)
     flat_floor = rng.random(n) < config.flat_floor_share
     # Secondaries (slow impacts) and craters with floors of rock are shallower; the factor is our choice.
     depth = np.where(clustered | flat_floor, 0.75 * depth, depth)
@@ -190,22 +192,32 @@ def check_craters(config: CratersConfig, grid: Grid) -> None:
         raise UserError("dataset.terrain.craters", "number", f"about {number:.3g} in a scene", expected)
 
 
-def _cluster(
-    x: Array,
-    y: Array,
-    age: Array,
-    oldest: Array,
-    diameter: Array,
-    reach: Array,
-    share: float,
-    rng: np.random.Generator,
-) -> tuple[Array, Array, Array, np.ndarray]:
-    """Move a share of the small craters into elongated clusters like those of secondaries, each of a single age.
+@dataclass(frozen=True, slots=True)
+class _Single:
+    """N craters that are drawn one by one."""
+
+    x_m: Array
+    """x of the centres, O_L, metres (N,)."""
+    y_m: Array
+    """y of the centres, O_L, metres (N,)."""
+    diameter_m: Array
+    """Diameters, metres (N,)."""
+    age_myr: Array
+    """Ages, Myr (N,)."""
+    oldest_myr: Array
+    """Largest age at which a crater of this size is visible, Myr (N,)."""
+    reach_m: Array
+    """Half-width of the ground that is fine enough for each crater, metres (N,)."""
+
+
+def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple[Array, Array, Array, np.ndarray]:
+    """Move a share of the small craters into elongated clusters, as secondaries form them, each of a single age.
 
     Returns x, y, age and whether each crater was moved (N,). The size-frequency law does not change. We chose sizes and
     shapes of the clusters by eye, by comparison with NAC images. A crater that would leave the part of the grid that is
     fine enough for it is not moved.
     """
+    x, y, age, diameter = single.x_m, single.y_m, single.age_myr, single.diameter_m
     chosen = np.flatnonzero((rng.random(len(x)) < share) & (diameter < _LARGEST_SECONDARY_M))
     clustered = np.zeros(len(x), bool)
     if not len(chosen):
@@ -221,12 +233,12 @@ def _cluster(
     cos, sin = np.cos(heading)[cluster], np.sin(heading)[cluster]
     new_x = x[chosen[first]][cluster] + along * cos - across * sin
     new_y = y[chosen[first]][cluster] + along * sin + across * cos
-    inside = np.maximum(np.abs(new_x), np.abs(new_y)) < reach[chosen]
+    inside = np.maximum(np.abs(new_x), np.abs(new_y)) < single.reach_m[chosen]
     moved = chosen[inside]
     x, y, age = x.copy(), y.copy(), age.copy()
     x[moved], y[moved] = new_x[inside], new_y[inside]
     # All craters of a cluster have one age, at which each of them is still visible.
-    youngest = np.minimum.reduceat(oldest[chosen], first) * rng.random(n_clusters)
+    youngest = np.minimum.reduceat(single.oldest_myr[chosen], first) * rng.random(n_clusters)
     age[moved] = youngest[cluster][inside]
     clustered[moved] = True
     return x, y, age, clustered

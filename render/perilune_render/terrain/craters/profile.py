@@ -23,7 +23,7 @@ label's circle.
 
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -64,12 +64,12 @@ def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
     """Fresh rim and ejecta at x = r/R, relative to the crest's height; 1 inside the crest."""
     x = np.asarray(x, np.float64)
     if profile == "pangu":
-        flank = _cubic(x, 1.0, 1.5, 1.0, 0.0, 1.5**-3, -3 * 1.5**-4)
-        far = _cubic(x, 2.2, REACH, 2.2**-3, -3 * 2.2**-4, 0.0, 0.0)
+        flank = _cubic(x, _End(1.0, 1.0, 0.0), _End(1.5, 1.5**-3, -3 * 1.5**-4))
+        far = _cubic(x, _End(2.2, 2.2**-3, -3 * 2.2**-4), _End(REACH, 0.0, 0.0))
         return np.select([x <= 1, x < 1.5, x < 2.2, x < REACH], [np.ones_like(x), flank, np.maximum(x, 1) ** -3.0, far])
     scale = 1 / _outer(1.02)
-    flank = _cubic(x, 1.0, 1.08, 1.0, 0.0, scale * _outer(1.08), scale * _outer_slope(1.08))
-    tail = _cubic(x, 1.4, 1.6, scale * _outer(1.4), scale * _outer_slope(1.4), 0.0, 0.0)
+    flank = _cubic(x, _End(1.0, 1.0, 0.0), _End(1.08, scale * _outer(1.08), scale * _outer_slope(1.08)))
+    tail = _cubic(x, _End(1.4, scale * _outer(1.4), scale * _outer_slope(1.4)), _End(1.6, 0.0, 0.0))
     return np.select([x <= 1, x < 1.08, x < 1.4, x < 1.6], [np.ones_like(x), flank, scale * _outer(x), tail])
 
 
@@ -83,7 +83,8 @@ def fresh_bowl(x: Array, profile: str = "fassett_thomson", *, flat: bool = False
     value, after = (
         float(-_depth_below_crest(np.array([at]), profile, flat)[0] / deepest[0]) for at in (edge, edge + step)
     )
-    return np.select([x < edge, x < 1], [inside, _cubic(x, edge, 1.0, value, (after - value) / step, 0.0, 0.0)])
+    lip = _cubic(x, _End(edge, value, (after - value) / step), _End(1.0, 0.0, 0.0))
+    return np.select([x < edge, x < 1], [inside, lip])
 
 
 def _outer(x: Any) -> Any:
@@ -94,15 +95,26 @@ def _outer_slope(x: float) -> float:
     return -0.187050452 + 2 * 0.01844746 * x + 3 * 0.01505647 * x**2
 
 
-def _cubic(x: Array, low: float, high: float, y0: float, slope0: float, y1: float, slope1: float) -> Array:
-    """The Hermite cubic with the given values and slopes at both ends."""
-    width = high - low
-    t = np.clip((x - low) / width, 0, 1)
+class _End(NamedTuple):
+    """One end of a cubic."""
+
+    x: float
+    """Distance from the crater's centre, radii."""
+    value: float
+    """Value there."""
+    slope: float
+    """Slope there."""
+
+
+def _cubic(x: Array, low: _End, high: _End) -> Array:
+    """The Hermite cubic with the given values and slopes at both ends; constant beyond them."""
+    width = high.x - low.x
+    t = np.clip((x - low.x) / width, 0, 1)
     return (
-        (2 * t**3 - 3 * t**2 + 1) * y0
-        + (t**3 - 2 * t**2 + t) * width * slope0
-        + (3 * t**2 - 2 * t**3) * y1
-        + (t**3 - t**2) * width * slope1
+        (2 * t**3 - 3 * t**2 + 1) * low.value
+        + (t**3 - 2 * t**2 + t) * width * low.slope
+        + (3 * t**2 - 2 * t**3) * high.value
+        + (t**3 - t**2) * width * high.slope
     )
 
 
@@ -182,7 +194,7 @@ def profile_tables(profile: str = "fassett_thomson") -> ProfileTables:
         rim,
         bowl,
         worn(fresh_bowl(x, profile, flat=True)),
-        worn(_cubic(x, 1.0, 1.2, 1.0, 0.0, 0.0, 0.0)),
+        worn(_cubic(x, _End(1.0, 1.0, 0.0), _End(1.2, 0.0, 0.0))),
         _crests(columns, rim, bowl),
     )
 

@@ -27,7 +27,7 @@ def indices_of(crater_ids: Sequence[int], n_real: int, n_craters: int, seed: int
 
 def near(x_m: Array | float, y_m: Array | float, removed: Craters) -> np.ndarray:
     """Whether places (N,) on O_L's plane, metres, are within REACH_RADII of one of the removed craters."""
-    found = np.zeros(np.shape(x_m), bool)
+    within = np.zeros(np.shape(x_m), bool)
     for x, y, diameter in zip(removed.x_m, removed.y_m, removed.diameter_m, strict=True):
-        found |= np.square(x_m - x) + np.square(y_m - y) <= (REACH_RADII * diameter / 2) ** 2
-    return found
+        within |= np.square(x_m - x) + np.square(y_m - y) <= (REACH_RADII * diameter / 2) ** 2
+    return within

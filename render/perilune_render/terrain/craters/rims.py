@@ -21,7 +21,7 @@ class Rims:
     normal: Array
     """Unit normal of the plane through the rim, O_L (N, 3)."""
     depth_m: Array
-    """Mean height of the rim minus that of the inner fifth and `Stamped.sag_m`, at least 0, metres (N,)."""
+    """Mean height of the rim, minus mean height of the inner fifth, minus `Stamped.sag_m`; at least 0, metres (N,)."""
 
 
 def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:

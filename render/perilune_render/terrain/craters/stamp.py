@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from perilune_render.provenance.kernels import njit
-from perilune_render.terrain.craters.older_ground import _chord, _fit_plane, _sag
+from perilune_render.terrain.craters.older_ground import Window, _chord, _fit_plane, _sag
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.craters.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_of_ring
@@ -92,6 +92,19 @@ class _Profile(NamedTuple):
     """Share of the older ground that is removed (n_x,)."""
 
 
+class _RimSamples(NamedTuple):
+    """Points at which the survival of the rims is sampled: _N_RIM of each of N craters."""
+
+    cos: Array
+    """Cosines of their directions from the centre (_N_RIM,)."""
+    sin: Array
+    """Sines of their directions (_N_RIM,)."""
+    vertex: np.ndarray
+    """Nearest vertex, -1 outside the grid (N, _N_RIM)."""
+    before: Array
+    """`_Ground.log_left` there when the rim was new (N, _N_RIM)."""
+
+
 def stamp_craters(
     height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array, profile: str = "fassett_thomson"
 ) -> Stamped:
@@ -131,20 +144,19 @@ def _stamp(ground, shapes, tables):
     lines = np.empty((2 * ground.n_half + 1 + 4 * len(ground.half_widths), 7))
     sag = np.zeros(n)
     angle = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
-    circle = np.cos(angle), np.sin(angle)
-    rim_vertex = np.full((n, _N_RIM), -1)
-    rim_before = np.zeros((n, _N_RIM))
+    rims = _RimSamples(np.cos(angle), np.sin(angle), np.full((n, _N_RIM), -1), np.zeros((n, _N_RIM)))
     for k in range(n):
         _interpolate_profile(shapes, k, tables, profile)
         x, y, reach = shapes.x[k], shapes.y[k], REACH * shapes.radius[k]
-        count = lines_in(x - reach, x + reach, y - reach, y + reach, ground.n_half, ground.half_widths, lines)
-        found, plane = _fit_plane(ground.height, x, y, shapes.radius[k], lines, count)
-        if not found:
+        bounds = x - reach, x + reach, y - reach, y + reach
+        window = Window(lines, lines_in(bounds, ground.n_half, ground.half_widths, lines))
+        fits, plane = _fit_plane(ground.height, x, y, shapes.radius[k], window)
+        if not fits:
             continue
         sag[k] = _sag(plane, profile.removed)
-        _stamp_one(ground, shapes, k, profile, plane, lines, count)
-        _sample_rim(ground, x, y, shapes.label_radius[k], circle, k, rim_vertex, rim_before)
-    return sag, _rims_left(ground.log_left, rim_vertex, rim_before)
+        _stamp_one(ground, shapes, k, profile, plane, window)
+        _sample_rim(ground, shapes, k, rims)
+    return sag, _rims_left(ground.log_left, rims)
 
 
 @njit(inline="always")
@@ -162,16 +174,16 @@ def _interpolate_profile(shapes, k, tables, profile):
 
 
 @njit(inline="always")
-def _stamp_one(ground, shapes, k, profile, plane, lines, count):
-    """Stamp crater `k` on its window of the ground, `count` lines of vertices."""
+def _stamp_one(ground, shapes, k, profile, plane, window):
+    """Stamp crater `k` on its window of the ground."""
     x, y, radius, brightness = shapes.x[k], shapes.y[k], shapes.radius[k], shapes.brightness[k]
     outline, crest = shapes.outline[k], shapes.crest[k]
     height, albedo, log_left = ground.height, ground.albedo, ground.log_left
     own_rim, own_bowl, removed = profile
     columns = len(own_rim)
     per_radius = (columns - 1) / REACH
-    for line in range(count):
-        dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x, y, REACH * radius)
+    for line in range(window.n_lines):
+        dx, dy, step_x, step_y, first, start, stop = _chord(window.lines, line, x, y, REACH * radius)
         for p in range(start, stop):
             px, py = dx + p * step_x, dy + p * step_y
             distance = np.sqrt(px * px + py * py)
@@ -216,25 +228,26 @@ def _irregularity(px, py, distance, outline, crest):
 
 
 @njit(inline="always")
-def _sample_rim(ground, x, y, radius, circle, k, rim_vertex, rim_before):
-    """Write the vertices nearest to points of a new rim, -1 outside the grid, and their `log_left`, into row `k`."""
+def _sample_rim(ground, shapes, k, rims):
+    """Write the samples of the new rim of crater `k` into `rims`."""
+    x, y, radius = shapes.x[k], shapes.y[k], shapes.label_radius[k]
     for p in range(_N_RIM):
-        vertex = _nearest(x + radius * circle[0][p], y + radius * circle[1][p], ground.n_half, ground.half_widths)
-        rim_vertex[k, p] = vertex
+        vertex = _nearest(x + radius * rims.cos[p], y + radius * rims.sin[p], ground.n_half, ground.half_widths)
+        rims.vertex[k, p] = vertex
         if vertex >= 0:
-            rim_before[k, p] = ground.log_left[vertex]
+            rims.before[k, p] = ground.log_left[vertex]
 
 
 @njit()
-def _rims_left(log_left, rim_vertex, rim_before):
-    """`Stamped.rim_left` from the sampled rims (N, _N_RIM); 1 for a rim outside the grid."""
-    rim_left = np.ones(len(rim_vertex))
-    for k in range(len(rim_vertex)):
+def _rims_left(log_left, rims):
+    """`Stamped.rim_left` from the sampled rims; 1 for a rim outside the grid."""
+    rim_left = np.ones(len(rims.vertex))
+    for k in range(len(rims.vertex)):
         total = on_grid = 0.0
         for p in range(_N_RIM):
-            if rim_vertex[k, p] >= 0:
+            if rims.vertex[k, p] >= 0:
                 on_grid += 1.0
-                total += np.exp(log_left[rim_vertex[k, p]] - rim_before[k, p])
+                total += np.exp(log_left[rims.vertex[k, p]] - rims.before[k, p])
         if on_grid > 0:
             rim_left[k] = total / on_grid
     return rim_left
@@ -242,7 +255,7 @@ def _rims_left(log_left, rim_vertex, rim_before):
 
 @njit()
 def _nearest(x, y, n_half, half_widths):
-    """Index of a vertex near a place, or -1 outside the grid."""
+    """Index of a vertex near (x, y), or -1 outside the grid."""
     n = n_half
     distance = max(abs(x), abs(y))
     if distance > half_widths[-1]:

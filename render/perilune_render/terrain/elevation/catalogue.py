@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from perilune_render.config.terrain import CatalogueColumnsConfig, TerrainConfig
-from perilune_render.terrain.craters.population import Craters
+from perilune_render.terrain.craters.population import ORIGINS, Craters
+from perilune_render.terrain.craters.profile import fresh_rim_height_m
 from perilune_render.terrain.elevation.crests import measure_crests
 from perilune_render.terrain.elevation.model import ElevationModel, raster_places, resolved_m
 from perilune_render.terrain.grid import Grid
@@ -38,7 +39,7 @@ class Counts:
     """They repeat another crater."""
 
     def __str__(self) -> str:
-        """Return the counts as text, those of craters that are not used only where there are some."""
+        """Return the counts as text; counts of unused craters are omitted if they are 0."""
         others = {
             "outside the ground": self.outside,
             "outside the model or in its holes": self.unmeasured,
@@ -109,15 +110,10 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
         raise _nothing_used(path, listed, counts, smallest_m)
     order = np.flatnonzero(kept)[np.argsort(-diameter[kept], kind="stable")]
     unknown = np.full(len(order), np.nan)
-    craters = Craters.round(
-        x[order],
-        y[order],
-        diameter[order],
-        unknown,
-        unknown,
-        np.zeros(len(order)),
-        config.craters.profile,
-        "elevation model",
+    craters = replace(
+        Craters.round(x[order], y[order], diameter[order], unknown, unknown, np.zeros(len(order))),
+        rim_height_m=fresh_rim_height_m(diameter[order], unknown, config.craters.profile),
+        origin=np.full(len(order), ORIGINS.index("elevation model")),
     )
     if config.elevation.rims == "measured":
         craters = replace(

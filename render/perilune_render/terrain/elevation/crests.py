@@ -37,7 +37,7 @@ _CHUNK = 256
 
 @dataclass(frozen=True, slots=True)
 class Crests:
-    """Rims of N craters as they lie in the model; NaN where no crest was found."""
+    """Rims of N craters in the model; NaN where no crest was found."""
 
     x_m: Array
     """x of the centres of the ellipses, O_L, metres (N,)."""
@@ -58,22 +58,22 @@ class Crests:
 
 def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> Crests:
     """Measure the crests of craters at places (N,) of O_L with catalogued diameters (N,)."""
-    found = np.full((5, len(x_m)), np.nan)
+    measured = np.full((5, len(x_m)), np.nan)
     large = np.flatnonzero(diameter_m >= LEAST_PIXELS * model.pixel_m)
     for start in range(0, len(large), _CHUNK):
-        own = large[start : start + _CHUNK]
-        radius = diameter_m[own] / 2
-        x, y, scale = x_m[own], y_m[own], radius
+        chunk = large[start : start + _CHUNK]
+        radius = diameter_m[chunk] / 2
+        x, y, scale = x_m[chunk], y_m[chunk], radius
         # The second pass is centred on the first's ellipse, and sized by it.
         for _ in range(2):
             fit = _fit(model, x, y, scale)
             x, y, scale = fit.x_m, fit.y_m, fit.radius_m
-        shift = np.hypot(x - x_m[own], y - y_m[own]) / radius
+        shift = np.hypot(x - x_m[chunk], y - y_m[chunk]) / radius
         growth = scale / radius
         good = fit.good & (shift <= _LARGEST_SHIFT) & (growth > _NEAR) & (growth < _FAR)
         rows = np.stack([x, y, 2 * scale, fit.rms_share, fit.axis_ratio])
-        found[:, own] = np.where(good, rows, np.nan)
-    return Crests(*found)
+        measured[:, chunk] = np.where(good, rows, np.nan)
+    return Crests(*measured)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ def _cubic(height_m: Array, row: Array, column: Array) -> Array:
 
 
 def _weights(t: Array) -> list[Array]:
-    """Weights of the pixels before, at, after and two after a place that lies `t` pixels after one."""
+    """Weights of the four nearest pixels along an axis for a point `t` pixels after the second of them."""
     return [
         0.5 * t * (-1 + t * (2 - t)),
         1 + t * t * (-2.5 + 1.5 * t),

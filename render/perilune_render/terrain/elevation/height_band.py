@@ -1,4 +1,4 @@
-"""The heights of a raster file: which band has them, their unit, and the values that are no heights."""
+"""The heights of a raster file: which band has them, their unit, and the values that mark missing heights."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ class HeightBand:
 
     @property
     def exact(self) -> bool:
-        """Whether values may not be averaged, since some mean that there is no height."""
+        """Whether values must not be averaged, since some of them mark pixels without a height."""
         return self.nodata is not None or self.special
 
     def read(self, window: Any, shape: tuple[int, int]) -> Array:
-        """Heights (rows, columns) of a window in the file's unit, NaN where there is none; see `in_metres`."""
+        """Heights (rows, columns) of a window in the file's unit, NaN without a height; see `in_metres`."""
         from rasterio.enums import Resampling
 
-        way = Resampling.nearest if self.exact else Resampling.average
-        raw = self.raster.read(self.index, window=window, out_shape=shape, resampling=way, masked=True)
+        method = Resampling.nearest if self.exact else Resampling.average
+        raw = self.raster.read(self.index, window=window, out_shape=shape, resampling=method, masked=True)
         values = raw.data
         height = raw.astype(np.float64).filled(np.nan)
         if self.nodata is not None:

@@ -113,9 +113,9 @@ def read_elevation(
         site = Site(*raster_map.middle, site.latitude_deg, site.longitude_deg)
         sides = _pixel_sides_m(raster_map, site)
     hole = distance_in_holes_m(known, sides)
-    place, pixel = (site.latitude_deg, site.longitude_deg), float(np.mean(sides))
+    site_deg, pixel = (site.latitude_deg, site.longitude_deg), float(np.mean(sides))
     return ElevationModel(
-        height, known, raster_map, *place, pixel, sides, step, window.step, hole, _source_of(files, used)
+        height, known, raster_map, *site_deg, pixel, sides, step, window.step, hole, _source_of(files, used)
     )
 
 
@@ -147,7 +147,7 @@ def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array,
 def height_of_site_m(model: ElevationModel) -> float:
     """Height of the site above the sphere of MOON_RADIUS_M in the model, metres.
 
-    Heights of more than half this radius are taken for radii.
+    Heights of more than half this radius are read as radii.
     """
     column, row = raster_places(model, np.zeros(1), np.zeros(1))
     height = float(ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")[0])
@@ -171,7 +171,7 @@ def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
 
 
 def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
-    """Raises UserError if `outside` is "refuse" and the ground extends beyond the model's raster."""
+    """Raise UserError if `outside` is "refuse" and the ground extends beyond the model's raster."""
     if outside != "refuse":
         return
     edge = grid.extent_m / 2 * np.linspace(-1, 1, 33)
@@ -190,14 +190,14 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
 
 
 def refuse_unseen(model: ElevationModel, grid: Grid, config: ElevationConfig) -> None:
-    """Raises UserError if no ground in view has a height in the model, unless the configuration allows this."""
+    """Raise UserError if no ground in view has a height in the model, unless the configuration allows this."""
     if not config.allow_unseen and _real_share(model, grid) == 0:
         found = f"no height within {grid.extent_m:.0f} m x {grid.extent_m:.0f} m of ground"
-        place = f"latitude {model.latitude_deg:.4f}, longitude {model.longitude_deg:.4f}"
+        site_text = f"latitude {model.latitude_deg:.4f}, longitude {model.longitude_deg:.4f}"
         raise UserError(
             model.source,
             "dem",
-            f"{found} around {place}",
+            f"{found} around {site_text}",
             f"a model or a site ({_FIELD}.site_*) with heights there, or {_FIELD}.allow_unseen=true",
         )
 
@@ -249,7 +249,7 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
     x, y = grid.vertices_xy()
     from scipy.interpolate import RectBivariateSpline  # here, since it takes 0.2 s and only elevation models need it
 
-    column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in (column, row))
+    column, row = (RectBivariateSpline(net, net, values).ev(y, x) for values in (column, row))
     beyond = beyond_m(model, column, row)
     pixels = float(np.maximum.reduce([-row, row - rows, -column, column - columns]).max())
     sides = rows * model.pixel_sides_m[0], columns * model.pixel_sides_m[1]
@@ -266,15 +266,15 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
         raise UserError(
             model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model that covers more of it"
         )
-    places = [row - 0.5 + margin, column - 0.5 + margin]
+    coordinates = [row - 0.5 + margin, column - 0.5 + margin]
     if outside == "mirror":
         padded = _mirrored(model.height_m, margin, model.pixel_m)
-        height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
+        height = ndimage.map_coordinates(padded, coordinates, order=3, mode="nearest")
     else:
         centres = [np.arange(n + 2 * margin) + 0.5 - margin for n in (rows, columns)]
         far = beyond_m(model, *np.meshgrid(centres[1], centres[0]))
         padded = continued(model.height_m, far, margin, model.pixel_sides_m)
-        height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
+        height = ndimage.map_coordinates(padded, coordinates, order=3, mode="nearest")
         height += mean_slope(model.height_m, row - 0.5, column - 0.5, beyond, min(sides))
     return height - height[middle], beyond
 
@@ -304,7 +304,7 @@ def _pixel_sides_m(raster: RasterMap, site: Site) -> tuple[float, float]:
     Approximation: small differences of latitude and longitude; wrong within two pixels of a pole.
     """
     # Inwards at the last row or column, since latitudes may end there.
-    down, across = (-1 if place + 1 > n else 1 for place, n in zip((site.row, site.column), raster.shape, strict=True))
+    down, across = (-1 if index + 1 > n else 1 for index, n in zip((site.row, site.column), raster.shape, strict=True))
     lats, lons = raster.selenographic(
         np.array([site.column, site.column + across]), np.array([site.row + down, site.row])
     )

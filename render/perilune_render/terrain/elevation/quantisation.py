@@ -15,7 +15,7 @@ _GENTLE = 3.5
 
 
 def step_of(height_m: Array, pixel_m: float) -> float:
-    """The quantisation step, metres, of known heights (N,); 0 if there is none or it makes no visible terraces.
+    """The quantisation step, metres, of known heights (N,); 0 without a step that makes visible terraces.
 
     A step is found if heights repeat and all are within a twentieth of a step of its multiples.
     """

@@ -1,4 +1,4 @@
-"""Resample an elevation model about its site where its own map is no smooth map of the ground.
+"""Resample an elevation model about its site where its own map is not a smooth map of the ground.
 
 Around a pole of a cylindrical map, and where a map is cut, neighbouring places of the ground have columns far apart.
 """
@@ -26,7 +26,7 @@ def resampled(
 ) -> tuple[Array, np.ndarray, RasterMap]:
     """Heights (N, N), whether they are known, and their map: azimuthal equidistant about the site, north up.
 
-    `height_m` and `known` (rows, columns) are those of `raster`. The pixels are `pixel_m` wide, or wider, so that
+    `height_m` and `known` (rows, columns) are the pixels of `raster`. The pixels are `pixel_m` wide, or wider, so that
     they are at most _MOST_PX; they cover square ground of side `ground_m` with a margin.
     """
     import rasterio
@@ -37,7 +37,7 @@ def resampled(
     centre = (np.arange(n) + 0.5 - n / 2) * pixel
     padded = ndimage.spline_filter(_padded(height_m, raster), order=3, mode="nearest")
     rows, columns = height_m.shape
-    found, seen = np.empty((n, n)), np.zeros((n, n), bool)
+    heights, seen = np.empty((n, n)), np.zeros((n, n), bool)
     around = raster.circle_px
     for top in range(0, n, _ROWS_AT_ONCE):
         part = slice(top, top + _ROWS_AT_ONCE)
@@ -48,18 +48,18 @@ def resampled(
         if around is not None:
             column = np.where(column < 0, column + around, np.where(column > columns, column - around, column))
         at = [row - 0.5 + _PAD_PX, column - 0.5 + _PAD_PX]
-        found[part] = ndimage.map_coordinates(padded, at, order=3, mode="nearest", prefilter=False)
+        heights[part] = ndimage.map_coordinates(padded, at, order=3, mode="nearest", prefilter=False)
         i, j = np.floor(row).astype(int), np.floor(column).astype(int)
         inside = on_map & (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
         seen[part] = inside & known[np.clip(i, 0, rows - 1), np.clip(j, 0, columns - 1)]
-    place = f"+lat_0={site.latitude_deg!r} +lon_0={site.longitude_deg!r}"
-    crs = rasterio.crs.CRS.from_string(f"+proj=aeqd {place} +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
+    origin = f"+lat_0={site.latitude_deg!r} +lon_0={site.longitude_deg!r}"
+    crs = rasterio.crs.CRS.from_string(f"+proj=aeqd {origin} +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
     transform = rasterio.Affine(pixel, 0, -n / 2 * pixel, 0, -pixel, n / 2 * pixel)
-    return found, seen, RasterMap(transform, crs, (n, n))
+    return heights, seen, RasterMap(transform, crs, (n, n))
 
 
 def _padded(height_m: Array, raster: RasterMap) -> Array:
-    """Heights with _PAD_PX more on each side: those beyond the edge of the map where it repeats, and over its poles."""
+    """Heights extended by _PAD_PX on each side: beyond an edge where the map repeats, and over its poles."""
     around, columns = repeat_px(raster), height_m.shape[1]
     if not around:
         return np.pad(height_m, _PAD_PX, mode="edge")

@@ -74,8 +74,8 @@ class RasterMap:
         """The map of a raster of which each pixel is step x step of this one, from a row and a column on."""
         import rasterio
 
-        place = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(step)
-        return RasterMap(self.transform @ place, self.crs, shape, self.circle)
+        transform = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(step)
+        return RasterMap(self.transform @ transform, self.crs, shape, self.circle)
 
     def covers(self, column: float, row: float) -> bool:
         """Whether raster coordinates are in the raster; False for NaN."""
@@ -121,14 +121,14 @@ def map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
 
 
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
-    """Raises UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
+    """Raise UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
 
     PROJ refuses to transform between bodies, but its error message states neither body.
     """
-    found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
-    radius = float(found[2]) if found else 0.0
+    ellipsoid = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
+    radius = float(ellipsoid[2]) if ellipsoid else 0.0
     if abs(radius / MOON_RADIUS_M - 1) > 0.01:
-        name = f"{found[1]}, radius {radius / 1000:.0f} km" if found else "none on a sphere or ellipsoid"
+        name = f"{ellipsoid[1]}, radius {radius / 1000:.0f} km" if ellipsoid else "none on a sphere or ellipsoid"
         raise UserError(
             path, "projection", name, f"a coordinate reference system of the Moon ({MOON_RADIUS_M / 1000:.0f} km)"
         )

@@ -59,16 +59,17 @@ def fitted_relief(model: ElevationModel, relief: ReliefConfig, craters: CratersC
 
 
 def add_fitted_relief(
-    height_m: Array, grid: Grid, fitted: FittedRelief, beyond_m: Array, seed: int, shortest_m: float, longest_m: float
+    height_m: Array, grid: Grid, fitted: FittedRelief, beyond_m: Array, seed: int, band_m: tuple[float, float]
 ) -> None:
-    """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
+    """Add the waves of a band of wavelengths to height_m (n_vertices,), in place, beyond the model only.
 
-    They are added beyond the model only. The amplitude of a wave grows with distance as the model's relief of the same
-    wavelength fades (`continuation.fade`).
+    `band_m` is the shortest wavelength, included, and the longest, excluded, metres. `beyond_m` (n_vertices,) is the
+    distance from known ground of the model, metres. The amplitude of a wave grows with this distance as the model's
+    relief of the same wavelength fades (`continuation.fade`).
     """
     outside = np.flatnonzero(beyond_m > 0)
     for length, amplitude in zip(fitted.wavelength_m, fitted.amplitude_m, strict=True):
-        if shortest_m <= length < longest_m and amplitude > 0:
+        if band_m[0] <= length < band_m[1] and amplitude > 0:
             waves = np.zeros(grid.n_vertices)
             add_waves(waves, grid, float(length), float(amplitude), stream(seed, "surroundings", length))
             height_m[outside] += waves[outside] * (1 - fade(beyond_m[outside], float(length)) ** 2)
@@ -79,15 +80,15 @@ def second_differences(height_m: Array, baselines: np.ndarray) -> Array:
 
     NaN are ignored; 0 if there are no other values.
     """
-    found = []
+    deviations = []
     for b in baselines:
         along = [
             np.abs(h[: -2 * b] - 2 * h[b:-b] + h[2 * b :]).ravel() for h in (height_m, height_m.T) if len(h) > 2 * b
         ]
         values = np.concatenate(along) if along else np.empty(0)
         values = values[np.isfinite(values)]
-        found.append(np.median(values) / _NORMAL if len(values) else 0.0)
-    return np.array(found)
+        deviations.append(np.median(values) / _NORMAL if len(values) else 0.0)
+    return np.array(deviations)
 
 
 def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:

@@ -69,7 +69,7 @@ def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Wind
 
 
 def repeat_px(raster: RasterMap) -> int:
-    """Number of columns after which those of a raster repeat, 0 if it does not show all longitudes."""
+    """Number of columns after which a raster repeats; 0 if it does not show all longitudes."""
     circle, columns = raster.circle_px, raster.shape[1]
     if circle is None:
         return 0
@@ -83,13 +83,13 @@ def read_window(band: HeightBand, raster: RasterMap, window: Window) -> Array:
     from rasterio.windows import Window as Part
 
     rows, step = window.shape[0], window.step
-    found = []
+    pieces = []
     for first, count in _runs(raster, window):
         if first is None:
-            found.append(np.full((rows, count), np.nan))
+            pieces.append(np.full((rows, count), np.nan))
         else:
-            found.append(band.read(Part(first, window.top, count * step, rows * step), (rows, count)))
-    return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
+            pieces.append(band.read(Part(first, window.top, count * step, rows * step), (rows, count)))
+    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=1)
 
 
 def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
@@ -102,7 +102,7 @@ def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
     net = np.linspace(-ground_m / 2, ground_m / 2, _NET)
     between = (net[1:] + net[:-1]) / 2
     known = [places_of(raster, site, *np.meshgrid(each, each)) for each in (net, between)]
-    if not all(np.isfinite(place).all() for pair in known for place in pair):
+    if not all(np.isfinite(coordinate).all() for pair in known for coordinate in pair):
         return False
     off = [
         np.abs(RectBivariateSpline(net, net, at).ev(*np.meshgrid(between, between, indexing="ij")) - there).max()
@@ -133,12 +133,12 @@ def _runs(raster: RasterMap, window: Window) -> list[tuple[int | None, int]]:
     """First column in the raster, None where it has none, and number of the window's columns, of its parts."""
     columns, step, around = raster.shape[1], window.step, repeat_px(raster)
     runs: list[tuple[int | None, int]] = []
-    place, left = window.left, window.shape[1]
+    column, left = window.left, window.shape[1]
     while left > 0:
-        first = place % around if around else place
+        first = column % around if around else column
         most = (min(columns, around) if around else columns) - first
         has = most >= step
         count = min(most // step if has else max((around - first) // step, 1), left)
         runs.append((first if has else None, count))
-        place, left = place + count * step, left - count
+        column, left = column + count * step, left - count
     return runs

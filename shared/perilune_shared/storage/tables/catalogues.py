@@ -102,20 +102,20 @@ def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]
     for known in _KNOWN.values():
         if set(known.values()) <= set(names):
             return dict(known)
-    found = {key: [name for name in names if pattern.fullmatch(name)] for key, pattern in _PATTERNS.items()}
-    exact = {key: [key] if key in names else matches for key, matches in found.items()}
+    matching = {key: [name for name in names if pattern.fullmatch(name)] for key, pattern in _PATTERNS.items()}
+    exact = {key: [key] if key in names else matches for key, matches in matching.items()}
     sizes = [(key, name) for key in METRES for name in exact[key]]
     diameters = [size for size in sizes if size[0].startswith("diameter")]
     sizes = [("diameter_m", "diameter_m")] if "diameter_m" in names else diameters or sizes
-    places = [exact[key] for key in PLACES]
-    if all(len(matches) == 1 for matches in places) and len(sizes) == 1:
-        return {"longitude_deg": places[0][0], "latitude_deg": places[1][0], sizes[0][0]: sizes[0][1]}
-    several = [name for matches in (*places, [name for _, name in sizes]) if len(matches) > 1 for name in matches]
+    coordinates = [exact[key] for key in PLACES]
+    if all(len(matches) == 1 for matches in coordinates) and len(sizes) == 1:
+        return {"longitude_deg": coordinates[0][0], "latitude_deg": coordinates[1][0], sizes[0][0]: sizes[0][1]}
+    several = [name for matches in (*coordinates, [name for _, name in sizes]) if len(matches) > 1 for name in matches]
     got = (
         f"columns {', '.join(several)}" if several else f"columns {', '.join(name for name in names if name) or 'none'}"
     )
     expected = "longitude_deg, latitude_deg and diameter_m or diameter_km"
-    if not several and all(places) and not sizes:
+    if not several and all(coordinates) and not sizes:
         expected = "a diameter or radius with its unit, as diameter_m or Diameter (km)"
     raise UserError(path, "columns", got, f"{expected}; {setting} can state which columns these are")
 
@@ -131,8 +131,8 @@ def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
     for low in np.unique(np.floor(np.log2(sizes))):
         # The window is wider than the octave, so that craters on both sides of its end are compared.
         high = 1.1 * 2 ** (low + 1)
-        own = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
-        order = own[np.argsort(x_m[own], kind="stable")]
+        similar = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
+        order = similar[np.argsort(x_m[similar], kind="stable")]
         for step in range(1, min(len(order), _MOST_NEIGHBOURS)):
             first, second = np.sort([order[:-step], order[step:]], axis=0)
             apart = np.abs(x_m[second] - x_m[first])

@@ -55,21 +55,21 @@ class Columns:
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """Return a column that was read as "number" (n,); NaN where a row has no value."""
-        found = self.arrays[name]
-        assert isinstance(found, np.ndarray)
-        return found.astype(np.float64, copy=False)
+        values = self.arrays[name]
+        assert isinstance(values, np.ndarray)
+        return values.astype(np.float64, copy=False)
 
     def integers(self, name: str) -> NDArray[np.int64]:
         """Return a column that was read as "integer" (n,)."""
-        found = self.arrays[name]
-        assert isinstance(found, np.ndarray)
-        return found.astype(np.int64, copy=False)
+        values = self.arrays[name]
+        assert isinstance(values, np.ndarray)
+        return values.astype(np.int64, copy=False)
 
     def texts(self, name: str) -> Texts:
         """Return a column that was read as "text"."""
-        found = self.arrays[name]
-        assert isinstance(found, Texts)
-        return found
+        values = self.arrays[name]
+        assert isinstance(values, Texts)
+        return values
 
     def finite(self, name: str, low: float = -np.inf, high: float = np.inf) -> NDArray[np.float64]:
         """Return a column of finite numbers from `low` to `high` (n,). Raises UserError that names the first other."""
@@ -84,9 +84,9 @@ class Columns:
 
     def fault(self, row: int, name: str, expected: str) -> UserError:
         """Return the error about the value of a column in a row, counted from 0."""
-        found = self.arrays[name]
-        value: object = found[row]
-        if isinstance(found, Texts):
+        values = self.arrays[name]
+        value: object = values[row]
+        if isinstance(values, Texts):
             value = repr(value) if value else "nothing"
         elif isinstance(value, np.floating):
             value = "nothing" if np.isnan(value) else float(value)

@@ -1,4 +1,4 @@
-"""Read Parquet tables from outside: schema, rows and sizes first, then only the columns that are asked for.
+"""Read Parquet tables from outside: schema, rows and sizes first, then only the requested columns.
 
 A short file can state any number of rows and any length of text: dictionaries and runs repeat values without bytes. So
 rows and sizes are compared with the limits before anything is decompressed, texts are read as dictionaries, and one
@@ -78,7 +78,7 @@ class ParquetTable:
         """Return None: a Parquet file has a header. For text, return the next row."""
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read those of these columns that the table has. Raises UserError on a column of another type."""
+        """Read the given columns, as far as the table has them. Raises UserError on a column of another type."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
@@ -114,26 +114,26 @@ class ParquetTable:
         return UserError(self.path, "content", error, f"a complete Parquet file with {self._limits.kind}")
 
     def _check_type(self, name: str, kind: Kind) -> None:
-        found = self._schema.field(self._name_in_file[name]).type
-        value = found.value_type if pa.types.is_dictionary(found) else found
+        type_in_file = self._schema.field(self._name_in_file[name]).type
+        value = type_in_file.value_type if pa.types.is_dictionary(type_in_file) else type_in_file
         is_number = pa.types.is_integer(value) or pa.types.is_floating(value) or pa.types.is_decimal(value)
         is_text = pa.types.is_string(value) or pa.types.is_large_string(value) or pa.types.is_string_view(value)
-        fits = is_number or pa.types.is_null(found) if kind != "text" else is_text or pa.types.is_integer(value)
-        if not fits or (pa.types.is_dictionary(found) and not is_text):
+        fits = is_number or pa.types.is_null(type_in_file) if kind != "text" else is_text or pa.types.is_integer(value)
+        if not fits or (pa.types.is_dictionary(type_in_file) and not is_text):
             expected = {"number": "numbers", "integer": "integers", "text": "texts"}[kind]
-            raise UserError(self.path, f"column {name}", found, expected)
+            raise UserError(self.path, f"column {name}", type_in_file, expected)
 
     def _check_sizes(self, names: Sequence[str]) -> None:
         """Check the sizes of the columns that will be read, in the footer and in the headers of the pages."""
         footer = self._file.metadata
         in_file = {self._name_in_file[name] for name in names}
-        paths = [footer.schema.column(place).path for place in range(footer.num_columns)]
-        places = [(place, path) for place, path in enumerate(paths) if path.split(".")[0] in in_file]
-        check_footer(footer, places, self._n_bytes, str(self.path), self._footer_limits)
+        paths = [footer.schema.column(index).path for index in range(footer.num_columns)]
+        columns = [(index, path) for index, path in enumerate(paths) if path.split(".")[0] in in_file]
+        check_footer(footer, columns, self._n_bytes, str(self.path), self._footer_limits)
         with self.path.open("rb") as stream:
             for group in range(footer.num_row_groups):
-                for place, path in places:
-                    column = footer.row_group(group).column(place)
+                for index, path in columns:
+                    column = footer.row_group(group).column(index)
                     pages = pages_of(stream, column)
                     if pages.uncompressed_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
                         found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
@@ -187,16 +187,16 @@ class ParquetTable:
                     if longest > MOST_VALUE_CHARACTERS:
                         expected = f"at most {MOST_VALUE_CHARACTERS}"
                         raise UserError(self.path, f"column {name}", f"a text of {longest} bytes", expected)
-                    place = np.asarray(column.indices.fill_null(-1), np.int64)
-                    used = np.unique(place[place >= 0])
-                    own = np.full(len(column.dictionary) + 1, -1, np.int32)
+                    index = np.asarray(column.indices.fill_null(-1), np.int64)
+                    used = np.unique(index[index >= 0])
+                    numbers = np.full(len(column.dictionary) + 1, -1, np.int32)
                     for at, word in zip(used, column.dictionary.take(pa.array(used)).to_pylist(), strict=True):
                         n_known = len(code_of)
-                        own[at] = code_of.setdefault(word, n_known) if word else -1
-                        n_characters += len(word) if word and own[at] == n_known else 0
+                        numbers[at] = code_of.setdefault(word, n_known) if word else -1
+                        n_characters += len(word) if word and numbers[at] == n_known else 0
                     if n_characters > MOST_TEXT_CHARACTERS:
                         found = f"more than {MOST_TEXT_CHARACTERS} characters in different values"
                         raise UserError(self.path, f"column {name}", found, f"at most {MOST_TEXT_CHARACTERS}")
-                    codes[row : row + len(place)] = own[place]
-                    row += len(place)
+                    codes[row : row + len(index)] = numbers[index]
+                    row += len(index)
         return Texts(list(code_of), codes)

@@ -89,18 +89,18 @@ class TextTable:
             yield line, words
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read those of these columns that the table has. Raises UserError on a value that is not of its kind."""
+        """Read the given columns, as far as the table has them. Raises UserError on a value that is not of its kind."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
-        places = [self.names.index(name) for name in wanted]
+        positions = [self.names.index(name) for name in wanted]
         built = [_builder(columns[name], self.path, name) for name in wanted]
         lines = array("q")
         rows = self.rows()
         while batch := _batch(rows):
             numbers = [line for line, _ in batch]
-            for place, column in zip(places, built, strict=True):
-                column.add([words[place] for _, words in batch], numbers)
+            for position, column in zip(positions, built, strict=True):
+                column.add([words[position] for _, words in batch], numbers)
             lines.extend(numbers)
         arrays = {name: column.array() for name, column in zip(wanted, built, strict=True)}
         return Columns(

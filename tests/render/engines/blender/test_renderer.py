@@ -134,7 +134,7 @@ def test_label_ellipses_lie_on_rendered_rims():
     )
     with Renderer(scene, config_with(), camera, sun_direction(90, 60)) as renderer:
         radiance = renderer.render(position, rotation)
-    labels = label_frame(RimCircles.of_scene(scene), camera, position, rotation, radiance, 2, 150)
+    labels = label_frame(RimCircles.of_scene(scene), camera, position, rotation, radiance, (2, 150))
     assert labels.crater_id.tolist() == [0, 1, 2]
     assert (labels.visible_fraction > 0.95).all() and (labels.sunlit_fraction > 0.95).all()
     # The tilted view passes the small ground's edge: there is no depth.
@@ -179,12 +179,11 @@ def test_a_hidden_rim_and_a_dark_crater_are_reported():
         )
         assert lit.visible_fraction[0] > 0.9 and lit.sunlit_fraction[0] < 0.1
         aside = np.array([-150.0, 0, 100.0])
-        hidden = label_frame(RimCircles.of_scene(scene), camera, aside, slanted, renderer.render(aside, slanted), 2, 90)
+        circles = RimCircles.of_scene(scene)
+        hidden = label_frame(circles, camera, aside, slanted, renderer.render(aside, slanted), (2, 90))
         if len(hidden.crater_id) == 0:
             slanted = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector([0, np.radians(-50), 0])
-            hidden = label_frame(
-                RimCircles.of_scene(scene), camera, aside, slanted, renderer.render(aside, slanted), 2, 90
-            )
+            hidden = label_frame(circles, camera, aside, slanted, renderer.render(aside, slanted), (2, 90))
     assert hidden.visible_fraction[0] < 0.6
 
 

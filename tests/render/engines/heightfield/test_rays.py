@@ -213,7 +213,7 @@ def test_rays_begin_near_the_ground_that_they_hit(scene, engine):
     above = []
     for row in range(0, CAMERA.height_px - 8, 8):
         for column in range(0, CAMERA.width_px - 8, 8):
-            height = begin_m(tops, ground, position, rays_of(CAMERA) @ rotation, column, column + 8, row, row + 8)
+            height = begin_m(tops, ground, position, rays_of(CAMERA) @ rotation, (column, column + 8, row, row + 8))
             above.append(height - (500 - depth[row : row + 8, column : column + 8].min()))
     assert min(above) > 0
     assert np.median(above) < 0.3 * (ground.highest_m - ground.lowest_m)
@@ -229,8 +229,8 @@ def test_the_part_below_a_block_holds_the_ways_of_its_rays(scene, engine):
         for row in range(0, CAMERA.height_px - 8, 8):
             for column in range(0, CAMERA.width_px - 8, 8):
                 block = column, column + 8, row, row + 8
-                begin = begin_m(tops, ground, origin, basis, *block)
-                part = only_part(ground, origin, basis, *block, begin)
+                begin = begin_m(tops, ground, origin, basis, block)
+                part = only_part(ground, origin, basis, block, begin)
                 seen.add(part)
                 if part < 0:
                     continue

@@ -5,9 +5,9 @@ import time
 
 from tests.render.server.conftest import Running
 
-from perilune_render.server.notes import Notes
+from perilune_render.server.connection import Limits
 from perilune_render.server.pangu.session import Conventions
-from perilune_render.server.serve import Limits
+from perilune_render.server.serve import LineQueue
 
 
 def echo(client):
@@ -33,8 +33,8 @@ def test_goodbye_has_no_reply(server):
         assert client.is_closed()
 
 
-def test_a_client_may_end_the_server_only_if_allowed(world):
-    with Running(world, conventions=Conventions(may_quit=True)) as running:
+def test_a_client_may_end_the_server_only_if_allowed(simulated):
+    with Running(simulated, conventions=Conventions(may_quit=True)) as running:
         with running.client() as client:
             client.send("0000001b")
             assert client.number() == 0
@@ -42,8 +42,8 @@ def test_a_client_may_end_the_server_only_if_allowed(world):
         assert not running.thread.is_alive()
 
 
-def test_clients_that_vanish_or_stall_hold_up_nobody(world):
-    with Running(world, Limits(clients=4, message_s=0.5, idle_s=3.0)) as running:
+def test_clients_that_vanish_or_stall_hold_up_nobody(simulated):
+    with Running(simulated, Limits(clients=4, message_s=0.5, idle_s=3.0)) as running:
         half = running.client()
         half.send("0000000b 0000")  # half a message
         gone = running.client()
@@ -60,8 +60,8 @@ def test_clients_that_vanish_or_stall_hold_up_nobody(world):
         assert 2 < time.monotonic() - start < 8
 
 
-def test_a_hello_and_a_begun_number_must_come_in_the_time_of_a_message(world):
-    with Running(world, Limits(message_s=0.5, idle_s=60.0)) as running:
+def test_a_hello_and_a_begun_number_must_come_in_the_time_of_a_message(simulated):
+    with Running(simulated, Limits(message_s=0.5, idle_s=60.0)) as running:
         silent, half_hello, half_number, idle = (
             running.client(None),
             running.client(None),
@@ -76,8 +76,8 @@ def test_a_hello_and_a_begun_number_must_come_in_the_time_of_a_message(world):
         echo(idle)  # silence between messages is not limited by message_s
 
 
-def test_a_message_that_drips_is_ended_in_the_time_of_one_message(world):
-    with Running(world, Limits(message_s=0.6, idle_s=60.0)) as running:
+def test_a_message_that_drips_is_ended_in_the_time_of_one_message(simulated):
+    with Running(simulated, Limits(message_s=0.6, idle_s=60.0)) as running:
         drips = running.client()
         drips.send("0000")
         time.sleep(0.4)
@@ -87,8 +87,8 @@ def test_a_message_that_drips_is_ended_in_the_time_of_one_message(world):
         assert time.monotonic() - start < 0.5
 
 
-def test_silent_clients_give_way_and_an_extra_client_gets_an_error(world):
-    with Running(world, Limits(clients=3, message_s=20.0, idle_s=60.0)) as running:
+def test_silent_clients_give_way_and_an_extra_client_gets_an_error(simulated):
+    with Running(simulated, Limits(clients=3, message_s=20.0, idle_s=60.0)) as running:
         asking = running.client()
         echo(asking)
         said_hello, silent = running.client(), running.client(None)
@@ -109,8 +109,8 @@ def test_silent_clients_give_way_and_an_extra_client_gets_an_error(world):
             echo(each)
 
 
-def test_sockets_without_a_word_do_not_lock_clients_out(world):
-    with Running(world, Limits(clients=4, message_s=1.5, idle_s=60.0)) as running:
+def test_sockets_without_a_word_do_not_lock_clients_out(simulated):
+    with Running(simulated, Limits(clients=4, message_s=1.5, idle_s=60.0)) as running:
         held = [running.client(None) for _ in range(30)]
         time.sleep(1.6)
         with running.client() as client:
@@ -119,9 +119,9 @@ def test_sockets_without_a_word_do_not_lock_clients_out(world):
             each.socket.close()
 
 
-def test_the_server_ends_at_once_with_clients_connected(world, capfd):
+def test_the_server_ends_at_once_with_clients_connected(simulated, capfd):
     for _ in range(10):
-        with Running(world) as running:
+        with Running(simulated) as running:
             client = running.client()
             start = time.monotonic()
         assert time.monotonic() - start < 3
@@ -129,9 +129,9 @@ def test_the_server_ends_at_once_with_clients_connected(world, capfd):
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_notes_that_nobody_reads_do_not_block_the_server(world):
+def test_notes_that_nobody_reads_do_not_block_the_server(simulated):
     free = threading.Event()
-    with Running(world, note=lambda text: free.wait(60)) as running:
+    with Running(simulated, note=lambda text: free.wait(60)) as running:
         for _ in range(3):
             with running.client() as client:
                 echo(client)
@@ -146,7 +146,7 @@ def test_notes_are_passed_on_in_order_and_dropped_when_there_are_too_many():
         free.wait(20)
         got.append(text)
 
-    notes = Notes(slow, most=3)
+    notes = LineQueue(slow, most=3)
     notes("0")
     assert begun.wait(20)
     for k in range(1, 10):
@@ -156,8 +156,8 @@ def test_notes_are_passed_on_in_order_and_dropped_when_there_are_too_many():
     assert got == ["0", "1", "2", "3"]
 
 
-def test_a_client_that_reads_nothing_is_disconnected_and_holds_up_nobody(world):
-    with Running(world, Limits(message_s=1.0)) as running:
+def test_a_client_that_reads_nothing_is_disconnected_and_holds_up_nobody(simulated):
+    with Running(simulated, Limits(message_s=1.0)) as running:
         slow = running.client()
         slow.send("00000001" * 20_000)
         with running.client() as good:

@@ -11,11 +11,11 @@ from tests.render.server.conftest import Running
 from tests.render.server.pangu.valid import VALID
 from tests.render.server.pangu.words import DOWN_1000
 
+from perilune_render.server.connection import Limits
 from perilune_render.server.pangu import serve as pangu_serve
 from perilune_render.server.pangu import wire
 from perilune_render.server.pangu.answers import answer
 from perilune_render.server.pangu.messages import ECHO, ERROR, GOODBYE, IMAGE, MESSAGES, QUIT
-from perilune_render.server.serve import Limits
 
 LONGEST_S = 5.0
 """Time within which each message must be answered on a busy core: the largest grid has a million heights."""
@@ -80,10 +80,10 @@ def test_every_valid_message_is_accepted(client):
 
 
 @pytest.mark.parametrize("n_messages", [1500, pytest.param(6000, marks=pytest.mark.slow)])
-def test_malformed_messages_neither_crash_nor_stall_the_server(world, n_messages, monkeypatch, caplog):
+def test_malformed_messages_neither_crash_nor_stall_the_server(simulated, n_messages, monkeypatch, caplog):
     rng, counting, n_broken = random.Random(3), Counting(), 0
     monkeypatch.setattr(pangu_serve, "answer", counting)
-    with Running(world, Limits(clients=64, message_s=20.0, items=1000)) as running:
+    with Running(simulated, Limits(clients=64, message_s=20.0, items=1000)) as running:
         before = psutil.Process().memory_info().rss
         sent = 0
         while sent < n_messages:

@@ -11,7 +11,7 @@ from perilune_render.server.pangu.answers import answer
 from perilune_render.server.pangu.messages import MESSAGES
 
 
-def test_every_setting_is_acknowledged_and_every_request_answered(client, world):
+def test_every_setting_is_acknowledged_and_every_request_answered(client, simulated):
     """All messages with zeros: none desynchronises the stream, which an echo after each one shows."""
     for number, message in MESSAGES.items():
         if number in (0, 27):
@@ -69,8 +69,8 @@ def test_a_faulty_request_is_an_error_and_the_session_goes_on(client, request_by
     client.image()
 
 
-def test_the_fastest_camera_with_the_narrowest_view_gets_an_image(client, world):
-    z = float(world.heights_m(np.zeros(1), np.zeros(1))[0]) + 1.2
+def test_the_fastest_camera_with_the_narrowest_view_gets_an_image(client, simulated):
+    z = float(simulated.heights_m(np.zeros(1), np.zeros(1))[0]) + 1.2
     for request in (
         "00000105" + floats(0.0101),
         "0000012b 00000000" + doubles(6000, -8000, *[0.0] * 16),

@@ -14,17 +14,17 @@ TOLERANCE_M = 0.2
 
 
 @pytest.fixture
-def height(world):
+def height(simulated):
     """Heights of the ground, by another way than rays."""
-    return lambda x, y: float(value_at(world.scene.height_m, world.scene.grid, x, y))
+    return lambda x, y: float(value_at(simulated.scene.height_m, simulated.scene.grid, x, y))
 
 
 @pytest.fixture
-def boulder(world):
+def boulder(simulated):
     """x, y and z of the centre of the largest boulder."""
-    boulders = world.scene.boulders
+    boulders = simulated.scene.boulders
     k = int(np.argmax(boulders.diameter_m))
-    return float(boulders.x_m[k]), float(boulders.y_m[k]), float(world.scene.boulder_z_m[k])
+    return float(boulders.x_m[k]), float(boulders.y_m[k]), float(simulated.scene.boulder_z_m[k])
 
 
 def items(client, reply, size=1):
@@ -136,14 +136,14 @@ def test_a_lidar_pulse_has_range_and_cosine(client, height):
     assert [client.number(), client.number(), client.number()] == [9, 0, 0]
 
 
-def test_an_oblique_lidar_pulse(client, world, height):
+def test_an_oblique_lidar_pulse(client, simulated, height):
     origin, target = np.array([120.0, 60.0, 300.0]), np.array([10.0, -20.0, height(10, -20)])
     way = target - origin
     client.send("0000000d" + floats(*origin, *(2 * way)))  # the direction's length is of no importance
     assert client.number() == 9
     distance, cosine = (as_float(client.read(4)) for _ in range(2))
     assert abs(distance - np.linalg.norm(way)) < 2 * TOLERANCE_M
-    step = float(world.scene.grid.spacings_m[0])
+    step = float(simulated.scene.grid.spacings_m[0])
     slope = [(height(10 + dx, -20 + dy) - height(10 - dx, -20 - dy)) / (2 * step) for dx, dy in ((step, 0), (0, step))]
     normal = np.array([-slope[0], -slope[1], 1]) / np.linalg.norm([*slope, 1])
     assert abs(cosine + normal @ way / np.linalg.norm(way)) < 0.1
@@ -223,7 +223,7 @@ def test_rays_from_inside_a_boulder_hit_nothing(client, boulder):
     assert items(client, 4)[0] is not None
 
 
-def test_the_back_of_the_ground_is_not_hit(client, world):
-    beside = world.scene.grid.extent_m / 2 + 50 + abs(world.scene.grid.centre_x_m)
+def test_the_back_of_the_ground_is_not_hit(client, simulated):
+    beside = simulated.scene.grid.extent_m / 2 + 50 + abs(simulated.scene.grid.centre_x_m)
     client.send("0000000d" + floats(beside, 0, -200, -1, 0, 0.5))
     assert [client.number(), client.number(), client.number()] == [9, 0, 0]

@@ -12,7 +12,7 @@ from perilune_render.server.pangu import wire
 from perilune_render.server.pangu.view import rotation_from_angles, rotation_from_quaternion, sun_from_angles
 
 
-def test_a_client_sets_a_viewpoint_and_gets_its_image(client, world):
+def test_a_client_sets_a_viewpoint_and_gets_its_image(client, simulated):
     client.send(f"00000100 {DOWN_1000}")
     assert client.number() == 0
     client.send("00000001")

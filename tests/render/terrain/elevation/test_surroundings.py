@@ -88,7 +88,7 @@ def test_relief_outside_has_the_roughness_of_the_model(tmp_path):
         fitted = fitted_relief(model, ReliefConfig(), NO_CRATERS, 1)
         assert fitted.hurst_exponent == pytest.approx(hurst, abs=0.15)
         around = np.zeros(own.n_vertices)
-        add_fitted_relief(around, own, fitted, np.full(own.n_vertices, 1e4), 1, 0.0, np.inf)
+        add_fitted_relief(around, own, fitted, np.full(own.n_vertices, 1e4), 1, (0.0, np.inf))
         baselines = np.array([8, 16, 32])
         found = second_differences(around.reshape(201, 201), baselines)
         assert np.allclose(found / second_differences(model.height_m, baselines), 1, atol=0.35)

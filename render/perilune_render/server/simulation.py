@@ -1,4 +1,4 @@
-"""The world of a server: one scene, rendered and measured from any pose. Only one thread may use it."""
+"""A simulated scene, rendered and measured from any pose. Only one thread may use it."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -37,7 +37,7 @@ _DOWN = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where a camera is, and what it sees by."""
+    """A camera, its pose and the Sun."""
 
     position_m: Array
     """Position, O_L, metres (3,)."""
@@ -49,7 +49,7 @@ class View:
     """Unit vector towards the Sun, O_L (3,)."""
 
 
-class World:
+class SimulatedScene:
     """Renders frames of a scene, and casts rays at it. Close it at the end.
 
     With the engine `cycles`, a change of camera or Sun builds Blender's scene again, which takes seconds.
@@ -61,7 +61,7 @@ class World:
         self._circles, self._note = RimCircles.of_scene(scene), note
         self._sources: dict[tuple, tuple[FrameSource, ExitStack]] = {}
 
-    def __enter__(self) -> "World":
+    def __enter__(self) -> "SimulatedScene":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -103,8 +103,8 @@ class World:
         self.check_view(view)
         velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
         turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")
-        place = view.position_m, view.rotation_camera_from_site
-        return self._source(view).take(Shot(*place, velocity, seed, index, angular_velocity_radps=turn))
+        pose = view.position_m, view.rotation_camera_from_site
+        return self._source(view).take(Shot(*pose, velocity, seed, index, angular_velocity_radps=turn))
 
     def labels(self, view: View, frame: Frame) -> Labels:
         """Labels of a frame."""
@@ -135,11 +135,9 @@ class World:
     def _source(self, view: View) -> FrameSource:
         """The frame source of a camera and a Sun, opened if it is not yet."""
         key = (view.camera, tuple(view.sun.tolist()))
-        found = self._sources.pop(key, None)
-        if found is None:
-            found = self._opened(view)
-        self._sources[key] = found  # the last used one is the last
-        return found[0]
+        source = self._sources.pop(key, None) or self._opened(view)
+        self._sources[key] = source  # the last used one is the last
+        return source[0]
 
     def _opened(self, view: View) -> tuple[FrameSource, ExitStack]:
         cycles = self.config.render.engine == "cycles"
@@ -156,19 +154,19 @@ class World:
         return FrameSource.of(engine, self.config, view.camera, self._circles), stack
 
 
-def open_world(config: DatasetConfig) -> World:
-    """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
+def open_simulation(config: DatasetConfig) -> SimulatedScene:
+    """The simulated scene of a configuration. Its ground suits `dataset.scene.views`, or the flights of `nav`."""
     pinhole = camera_of(config.camera).covering_pinhole()
     scene = config.scene or SceneConfig()
     if scene.views:
         view = scene_view(scene, pinhole)
     else:
         view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
-    return world_over(config, view, scene_seed(config))
+    return simulation_over(config, view, scene_seed(config))
 
 
-def world_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> World:
-    """The world of a configuration over the ground of a seed, made for given views.
+def simulation_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> SimulatedScene:
+    """The simulated scene of a configuration over the ground of a seed, which suits the given views.
 
     Raises UserError if the engine is not installed or the ground is too large.
     """
@@ -178,18 +176,18 @@ def world_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> World:
         view = replace(view, seen=None)
     check_ground(config, view)
     say("generating the ground")
-    return World(cached_scene(config, view, seed), config, say)
+    return SimulatedScene(cached_scene(config, view, seed), config, say)
 
 
 def _poses(position_m: Array, rotation_camera_from_site: Array) -> Poses:
     """One pose, to be checked."""
-    return Poses(["asked for"], np.asarray(position_m)[None], quaternion_from_matrix(rotation_camera_from_site)[None])
+    return Poses(["requested"], np.asarray(position_m)[None], quaternion_from_matrix(rotation_camera_from_site)[None])
 
 
 def _limited(values: Array | None, field: str, largest: float, unit: str) -> Array:
     """A vector (3,), 0 if it is not given. Raises UserError if it is longer than `largest`."""
-    found = np.zeros(3) if values is None else np.asarray(values, np.float64)
+    vector = np.zeros(3) if values is None else np.asarray(values, np.float64)
     # The components first: the length of a very large vector overflows.
-    if not np.abs(found).max() <= largest or np.linalg.norm(found) > largest:
-        raise UserError("camera", field, found.tolist(), f"at most {largest:g} {unit}")
-    return found
+    if not np.abs(vector).max() <= largest or np.linalg.norm(vector) > largest:
+        raise UserError("camera", field, vector.tolist(), f"at most {largest:g} {unit}")
+    return vector

@@ -9,7 +9,7 @@ from perilune_render.config.dataset import CameraConfig, RenderConfig
 from perilune_render.config.scene import SceneConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import view_envelope
-from perilune_render.server.world import View, open_world
+from perilune_render.server.simulation import View, open_simulation
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import sun_direction
@@ -35,18 +35,18 @@ def view_of(config, height_m, below_deg):
 
 def test_a_horizon_without_views_shows_the_sky_to_the_descents_of_the_preset():
     config = config_of(SceneConfig(horizon=True))
-    with open_world(config) as world:
-        assert world.scene.view.horizon
-        depth_m = world.frame(view_of(config, 60.0, 5.0), 0, 0).radiance.depth_m
+    with open_simulation(config) as simulated:
+        assert simulated.scene.view.horizon
+        depth_m = simulated.frame(view_of(config, 60.0, 5.0), 0, 0).radiance.depth_m
         with pytest.raises(UserError, match="beyond the terrain's edge"):
-            world.frame(view_of(config, 5000.0, 5.0), 0, 0)
+            simulated.frame(view_of(config, 5000.0, 5.0), 0, 0)
     assert 0.2 < np.isinf(depth_m).mean() < 0.8
 
 
 def test_a_horizon_of_too_high_descents_is_refused():
     config = config_of(SceneConfig(horizon=True), start_altitude_m=30_000.0)
     with pytest.raises(UserError, match=r"dataset.scene.views: got none"):
-        open_world(config)
+        open_simulation(config)
 
 
 def test_blender_refuses_a_ground_of_which_it_would_show_only_one_descent():
@@ -55,7 +55,7 @@ def test_blender_refuses_a_ground_of_which_it_would_show_only_one_descent():
     whole = graded_grid(config.terrain, view_envelope(camera_of(config.camera), config.nav.flight)).n_vertices
     limited = config.terrain.model_copy(update={"max_vertices": whole - 1})
     with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 2.0 needs .* vertices"):
-        open_world(config.model_copy(update={"terrain": limited}))
+        open_simulation(config.model_copy(update={"terrain": limited}))
     just = config.terrain.model_copy(update={"max_vertices": whole})
-    with open_world(config.model_copy(update={"terrain": just})) as world:
-        assert world.scene.view.seen is None and world.scene.grid.n_vertices == whole
+    with open_simulation(config.model_copy(update={"terrain": just})) as simulated:
+        assert simulated.scene.view.seen is None and simulated.scene.grid.n_vertices == whole

@@ -1,11 +1,16 @@
-"""Turn the exceptions of object stores into errors of one line with the address."""
+"""Object stores: fsspec's file systems, and their exceptions as errors of one line with the address."""
 
 import contextlib
+import os
 import re
 from collections.abc import Iterator
+from typing import Any
 
 from perilune_shared.errors import UserError, one_line
 
+OBJECT_STORES = {"s3": "s3", "gs": "gcs", "memory": ""}
+"""Kinds of object stores, and the extra of perilune-shared that each needs."""
+_TIMEOUTS_S = {"connect_timeout": 10, "read_timeout": 60}
 _LIBRARIES = ("aiohttp", "aiobotocore", "botocore", "fsspec", "gcsfs", "google", "requests", "s3fs", "urllib3")
 """Libraries below fsspec that raise exceptions of their own."""
 _ACCESS = re.compile(r"credential|token|accessdenied|forbidden|signature|access key|\b40[13]\b", re.I)
@@ -14,6 +19,22 @@ _CREDENTIALS = {
     "s3": "credentials with access to it: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE",
     "gs": "credentials with access to it: GOOGLE_APPLICATION_CREDENTIALS, or `gcloud auth application-default login`",
 }
+
+
+def file_system(kind: str, address: str) -> Any:
+    """Return fsspec's file system for a kind of address; listings are never cached, since others may write."""
+    import fsspec
+
+    options: dict[str, Any] = {} if kind == "memory" else {"use_listings_cache": False}
+    if kind == "s3":
+        # Part of the key by which fsspec keeps file systems: the variable may change within a process.
+        options |= {"endpoint_url": os.environ.get("AWS_ENDPOINT_URL"), "config_kwargs": _TIMEOUTS_S}
+    try:
+        with store_faults(address):
+            return fsspec.filesystem(kind, **options)
+    except ImportError:
+        expected = f"the extra {OBJECT_STORES[kind]}: pip install 'perilune-shared[{OBJECT_STORES[kind]}]'"
+        raise UserError(address, "address", f"{kind}:// without its library", expected) from None
 
 
 def is_missing_bucket(error: Exception) -> bool:

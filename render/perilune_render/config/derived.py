@@ -1,0 +1,38 @@
+"""Settings of datasets that are derived from another one: a survey of its terrain, or a counterfactual."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from perilune_render.config.values import Altitude
+from perilune_shared.config.resolve import Section
+
+SceneSeed = Annotated[int, Field(ge=0, lt=2**63)]
+CraterId = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class SurveyConfig(Section):
+    """Images of the same terrain from orbit, to map its craters before a landing.
+
+    A pair of images of each scene from one height, one from the west of the site and one from the east.
+    """
+
+    altitude_m: Altitude = 4500.0
+    """Height of both cameras above the site, metres."""
+    pixel_m: Annotated[float, Field(gt=0, le=1000)] = 0.6
+    """Size of a pixel on level ground straight below the camera, metres."""
+    convergence_deg: Annotated[float, Field(ge=5, le=60)] = 30.0
+    """Angle between the camera axes, degrees; a wider one gives better heights and sees less of the ground twice."""
+    sun_azimuth_offset_deg: Annotated[float, Field(ge=-180, le=180)] = 90.0
+    """Azimuth of the Sun, relative to the Sun in the frames of the descent, clockwise, degrees."""
+    sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
+    """Elevation of the Sun, degrees."""
+
+
+class CounterfactualConfig(Section):
+    """The frames of another dataset with changed ground or light. Poses, noise and other ground stay as they are."""
+
+    removed: dict[SceneSeed, tuple[CraterId, ...]] = Field(default_factory=dict)
+    """Craters that are removed from the ground, as crater_id, by the random seed of their scene."""
+    sun_azimuth_offset_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """Azimuth of the Sun, relative to the Sun of the other dataset, clockwise, degrees."""

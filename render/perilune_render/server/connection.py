@@ -1,0 +1,77 @@
+"""One client of the server: its messages within time limits, and what it may ask for."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+Ask = Callable[[Callable[[], Any]], Awaitable[Any]]
+"""Runs a function in the thread that renders, and returns its result."""
+
+
+class Dropped(Exception):
+    """Ends a connection; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one client may ask for."""
+
+    clients: int = 16
+    """Largest number of clients at once."""
+    idle_s: float = 600.0
+    """Time after which a client that sends nothing between two messages is disconnected, seconds."""
+    message_s: float = 30.0
+    """Time within which the hello arrives, a started message is completed, and a reply is read, seconds."""
+    items: int = 100_000
+    """Largest number of items of an array in a message."""
+    item_bytes: int = 4_000_000
+    """Largest size of an array in a message, bytes."""
+
+
+@dataclass(eq=False)
+class Connection:
+    """One client."""
+
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+    limits: Limits
+    ask: Ask
+    """Runs a function in the thread that renders."""
+    name: str = ""
+    """Address of the client, for messages."""
+    is_extra: bool = False
+    """Whether the largest number of clients is connected already: this one gets an error."""
+    has_asked: bool = False
+    """Whether it has sent a whole request."""
+    heard_s: float = field(default_factory=time.monotonic)
+    """When it connected or last sent something, by `time.monotonic`."""
+    _due_s: float = 0.0
+    """Time by which the current message must be complete, by `time.monotonic`."""
+
+    async def hello(self, n_bytes: int) -> bytes:
+        """The bytes that a client sends first. Raises TimeoutError after `limits.message_s`."""
+        self._due_s = time.monotonic() + self.limits.message_s
+        return await self.rest(n_bytes)
+
+    async def first(self, n_bytes: int) -> bytes:
+        """The first bytes of a message. Raises TimeoutError after `limits.idle_s`, and if they come in part only."""
+        async with asyncio.timeout(self.limits.idle_s):
+            begun = await self.reader.readexactly(1)
+        self._due_s = time.monotonic() + self.limits.message_s
+        return begun + await self.rest(n_bytes - 1)
+
+    async def rest(self, n_bytes: int) -> bytes:
+        """More bytes of a message. Raises TimeoutError `limits.message_s` after the message began."""
+        async with asyncio.timeout(self._due_s - time.monotonic()):
+            data = await self.reader.readexactly(n_bytes)
+        self.heard_s = time.monotonic()
+        return data
+
+    async def send(self, data: bytes) -> None:
+        """Send a reply in one write. Raises TimeoutError if the client does not read it in `limits.message_s`."""
+        self.writer.write(data)
+        # Not `wait_for`, which in Python 3.11 loses a cancellation that comes as it ends.
+        async with asyncio.timeout(self.limits.message_s):
+            await self.writer.drain()
