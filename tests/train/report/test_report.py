@@ -19,7 +19,7 @@ from tests.train.report.conftest import BLOCKS, HEADLINE, HOSTILE, report_comman
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of
-from perilune_train.cli.main import report as command
+from perilune_train.cli import report as command
 from perilune_train.records.metrics_file import write_metrics
 from perilune_train.report.ground import shaded_ground
 from perilune_train.report.page import SUMMARY, gather, json_block, write_report
