@@ -45,7 +45,7 @@ SELECTIONS: dict[str, Selection] = {
     ),
 }
 """`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (true of every label).
-`visible`: craters that a person can see in the frame, for training and evaluation."""
+`visible`: craters above a threshold of contrast, for training and evaluation (docs/explanation/labels.md)."""
 
 
 REACH_RADII = 1.5
