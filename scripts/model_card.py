@@ -95,7 +95,8 @@ def _detector(one: Shipment) -> list[str]:
         "",
         "- `visible`: craters above a threshold of contrast in the frame",
         "- `paper`: all craters of 2 to 50 px radius, however faint",
-        "- usual: detections of other craters are neither right nor wrong; edge: detections of craters below 2 px are false positives",
+        "- usual: detections of other craters are neither right nor wrong; edge: detections of craters below 2 px are "
+        "false positives",
         "- strict: every detection without a label is a false positive",
         "",
         "| bin, labels by `visible`, usual scoring rule | AP |",
