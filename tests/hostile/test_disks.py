@@ -15,7 +15,7 @@ import pytest
 from perilune_render.cli.main import main as render
 from perilune_shared.cli.main import main as manifest
 from perilune_train.cli.main import main as train
-from perilune_train.detect import compare_runs as _compare  # noqa: F401  (loaded before the commands are forked)
+from perilune_train.detect import evaluate_runs as _compare  # noqa: F401  (loaded before the commands are forked)
 from perilune_train.detect.deploy import export as _export  # noqa: F401
 from perilune_train.detect.images import predict as _predict  # noqa: F401
 from tests.helpers.drawn_dataset import build_dataset

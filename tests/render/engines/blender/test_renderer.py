@@ -174,8 +174,7 @@ def test_a_hidden_rim_and_a_dark_crater_are_reported():
             above,
             ROTATION_CAMERA_FROM_BODY,
             renderer.render(above, ROTATION_CAMERA_FROM_BODY),
-            2,
-            90,
+            (2, 90),
         )
         assert lit.visible_fraction[0] > 0.9 and lit.sunlit_fraction[0] < 0.1
         aside = np.array([-150.0, 0, 100.0])
