@@ -7,6 +7,8 @@ import sys
 
 import perilune
 
+if len(sys.argv) != 3:
+    sys.exit("usage: find_craters.py IMAGE PICTURE")
 image, picture = sys.argv[1:]
 detector = perilune.load_detector()
 craters = detector(image)

@@ -9,6 +9,8 @@ from torch.utils.data import DataLoader
 
 import perilune
 
+if len(sys.argv) != 3:
+    sys.exit("usage: read_dataset.py DATASET PICTURE")
 address, picture = sys.argv[1:]
 dataset = perilune.open_dataset(address)
 dataset[0].plot().save(picture)

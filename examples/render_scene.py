@@ -7,6 +7,8 @@ import sys
 
 import perilune
 
+if len(sys.argv) < 2:
+    sys.exit("usage: render_scene.py PICTURE [SETTING ...]")
 picture, *settings = sys.argv[1:]
 scene = perilune.Scene("mare", seed=7, sun_elevation_deg=20, settings=settings)
 frames = scene.render(perilune.descent(n_frames=5))

@@ -12,8 +12,8 @@ PROGRAMS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_a_program_runs(program, quick, tmp_path, monkeypatch):
-    """In the repository, after `make dataset`."""
-    for address, target in {"docs": TOP / "docs", "data/small": quick}.items():
+    """In the repository, after `make dataset PRESET=tiny`."""
+    for address, target in {"docs": TOP / "docs", "data/tiny": quick}.items():
         (tmp_path / address).parent.mkdir(exist_ok=True)
         (tmp_path / address).symlink_to(target)
     monkeypatch.chdir(tmp_path)

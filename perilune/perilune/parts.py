@@ -17,4 +17,5 @@ def part(module: str, what: str) -> Any:
     except ModuleNotFoundError as error:
         extra = "render" if module.startswith("perilune_render") else "train"
         found = f"no module {str(error.name).split('.')[0]}"
-        raise MissingPart("perilune", what, found, f"pip install 'perilune[{extra}]'") from None
+        cure = f"perilune_{extra}: `make setup` in a checkout of perilune, or pip install 'perilune[{extra}]'"
+        raise MissingPart("perilune", what, found, cure) from None

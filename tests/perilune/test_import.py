@@ -47,7 +47,10 @@ def test_a_missing_part_is_named_with_what_to_install(missing, use, extra):
 def test_a_dataset_without_the_trainer_says_what_to_install(quick):
     opened = f"perilune.open_dataset({str(quick / 'detect')!r})"
     code = f"sys.modules['perilune_train'] = None\nimport perilune; {opened}.torch()"
-    assert "torch: got no module perilune_train, expected pip install 'perilune[train]'" in run(code).stderr
+    assert (
+        "expected perilune_train: `make setup` in a checkout of perilune, or pip install 'perilune[train]'"
+        in run(code).stderr
+    )
 
 
 def test_only_public_names_are_listed_and_each_has_an_explanation():

@@ -3,7 +3,8 @@
 import pytest
 from pydantic import ValidationError
 
-from perilune_shared.config.resolve import PRESETS, resolve
+from perilune_shared.config.resolve import PRESETS, SECTIONS, resolve
+from perilune_train.cli import main
 from perilune_train.detect.config import DetectConfig
 
 
@@ -27,3 +28,7 @@ def test_the_papers_weights_and_limits_are_the_defaults():
 def test_frozen_epochs_must_leave_some_to_train():
     with pytest.raises(ValidationError, match="frozen_epochs below epochs"):
         DetectConfig(epochs=3, frozen_epochs=3)
+
+
+def test_every_section_of_the_trainer_is_known_to_configuration_files():
+    assert set(main.SECTIONS) <= set(SECTIONS)

@@ -1,7 +1,11 @@
+from typing import get_args
+
 import numpy as np
 import pytest
 
+from perilune_render.config.terrain import CratersConfig
 from perilune_render.terrain.craters import profile
+from perilune_render.terrain.size_frequency import EQUILIBRIA
 
 PROFILES = ["fassett_thomson", "pangu"]
 
@@ -93,3 +97,15 @@ def test_diffusion_keeps_the_volume():
     x = np.linspace(0, profile.REACH, 301)
     volume = (tables.bowl[:24] * x).sum(axis=1)
     assert np.allclose(volume, volume[0], rtol=5e-3)
+
+
+def test_every_profile_of_the_settings_has_a_shape_of_its_own():
+    """A name without a branch in profile.py would silently give another profile."""
+    names = get_args(CratersConfig.model_fields["profile"].annotation)
+    x = np.linspace(0, 3, 301)
+    shapes = {profile.fresh_rim(x, name).tobytes() for name in names}
+    assert sorted(names) == sorted(PROFILES) and len(shapes) == len(names)
+
+
+def test_every_equilibrium_of_the_settings_is_registered():
+    assert set(get_args(CratersConfig.model_fields["equilibrium"].annotation)) == set(EQUILIBRIA)

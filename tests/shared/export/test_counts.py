@@ -1,9 +1,12 @@
 """Exports of one dataset agree on the number of craters, and their progress bars reach the end."""
 
+from typing import get_args
+
 import pytest
 from rich.progress import Progress
 from tests.helpers.drawn_dataset import build_dataset
 
+from perilune_shared.cli import export
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.export.coco import export_coco
 from perilune_shared.export.hugging_face import export_hugging_face
@@ -37,3 +40,8 @@ def test_the_progress_bar_of_one_split_reaches_the_end(drawn_root, tmp_path, exp
     export(open_dataset(drawn_root), tmp_path / "out", progress, "test")
     (task,) = progress.tasks
     assert task.completed == task.total > 0
+
+
+def test_every_format_has_the_files_by_which_it_is_known():
+    """Croissant is one file beside the dataset."""
+    assert set(get_args(export.ExportFormat)) - {"croissant"} == set(export._KNOWN_BY)
