@@ -170,7 +170,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
         "a compressed ZIP",
     ),
     "overlapping files": (overlapping, "a ZIP whose files overlap"),
-    "many files": (many_files, "a list of"),
+    "many files": (many_files, "a directory of"),
     "a pickle of 5 MB": (lambda: with_pickle(b"\x80\x02" + b"}" * 5_000_000), "a pickle of 5000002 bytes"),
     "a pickle of 4 MB": (lambda: with_pickle(b"\x80\x02" + b"}" * 3_900_000), "damaged"),
     "10^12 values": (lambda: saved(nested(12)), "more values, text or nesting"),
