@@ -1,4 +1,4 @@
-"""Limits of a container or a batch job on processor and memory: Linux cgroups, versions 1 and 2."""
+"""Processor and memory limits of a container or batch job: Linux cgroups, versions 1 and 2."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,13 +7,13 @@ _ROOT, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processor_quota() -> float | None:
-    """Least processor quota, in cores, of this process's cgroup and its parents; None without a quota."""
-    quotas = [used / period for used, period in _pairs("cpu") if used > 0 and period > 0]
+    """Smallest processor quota, in cores, of this process's cgroup and its parents; None without a quota."""
+    quotas = [quota / period for quota, period in _pairs("cpu") if quota > 0 and period > 0]
     return min(quotas, default=None)
 
 
 def memory_left_bytes() -> float | None:
-    """Least memory, in bytes, that this process's cgroup and its parents may still use; None without a limit."""
+    """Memory, in bytes, that the limits of this process's cgroup and its parents still allow; None without a limit."""
     left = [float(limit - used) for limit, used in _pairs("memory") if limit >= 0]
     return min(left, default=None)
 
@@ -22,7 +22,7 @@ _FILES = {
     "cpu": (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")),
     "memory": (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")),
 }
-"""Files of a controller with two numbers, in version 2 and in version 1."""
+"""Files with the two numbers of each controller: version 2, then version 1."""
 
 
 def _pairs(controller: str) -> Iterator[tuple[int, int]]:
@@ -39,7 +39,8 @@ def _pairs(controller: str) -> Iterator[tuple[int, int]]:
 def _folders(controller: str) -> list[Path]:
     """Folders of this process's cgroups for a controller, up to the roots.
 
-    In a container the path that the kernel states may lie outside what is mounted; the root is then the container's.
+    In a container, the path in /proc/self/cgroup may be outside the mounted tree; the mounted root is then the
+    container's own cgroup.
     """
     try:
         lines = _OWN.read_text(encoding="utf-8", errors="replace").splitlines()

@@ -132,10 +132,10 @@ def ones(*shape: int) -> torch.Tensor:
 
 
 CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
-    "nothing": (lambda: b"", "no checkpoint"),
-    "text": (lambda: b"not a checkpoint" * 100, "no checkpoint"),
-    "first half": (lambda: saved()[: len(saved()) // 2], "no checkpoint"),
-    "old format": (lambda: pickle.dumps({"architecture": DETECTOR}), "no checkpoint"),
+    "nothing": (lambda: b"", "not a checkpoint"),
+    "text": (lambda: b"not a checkpoint" * 100, "not a checkpoint"),
+    "first half": (lambda: saved()[: len(saved()) // 2], "not a checkpoint"),
+    "old format": (lambda: pickle.dumps({"architecture": DETECTOR}), "not a checkpoint"),
     "runs a command": (lambda: calling(os.system, "touch executed"), "a file that calls posix.system"),
     "calls eval": (lambda: calling(eval, "1"), "a file that calls __builtin__.eval"),
     "name with escape codes": (
@@ -170,7 +170,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
         "a compressed ZIP",
     ),
     "overlapping files": (overlapping, "a ZIP whose files overlap"),
-    "many files": (many_files, "a list of"),
+    "many files": (many_files, "a directory of"),
     "a pickle of 5 MB": (lambda: with_pickle(b"\x80\x02" + b"}" * 5_000_000), "a pickle of 5000002 bytes"),
     "a pickle of 4 MB": (lambda: with_pickle(b"\x80\x02" + b"}" * 3_900_000), "damaged"),
     "10^12 values": (lambda: saved(nested(12)), "more values, text or nesting"),
@@ -197,7 +197,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
     "unknown attention": (lambda: saved(DETECTOR | {"attention": "\x1b[31mred"}), "architecture.attention"),
     "a network of 1 GB in 2 kB": (lambda: saved(DETECTOR | {"width": 2.0}, {}), "another architecture"),
     "weights of another width": (lambda: saved(DETECTOR | {"width": 0.25}), "another architecture"),
-    "NaN": (lambda: saved(weights=changed_tensor("anchors", float("nan"))), "1 of 18 numbers not finite"),
+    "NaN": (lambda: saved(weights=changed_tensor("anchors", float("nan"))), "1 of 18 numbers are not finite"),
     "infinity": (lambda: saved(weights=changed_tensor("backbone.stem.conv.weight", float("inf"))), "not finite"),
     "negative variance": (
         lambda: saved(weights=changed_tensor("backbone.stem.norm.running_var", -1.0)),
@@ -250,7 +250,7 @@ SAFETENSORS: dict[str, tuple[Callable[[], bytes], str]] = {
     "architecture is a list": (lambda: half([1]), "architecture: got missing"),
     "width of 10^9": (lambda: half(DETECTOR | {"width": 1e9}), "architecture.width"),
     "width is NaN": (lambda: half(DETECTOR | {"width": float("nan")}), "architecture.width"),
-    "NaN": (lambda: half(weights=changed_tensor("anchors", float("nan"))), "1 of 18 numbers not finite"),
+    "NaN": (lambda: half(weights=changed_tensor("anchors", float("nan"))), "1 of 18 numbers are not finite"),
     "another type": (
         lambda: half(weights=state() | {"anchors": torch.ones(3, 3, 2).to(torch.float8_e5m2)}),
         "numbers of type F8_E5M2",

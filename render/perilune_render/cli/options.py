@@ -16,7 +16,7 @@ from perilune_shared.errors import UserError
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""
 OneKind = Annotated[Kind, typer.Option(help="Dataset of the preset: detect (crater detection) or nav (navigation).")]
-"""The option of commands that are about one dataset; its default is detect."""
+"""Option of commands that use one dataset; commands set the default detect."""
 Preset = Annotated[
     str,
     typer.Option(
@@ -29,7 +29,9 @@ Setting = Annotated[
 ]
 Dem = Annotated[
     Path | None,
-    typer.Option(help="Elevation model (GeoTIFF, JPEG 2000, PDS3, PDS4, ISIS) as the base; smaller craters are added."),
+    typer.Option(
+        help="Elevation model (GeoTIFF, JPEG 2000, PDS3, PDS4, ISIS) as base terrain; finer craters are added."
+    ),
 ]
 Unit = Annotated[
     HeightUnit | None,
@@ -37,7 +39,7 @@ Unit = Annotated[
 ]
 Catalogue = Annotated[
     Path | None,
-    typer.Option(help="Catalogue of the elevation model's own craters, CSV or Parquet."),
+    typer.Option(help="Catalogue of the craters in the elevation model, CSV or Parquet."),
 ]
 
 
@@ -63,7 +65,7 @@ def warn_of_size(config: DatasetConfig) -> None:
 
 
 def with_unit(setting: list[str] | None, height_unit: HeightUnit | None) -> list[str]:
-    """The settings of a command line, with the unit of its elevation model."""
+    """The values of --set, with --height-unit as a further setting."""
     unit = [] if height_unit is None else [f"dataset.terrain.elevation.height_unit={height_unit}"]
     return [*(setting or []), *unit]
 
@@ -79,12 +81,12 @@ def resolved_config(
 ) -> DatasetConfig:
     """The settings of a preset with the user's changes. Raises UserError on invalid ones.
 
-    `given_scene`: whether the command takes poses from outside, and so may have settings of `dataset.scene`.
+    `given_scene`: whether poses come from a file or from clients; the command then accepts `dataset.scene`.
     """
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
     if resolved.scene is not None and not given_scene:
         raise UserError(
-            "configuration", "dataset.scene", "set", "null, or poses: `perilune-render frames`, `preview --poses`"
+            "configuration", "dataset.scene", "set", "null; it is for `perilune-render frames` and `preview --poses`"
         )
     if resolved.survey is not None:
         raise UserError("configuration", "dataset.survey", "set", "null; `perilune-render survey` renders from orbit")
@@ -95,10 +97,15 @@ def resolved_config(
     terrain = resolved.terrain.model_copy(update=paths)
     if terrain.catalogue is not None and terrain.dem is None:
         raise UserError(
-            "--catalogue", "catalogue", terrain.catalogue, "--dem as well, the elevation model of this catalogue"
+            "--catalogue", "catalogue", terrain.catalogue, "also --dem, the elevation model of this catalogue"
         )
     for name in (*SITE_FIELDS, *FILE_FIELDS):
         found = getattr(terrain.elevation, name)
         if found != ElevationConfig.model_fields[name].default and terrain.dem is None:
-            raise UserError("configuration", f"dataset.terrain.elevation.{name}", found, "--dem, an elevation model")
+            raise UserError(
+                "configuration",
+                f"dataset.terrain.elevation.{name}",
+                found,
+                "to be set only with --dem, an elevation model",
+            )
     return resolved.model_copy(update={"terrain": terrain})

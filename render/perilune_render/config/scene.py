@@ -1,4 +1,4 @@
-"""Settings of one scene whose poses are given: by a file (`perilune-render frames`)."""
+"""Settings of one scene whose poses are given by a file (`perilune-render frames`)."""
 
 from typing import Annotated
 
@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from perilune_shared.config.resolve import Section
 
 HIGHEST_M = 20_000.0
-"""Largest height of a camera in a scene with horizon, metres: the ground is the cap of a sphere, seen from above."""
+"""Largest height of a camera in a scene with horizon, metres; the ground is a spherical cap around the site."""
 
 
 class ViewConfig(Section):
@@ -16,8 +16,8 @@ class ViewConfig(Section):
     height_m: Annotated[float, Field(gt=0, le=2e6)]
     """Height of a camera above the ground, metres."""
     reach_m: Annotated[float, Field(gt=0, le=2e6)]
-    """Largest |x| or |y| from the site of the ground that cameras at this height or below show, metres; with `horizon`,
-    largest |x| or |y| of the cameras."""
+    """Largest |x| or |y| of the ground that cameras at this height or below show, metres; with `horizon`, largest |x|
+    or |y| of the cameras themselves."""
 
 
 class SceneConfig(Section):
@@ -40,7 +40,7 @@ class SceneConfig(Section):
     def _views_ascend(self) -> "SceneConfig":
         for low, high in zip(self.views, self.views[1:], strict=False):
             if high.height_m <= low.height_m or high.reach_m < low.reach_m:
-                raise ValueError("views with ascending height_m, and reach_m that does not fall")
+                raise ValueError("views with ascending height_m, and reach_m that does not decrease")
         if self.horizon and self.views and self.views[-1].height_m > HIGHEST_M:
-            raise ValueError(f"views of at most {HIGHEST_M:g} m, since horizon is true")
+            raise ValueError(f"height_m of at most {HIGHEST_M:g}, since horizon is true")
         return self

@@ -27,7 +27,7 @@ class Flight:
     motion: Motion | None = None
     """The motion between the frames; None if it is not known."""
     angular_velocity_radps: Array | None = None
-    """Angular velocity of the camera, O_C, radians per second (N, 3); None for none during a frame."""
+    """Angular velocity of the camera, O_C, radians per second (N, 3); None if it does not rotate during a frame."""
 
     @property
     def rotation_camera_from_site(self) -> Array:
@@ -36,7 +36,7 @@ class Flight:
 
 
 def fly(config: FlightConfig, n_frames: int, seed: int) -> Flight:
-    """Draw the trajectory of a random seed, at `n_frames` times of equal distance."""
+    """Draw the trajectory of a random seed, at `n_frames` evenly spaced times."""
     motion = draw_motion(config, seed)
     time = np.linspace(0, config.duration_s, n_frames)
     position, velocity, _ = motion.path_at(time)

@@ -20,7 +20,7 @@ _HILL_M = 64.0
 
 
 def view_of(config: DatasetConfig, rig: Rig, kind: str) -> ViewEnvelope:
-    """The views that the ground of a configuration is made for, for the cameras on the body.
+    """The views for which the ground of a configuration is generated: those of all cameras on the body.
 
     Raises UserError if frames of the flights of `kind` could show the horizon, or if a given scene has no views.
     """
@@ -41,10 +41,10 @@ def scene_view(scene: SceneConfig, *cameras: Camera) -> ViewEnvelope:
 
 
 def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
-    """Smallest distance from a camera to ground at each distance from the site, up to the horizon: both (M,), metres.
+    """Smallest distance from any camera to the ground, and the ground's distance from the site: both (M,), metres.
 
     Cameras at the distance `reach_m[i]` from the site are at `height_m[i]` or above, with linear interpolation.
-    Beyond the horizon of the highest camera there is ground up to the place where a hill of _HILL_M is hidden.
+    The ground extends beyond the horizon of the highest camera to where a hill of height _HILL_M is hidden.
     """
     edge = reach_m[-1] + float(horizon_m(height_m[-1]) + horizon_m(_HILL_M))
     distance = np.union1d(np.geomspace(min(height_m[0], reach_m[0]), edge, _N_DISTANCES), reach_m)
@@ -56,12 +56,12 @@ def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
 def horizon_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
     """The views up to the horizon from all trajectories of a flight, up to three standard deviations from the nominal.
 
-    Raises UserError if they begin above HIGHEST_M.
+    Raises UserError if the trajectories can begin above HIGHEST_M.
     """
     altitude, spread = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, _N_ALTITUDES), _spread_m(flight)
     highest = flight.start_altitude_m + spread
     if highest > HIGHEST_M:
-        expected = f"views of at most {HIGHEST_M:g} m: with horizon, the descents of the preset begin too high"
+        expected = f"height_m of at most {HIGHEST_M:g}; the preset's descents begin too high for a horizon"
         raise UserError("configuration", "dataset.scene.views", "none", expected)
     reach = np.maximum.accumulate(nominal_distance_m(flight, altitude) + max(spread, 0.1 * flight.end_altitude_m))
     height = np.append(_lowest_m(flight, altitude), highest)
@@ -71,16 +71,16 @@ def horizon_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
 
 
 def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
-    """The views of all cameras on a body: at each distance the finest spacing that one of them needs.
+    """The views of all cameras on a body: at each distance, the finest spacing that any camera needs.
 
-    Raises UserError as `view_envelope`.
+    Raises UserError as `view_envelope` does.
     """
     views = [view_envelope(each.levelled(), each.flight_settings(flight)) for each in rig.values()]
     return views[0] if len(views) == 1 else _joined(views)
 
 
 def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
-    """The envelope of several, with the largest focal length; heights of the others are scaled to it."""
+    """The envelope of several views, with the largest focal length; heights are scaled to this focal length."""
     focal = max(view.focal_px for view in views)
     reach = np.unique(np.concatenate([view.reach_m for view in views]))
     heights = []
@@ -89,7 +89,7 @@ def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
         height = np.interp(reach, distance, view.height_m[first]) * focal / view.focal_px
         heights.append(np.where(reach <= distance[-1], height, np.inf))
     seen = [view.seen for view in views if view.seen is not None]
-    # Levels are cut by the height of the camera alone, so all have the spacing of the largest focal length.
+    # Levels are selected by camera height alone, so all levels have the spacing for the largest focal length.
     z = np.geomspace(min(each.z_m[0] for each in seen), max(each.z_m[-1] for each in seen), _N_HEIGHTS)
     nearest = np.min([np.interp(z, each.z_m, each.nearest_m) for each in seen], axis=0)
     farthest = np.max([np.interp(z, each.z_m, each.farthest_m) for each in seen], axis=0)
@@ -119,7 +119,7 @@ def _spread_m(flight: FlightConfig) -> float:
 
 
 def _lowest_m(flight: FlightConfig, altitude_m: Array) -> Array:
-    """Lowest height above the ground at nominal altitudes (N,), which may rise by a twentieth of the altitude."""
+    """Lowest height above the ground at nominal altitudes (N,); the ground may rise by a twentieth of the altitude."""
     return np.maximum(0.95 * altitude_m - _spread_m(flight), 0.2 * altitude_m)
 
 
@@ -148,7 +148,7 @@ def nominal_distance_m(flight: FlightConfig, altitude_m: Array) -> Array:
 
 
 def half_view_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
-    """Largest distance |dx| or |dy| from below the camera that a frame at this altitude shows of level ground, metres.
+    """Largest |dx| or |dy| between the point below the camera and level ground in a frame at this altitude, metres.
 
     The camera's axes are parallel to the axes of O_L except for small rotations, so a frame covers a square along the
     axes. Includes three standard deviations of tilt and rotation.
@@ -159,9 +159,9 @@ def half_view_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Arra
 
 
 def seen_ground(camera: Camera, flight: FlightConfig) -> SeenGround:
-    """The ground in view by the camera's height, with the margins of `view_envelope`.
+    """The ground in view at each camera height, with the margins of `view_envelope`.
 
-    Position and attitude are independent, so that three standard deviations of both are less than their sum.
+    Errors of position and attitude are independent, so their three standard deviations are added in quadrature.
     """
     spread = 3 * flight.position_sigma_m
     lowest, highest = flight.end_altitude_m, flight.start_altitude_m

@@ -32,14 +32,14 @@ def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
     return np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
 
 
-def padded(pictures: list[np.ndarray], in_row: list[int], columns: int) -> list[np.ndarray]:
-    """Pictures of any size for a sheet, in rows of `columns`; the row k starts with the next `in_row[k]` pictures.
+def padded(pictures: list[np.ndarray], group_sizes: list[int], columns: int) -> list[np.ndarray]:
+    """Pictures padded for a sheet with `columns` columns; each group of `group_sizes[k]` pictures starts a row.
 
     Smaller pictures and missing ones are filled with dark grey.
     """
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     sheet, rest = [], iter(pictures)
-    for n in in_row:
+    for n in group_sizes:
         row = [next(rest) for _ in range(n)] + [np.full((1, 1), _DARK, np.uint8)] * (-n % columns)
         for picture in row:
             more = (0, height - picture.shape[0], 0, width - picture.shape[1])

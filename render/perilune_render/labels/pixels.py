@@ -14,7 +14,7 @@ REACH = 1.5
 """Radius of the disc in which contrast is measured, rim radii."""
 _N_FITTED = 4
 _SLACK = 0.99
-"""Factor on the least radius of selected craters. Their ellipses are computed later, with other rounding."""
+"""Factor on the smallest radius to select: ellipses are computed later, with different rounding."""
 
 
 class Circles(NamedTuple):
@@ -29,7 +29,7 @@ class Circles(NamedTuple):
 
 
 class _Pinhole(NamedTuple):
-    """A camera without distortion, as an argument of compiled functions: all in pixels."""
+    """A camera without distortion, as an argument of compiled functions; all values in pixels."""
 
     fx: float
     fy: float
@@ -46,11 +46,11 @@ def _pinhole(camera: Camera) -> _Pinhole:
 def centred_in(
     camera: Camera, position_m: Array, rotation_camera_from_site: Array, circles: Circles, least_px: float
 ) -> tuple[np.ndarray, Array]:
-    """Circles in O_L that are centred in an image without distortion and may reach a radius sqrt(a b) of `least_px`.
+    """Circles in O_L whose centre is in an image without distortion and whose image has a radius of about `least_px`.
 
-    A few smaller ones are selected too. Returns their indices (M,) and their centres in O_C (M, 3), metres. The centres
-    and pixels equal those of `camera_from_site`, `Camera.project` and `Camera.inside` to the bit. One loop computes
-    them, since a scene has far more craters than an image.
+    The radius is sqrt(a b); some slightly smaller circles are selected too. Returns their indices (M,) and their
+    centres in O_C (M, 3), metres. The centres and pixels equal those of `camera_from_site`, `Camera.project` and
+    `Camera.inside` to the bit. A single loop computes them, since a scene has far more craters than an image shows.
     """
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
     return _centred_in(circles, *pose, _pinhole(camera), least_px)
@@ -99,9 +99,10 @@ class Rims(NamedTuple):
 def rim_shares(
     rims: Rims, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth: np.ndarray
 ) -> Array:
-    """Share (N,) of the points of rims that an image without distortion shows, given its depth (h, w), metres.
+    """Share (N,) of each rim's points that an image without distortion shows, given the image's depth (h, w), metres.
 
-    One loop computes the same as `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the bit.
+    A single loop computes the result of `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the
+    bit.
     """
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
     return _rim_shares(rims, *pose, _pinhole(camera), depth)
@@ -134,7 +135,7 @@ def _rim_shares(rims, position, rotation, pinhole, depth):
 
 
 def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
-    """Share (N,) of lit pixels in `sunlit` (h, w) bool among those with their centre in each of N ellipses.
+    """Sunlit share (N,) of the pixels whose centres are in each of N ellipses; `sunlit` is (h, w) bool.
 
     0 if an ellipse contains no pixel centre.
     """
@@ -168,9 +169,9 @@ def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: 
     crater's plane, in radii along and across the Sun's direction, to offsets in pixels. `grey` and `noise` (h, w) are
     the mean and standard deviation of each pixel.
 
-    Within REACH radii, grey is fitted by least squares as a plane plus c times the shading of a bowl,
-    -s exp(-(r / 0.8)^4), with r the distance from the centre and s its component towards the Sun: the wall that faces
-    the Sun is bright. The result is c over its standard error, where a pixel's variance is the sum of the variances of
+    Within REACH radii, grey is fitted by least squares as a plane plus c times the shading of a bowl, -s exp(-(r /
+    0.8)^4), with r the distance from the centre and s the offset's component towards the Sun: the wall that faces the
+    Sun is bright. The result is c over its standard error, where a pixel's variance is the sum of the variances of
     noise and of the fit's residuals. It is negative for a bump, about 0 for flat ground, and 0 if too few pixels are in
     the image.
     """
@@ -215,12 +216,12 @@ def _shading(centre, matrices, grey, noise):
                 count += 1
         if count <= _N_FITTED:
             continue
-        result[k] = _over_its_error(normal, right, squares, variance / count, count)
+        result[k] = _last_over_its_error(normal, right, squares, variance / count, count)
     return result
 
 
 @njit()
-def _over_its_error(normal, right, squares, variance, count):
+def _last_over_its_error(normal, right, squares, variance, count):
     """The last fitted value over its standard error, by Cholesky factors L L^T = normal (lower triangle given)."""
     for i in range(_N_FITTED):
         for j in range(i + 1):
@@ -237,18 +238,18 @@ def _over_its_error(normal, right, squares, variance, count):
             right[i] -= normal[i, m] * right[m]
         right[i] /= normal[i, i]
         squares -= right[i] ** 2
-    # The last unknown is right / L and its variance 1 / L^2, both with the last diagonal element of L.
+    # The last unknown is right / d and its variance is 1 / d^2, with d the last diagonal element of L.
     return right[-1] / np.sqrt(variance + max(squares, 0.0) / (count - _N_FITTED))
 
 
 def smallest_crater(
     crater_id: np.ndarray, circles: Circles, boxes_px: Array, camera: Camera, depth_m: np.ndarray | None
 ) -> np.ndarray:
-    """Index image (h, w) float32: the id of the last of N craters whose visible interior holds each pixel's centre.
+    """Index image (h, w) float32: the smallest crater whose visible interior contains each pixel's centre.
 
     `circles` are the rims in O_C, largest first, `boxes_px` (N, 4) the bounding boxes of their images. `camera` has no
-    distortion. depth_m (h, w), metres along the axis, hides interiors; None hides nothing. Pixels without a crater
-    are -1.
+    distortion. `depth_m` (h, w), metres along the optical axis, tells which interiors are hidden; with None none is.
+    Pixels without a crater are -1.
     """
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)
     depth = np.full((1, 1), np.inf) if depth_m is None else depth_m

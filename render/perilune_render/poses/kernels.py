@@ -28,7 +28,7 @@ def library() -> Any:
 def loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
     """Load kernels, and those that meta-kernels name, into an empty pool; clear it at the end.
 
-    Raises UserError for a file that is missing or is no regular file, and for a meta-kernel within a meta-kernel,
+    Raises UserError for a file that is missing or is not a regular file, and for a meta-kernel within a meta-kernel,
     before SPICE opens it: opening a pipe or a device can block for ever.
     """
     spice.kclear()
@@ -66,7 +66,7 @@ def _named_by(spice: Any, path: Path) -> list[Path]:
 
 
 def _check_regular(where: Path, path: Path, expected: str) -> None:
-    """Raise UserError about `where` for a path that is no regular file."""
+    """Raise UserError about `where` for a path that is not a regular file."""
     field = "kernel" if where == path else _LISTED
     prefix = "" if where == path else f"{path}: "
     try:

@@ -1,11 +1,11 @@
 """Poses and Sun from SPICE kernels, in O_L of a site (Acton et al. 2018, doi 10.1016/j.pss.2017.02.013).
 
-O_L is taken as a rigid frame fixed to the Moon: its origin is the site, its axes are west, south and up there. Place,
-velocity and attitude are converted by the same rotation. Deviation: the rendered ground is a plane, and the Moon falls
-away from the plane by d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
+O_L is taken as a rigid frame fixed to the Moon: its origin is the site, its axes point west, south and up at the site.
+Position, velocity and attitude are converted by the same rotation. Deviation: the rendered ground is a plane, and the
+Moon falls away from the plane by d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
 
-Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are checked
-before SPICE opens them, and read too.
+Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are also
+read; they are checked before SPICE opens them.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, quaternion_fro
 _MOON = "MOON"
 _FIXED_FRAMES = ("MOON_ME", "IAU_MOON")
 """Frames fixed to the Moon in order of preference: the first that the kernels define is used."""
-_MOST_FRAMES = 100_000
+_MAX_FRAMES = 100_000
 _LOADING_LIMIT_S = 60.0
-"""Longest time to open all kernels, seconds: a file that was replaced by a pipe after its check blocks for ever."""
+"""Time limit for opening all kernels, seconds: a file replaced by a pipe after the check would block for ever."""
 _LOADED = "loaded"
 
 
@@ -39,23 +39,23 @@ class SpiceSource:
     """What to read from kernels."""
 
     kernels: tuple[Path, ...]
-    """Kernels and meta-kernels, later ones override earlier ones."""
+    """Kernels and meta-kernels; later ones override earlier ones."""
     spacecraft: str
     """Name or NAIF id of the spacecraft, or of its camera if the kernels have the camera's position."""
     camera_frame: str
     """Name of the camera's frame."""
     camera_axes: str
-    """Axes of this frame to the right, down and forward in the image, as `x,y,z` or `-y,x,z`."""
+    """Axes of this frame that point right, down and forward in the image, such as `x,y,z` or `-y,x,z`."""
     fixed_frame: str | None
     """Frame fixed to the Moon; None for the first of MOON_ME and IAU_MOON that the kernels define."""
     start: str
     """UTC of the first frame."""
     end: str
-    """UTC of the last frame, or of the end."""
+    """UTC of the end; the last frame is at or before it."""
     n_frames: int | None
     """Number of frames, evenly spaced from start to end."""
     step_s: float | None
-    """Time between frames in place of their number, seconds."""
+    """Time between frames, seconds, in place of `n_frames`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class SpicePoses:
     """rotation_camera_from_site as unit quaternions (N, 4)."""
     velocity_mps: Array
     """Velocity relative to the ground, O_L, metres per second (N, 3)."""
-    turn_radps: Array | None
+    angular_velocity_radps: Array | None
     """Angular velocity of the camera relative to the ground, in its own axes, radians per second (N, 3); None if the
     kernels lack it."""
     sun_deg: Array
@@ -91,7 +91,9 @@ def rotation_site_from_fixed(latitude_deg: float, longitude_deg: float) -> Array
 
 
 def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_height_m: float) -> SpicePoses:
-    """Poses, velocities and Suns of a spacecraft, for a site `site_height_m` above the sphere of 1737.4 km.
+    """Poses and velocities of a spacecraft, and the Sun's direction, at a site.
+
+    The site is `site_height_m` above the sphere of 1737.4 km.
 
     Camera poses are geometric, without light time. The Sun is apparent (light time and stellar aberration, "LT+S") and
     seen from the site. SPICE runs in a process of its own, since damaged kernels can crash it. Raises UserError if
@@ -107,7 +109,7 @@ def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, s
     names = ", ".join(path.name for path in source.kernels)
     try:
         if not receiving.poll(_LOADING_LIMIT_S):
-            found = f"no end after {_LOADING_LIMIT_S:g} s of reading {names}"
+            found = f"no result after {_LOADING_LIMIT_S:g} s of reading {names}"
             raise UserError("SPICE", "kernels", found, "kernels that are local files")
         result = receiving.recv()
         if result == _LOADED:
@@ -140,7 +142,7 @@ def _read(
     site_height_m: float,
     tell_loaded: Callable[[], None],
 ) -> SpicePoses:
-    """See `read_spice`; in this process. Calls `tell_loaded` after all kernels are open."""
+    """Do the work of `read_spice` in this process. Calls `tell_loaded` after all kernels are open."""
     spice = library()
     axes = camera_axes(source.camera_axes, "--camera-axes")
     site_from_fixed = rotation_site_from_fixed(latitude_deg, longitude_deg)
@@ -155,12 +157,17 @@ def _read(
         for et in times:
             with reported(spice, f"at {_utc(spice, et)}"):
                 state = spice.spkezr(spacecraft, et, fixed, "NONE", _MOON)[0]
-                turned = axes @ spice.pxform(fixed, source.camera_frame, et) @ site_from_fixed.T
+                rotation_camera_from_site = axes @ spice.pxform(fixed, source.camera_frame, et) @ site_from_fixed.T
                 sun = spice.spkcpo("SUN", et, fixed, "OBSERVER", "LT+S", site_km, _MOON, fixed)[0][:3]
             rows.append(
-                (1000 * site_from_fixed @ (state[:3] - site_km), turned, 1000 * site_from_fixed @ state[3:], sun)
+                (
+                    1000 * site_from_fixed @ (state[:3] - site_km),
+                    rotation_camera_from_site,
+                    1000 * site_from_fixed @ state[3:],
+                    sun,
+                )
             )
-            turns.append(_turn_radps(spice, fixed, source.camera_frame, et, axes))
+            turns.append(_angular_velocity_radps(spice, fixed, source.camera_frame, et, axes))
             _refuse_night(site_from_fixed @ sun, _utc(spice, et))
         start = _utc(spice, times[0])
     position, rotation, velocity, sun = (np.array(column) for column in zip(*rows, strict=True))
@@ -177,7 +184,7 @@ def _read(
     return SpicePoses(times - times[0], position, quaternions, velocity, turn, sun_deg, start, fixed)
 
 
-def _turn_radps(spice: Any, fixed: str, camera_frame: str, et: float, axes: Array) -> Array | None:
+def _angular_velocity_radps(spice: Any, fixed: str, camera_frame: str, et: float, axes: Array) -> Array | None:
     """Angular velocity (3,) of a camera's axes relative to the fixed frame, in the camera's axes; None without data."""
     try:
         rotation, turn = spice.xf2rav(spice.sxform(fixed, camera_frame, et))
@@ -200,10 +207,10 @@ def poses_csv(
     ]
     names = "time_s,x_m,y_m,z_m,qw,qx,qy,qz,vx_mps,vy_mps,vz_mps,sun_azimuth_deg,sun_elevation_deg"
     columns = [poses.time_s[:, None], poses.position_m, poses.rotation_wxyz, poses.velocity_mps, poses.sun_deg]
-    if poses.turn_radps is None:
+    if poses.angular_velocity_radps is None:
         lines.append("# no angular velocities: the kernels (CK) have none at some of these times")
     else:
-        names, columns = f"{names},wx_radps,wy_radps,wz_radps", [*columns, poses.turn_radps]
+        names, columns = f"{names},wx_radps,wy_radps,wz_radps", [*columns, poses.angular_velocity_radps]
     lines.append(names)
     lines += [",".join(map(repr, row)) for row in np.hstack(columns).tolist()]
     return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
@@ -217,8 +224,8 @@ def _times(spice: Any, source: SpiceSource) -> Array:
     if end < begin or (end == begin and source.n_frames != 1):
         raise UserError("--end", "time", source.end, f"a time after --start, {source.start}")
     number = source.n_frames if source.step_s is None else int((end - begin) / source.step_s + 1e-9) + 1
-    if number is None or not 1 <= number <= _MOST_FRAMES:
-        raise UserError("spice", "frames", number, f"1 to {_MOST_FRAMES}")
+    if number is None or not 1 <= number <= _MAX_FRAMES:
+        raise UserError("spice", "frames", number, f"1 to {_MAX_FRAMES}")
     if source.step_s is not None:
         return begin + source.step_s * np.arange(number)
     return np.linspace(begin, end, number)
@@ -261,5 +268,8 @@ def _refuse_night(towards: Array, utc: str) -> None:
     if towards[2] <= 0:
         degrees = np.degrees(np.arcsin(towards[2] / np.linalg.norm(towards)))
         raise UserError(
-            f"SPICE: at {utc}", "elevation of the Sun", f"{degrees:.2f} degrees", "above 0: day at the site"
+            f"SPICE: at {utc}",
+            "elevation of the Sun",
+            f"{degrees:.2f} degrees",
+            "above 0 (the Sun is below the horizon)",
         )

@@ -1,8 +1,8 @@
 """numba.njit with a machine code cache that is keyed by the sources of all kernels.
 
-numba's own cache only checks the file of the function, although functions and constants of other files are compiled
-into it. Here a change to any of them selects a new cache folder. Of several processes that need a kernel for the first
-time, one compiles it and the others wait.
+numba's own cache checks only the file of the function, although the machine code also contains functions and constants
+of other files. Here, a change to any of these files selects a new cache folder. Of several processes that need a kernel
+for the first time, one compiles it and the others wait.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from perilune_render.provenance.caches import compiling, machine_code_folder
 
 
 def njit(**options: Any) -> Callable[[Callable], Any]:
-    """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`; other threads may run meanwhile."""
+    """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`; kernels release the GIL."""
 
     def decorate(function: Callable) -> Any:
         folder = machine_code_folder()
@@ -29,7 +29,7 @@ def njit(**options: Any) -> Callable[[Callable], Any]:
         compile_or_load = kernel.compile
 
         def compile_alone(signature: Any) -> Any:
-            # First numba's lock of threads: one that compiles a caller holds it, and waits here for its callee.
+            # Take numba's thread lock first: a thread that compiles a caller holds it and waits here for the callee.
             with global_compiler_lock, compiling(folder / f"{function.__module__}.{function.__qualname__}.lock"):
                 return compile_or_load(signature)
 

@@ -38,9 +38,9 @@ def add_relief(
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
-    The RMS slope, drawn from `config.rms_slope_deg` by the seed, is the slope of all octaves down to 1 m. Long waves
-    are added before the craters, which cut them. Short ones are added after, since a worn crater is as rough as the
-    ground around it.
+    The RMS slope is drawn from `config.rms_slope_deg` with `seed`; all octaves down to 1 m have this slope together.
+    Long waves are added before the craters, which cut them. Short waves are added afterwards, since a worn crater is
+    as rough as the ground around it.
     """
     finest = finest_wave_m(grid)
     check_waves(config, grid)

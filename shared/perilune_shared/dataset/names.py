@@ -1,6 +1,6 @@
 """Names that datasets and command lines use: kinds, splits, states of images; ids and paths of frames and parts.
 
-Without pandas and pyarrow, so that configurations and `--help` load without them.
+This module imports neither pandas nor pyarrow, so that configurations and `--help` load without them.
 """
 
 from typing import Literal, get_args
@@ -10,7 +10,7 @@ Kind = Literal["detect", "nav"]
 Split = Literal["train", "val", "test"]
 """Part of a dataset for training, validation or test."""
 SplitUnit = Literal["scene", "trajectory", "frame"]
-"""Rows that belong to one split as a whole."""
+"""Unit of a split: all rows of a unit belong to one split."""
 ImageState = Literal["files", "packed", "absent", "planned"]
 """Where the frames are: under frames/, in shards/*.parquet, omitted, or not rendered yet (then without labels)."""
 ImageKind = Literal["png", "exr", "lidar"]
@@ -21,9 +21,9 @@ ImageChoice = Literal["copy", "none", "plan"]
 """How frames are written: `copy`, `none` (omitted), or `plan` (frames, craters, boulders and labels omitted: scenes
 and poses determine them)."""
 ImageMode = Literal[ImageChoice, "link"]
-"""Also `link`: hard links where the file system allows them, so that an edit of a frame changes both datasets."""
+"""ImageChoice, or `link`: hard links where the file system allows them. Editing a frame then changes both datasets."""
 WHOLE_TABLE = "all"
-"""Name of the part that contains all rows of its table, or the first ones of a table with several parts."""
+"""Name of the part that contains all rows of its table, or the first rows if the table has several such parts."""
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
 """Pattern of scene_id and trajectory_id, which become file names."""

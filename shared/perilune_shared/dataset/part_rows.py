@@ -27,7 +27,7 @@ def rows_of_part(
     split: str | None,
     where: Condition | None,
 ) -> pa.Table:
-    """Read the rows of a part that belong to a scene, a trajectory and a split."""
+    """Read the rows of a part that belong to a scene, a trajectory and a split and satisfy `where`; None for any."""
     columns = part.schema.names
     equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
     equal = {name: value for name, value in equal.items() if value is not None and name in columns}
@@ -49,8 +49,8 @@ def rows_of_part(
     if where is not None:
         expression = where.within_table()
         needed += [name for _, name in sorted(where.columns)]
-        may_contain = set(part.groups_where(expression))
-        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in may_contain]
+        possible = set(part.groups_where(expression))
+        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in possible]
     rows = part.read(list(dict.fromkeys(needed)), groups)
     if expression is not None:
         try:

@@ -52,7 +52,7 @@ class Target:
         return Target(self.store, name)
 
     def content(self) -> bytes | None:
-        """Its present content; None if there is no file. Raises UserError if it is too large, or is no regular file."""
+        """Its present content; None if there is no file. Raises UserError if it is too large or not a regular file."""
         if self.store.folder is not None and not (self.store.folder / self.name).exists():
             return None
         if self.store.folder is None and not self.store.exists(self.name):

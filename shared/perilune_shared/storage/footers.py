@@ -10,7 +10,7 @@ _MAX_BYTES = 8 * 2**30
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 """Bound on compression: no data compresses by a larger factor."""
 _NESTED_ROWS = "labels."
-"""Start of the columns of a shard that contain rows of another table, any number for each frame."""
+"""Prefix of the columns of a shard that contain rows of another table: any number of rows for each frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,12 +22,12 @@ class FooterLimits:
     group_rows: int = 2**21
     """Maximum number of rows of a row group."""
     spare_rows: int = 10_000
-    """Rows that a file of any size may have."""
+    """Number of rows allowed whatever the size of the file."""
     bytes_per_row: int = 4
-    """Bytes that each other row takes at least, compressed."""
+    """Minimum compressed size of each further row, bytes."""
 
 
-OF_DATASET = FooterLimits()
+DATASET_LIMITS = FooterLimits()
 
 
 def check_footer(
@@ -35,11 +35,11 @@ def check_footer(
 ) -> None:
     """Check the numbers of rows and values, and the bytes after decompression, of a file of `n_bytes` bytes.
 
-    `footer` is pyarrow's metadata of the file, `columns` has place and path of each column that will be read; without
-    `limits` the limits of a dataset apply. Raises
-    UserError about `address` if a number exceeds its limit, ValueError if a row group has other columns than the file.
+    `footer` is pyarrow's metadata of the file, `columns` has index and path of each column that will be read. Without
+    `limits`, the limits of a dataset apply. Raises UserError about `address` if a number exceeds its limit, ValueError
+    if a row group has other columns than the file.
     """
-    limits = limits or OF_DATASET
+    limits = limits or DATASET_LIMITS
     most_rows = min(limits.rows, limits.spare_rows + n_bytes // limits.bytes_per_row)
     most_group_rows = min(limits.group_rows, most_rows)
     n_uncompressed, n_rows = 0, 0
@@ -58,11 +58,11 @@ def check_footer(
             n_values = column.num_values
             n_uncompressed += max(column.total_uncompressed_size, 0)
             if path.startswith(_NESTED_ROWS):
-                # Each is a row of a table, so the limit of rows applies.
+                # Each value is a row of a table, so the limit of rows applies.
                 n_nested[path] = n_nested.get(path, 0) + n_values
                 if n_values > limits.group_rows or n_nested[path] > most_rows:
                     raise UserError(address, path, f"{n_values} values", f"at most {most_rows} for {n_bytes} bytes")
-            # The longest other list is a quaternion.
+            # In other columns the longest list is a quaternion.
             elif n_values > 4 * in_group:
                 raise UserError(address, path, f"{n_values} values", "at most 4 per row")
     if footer.num_rows != n_rows or n_rows > most_rows:

@@ -244,7 +244,7 @@ def test_a_kernel_that_becomes_a_pipe_after_its_check_ends_at_the_limit_of_time(
     )
     monkeypatch.setattr(spice_module, "_LOADING_LIMIT_S", 3.0)
     monkeypatch.setattr(spice_module, "_send", unchecked)
-    with pytest.raises(UserError, match=r"got no end after 3 s of reading pipe.tls"):
+    with pytest.raises(UserError, match=r"got no result after 3 s of reading pipe.tls"):
         spice_module.read_spice(source, LATITUDE, LONGITUDE, HEIGHT_M)
 
 

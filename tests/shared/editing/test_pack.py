@@ -48,15 +48,15 @@ def test_large_tables_become_several_readable_parts(little, tmp_path, monkeypatc
     source = open_dataset(little)
     assert source.info.counts.craters == 600
     pack(source, tmp_path / "p", most_rows=100, most_frames=2)
-    original = footers.OF_DATASET
-    monkeypatch.setattr(footers, "OF_DATASET", footers.FooterLimits(rows=100))
+    original = footers.DATASET_LIMITS
+    monkeypatch.setattr(footers, "DATASET_LIMITS", footers.FooterLimits(rows=100))
     with pytest.raises(UserError, match="rows"):
         source.table("craters")
     made = open_dataset(tmp_path / "p")
     assert validate(made) == []
     assert len(made.parts("craters")) == 6 and len(made.parts("labels")) == 1 and len(made.shards()) == 4
     assert made.parts("craters")[:2] == ["manifest/craters/all.parquet", "manifest/craters/all.0001.parquet"]
-    monkeypatch.setattr(footers, "OF_DATASET", original)
+    monkeypatch.setattr(footers, "DATASET_LIMITS", original)
     assert made.table("craters").equals(source.table("craters"))
     for scene_id in source.scene_ids():
         assert made.table("craters", scene_id=scene_id).equals(source.table("craters", scene_id=scene_id))

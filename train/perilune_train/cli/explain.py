@@ -1,4 +1,4 @@
-"""`perilune-train explain` and `causal`: what attention gates show, and what single craters do."""
+"""`perilune-train explain` and `causal`: what attention gates show, and the effect of single craters."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -52,8 +52,8 @@ def explain(
 ) -> None:
     """Test what attention gates show: nulls, interventions, localisation, stability.
 
-    Computes the paper's correlations PCC1 to PCC4 of each gate and of null maps. A gate counts only if it beats every
-    null. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
+    Computes the paper's correlations PCC1 to PCC4 of each gate and of null maps. A gate is evidence only if it
+    beats every null. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
     Writes runs/explain/<name>/ with claims.json, metrics.json, the tables of all values and pictures. Leaves a finished
     run of the same settings, datasets and checkpoints unchanged; --overwrite replaces it.
@@ -66,10 +66,10 @@ def explain(
     name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
     for given, option, other in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
         if given is not None and task == other:
-            raise UserError(option, "option", str(given), f"nothing beside --task {other}")
+            raise UserError(option, "option", str(given), f"no {option} with --task {other}")
     if task != "navigate" and detector is None:
-        own = runs / "detect" / name
-        detector = RunFolder(shipped_run("detect") if task == "detect" and not own.is_dir() else own).best
+        run_folder = runs / "detect" / name
+        detector = RunFolder(shipped_run("detect") if task == "detect" and not run_folder.is_dir() else run_folder).best
     if task != "detect" and navigator is None:
         navigator = RunFolder(runs / "navigate" / f"{name}-stack").best
     run = explain_run(
@@ -109,7 +109,7 @@ def causal(
     gate: Annotated[
         str | None,
         typer.Option(
-            help="Gate of the headline, such as B_22. [default: the one that runs/explain/<name> chose, else B_11]"
+            help="Gate of the headline, such as B_22. [default: the gate chosen by runs/explain/<name>, else B_11]"
         ),
     ] = None,
     nav_dataset: Annotated[str | None, typer.Option(help="Navigation dataset with all craters, for poses.")] = None,
@@ -123,7 +123,7 @@ def causal(
     allow_overlap: AllowOverlap = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure what single craters do to attention masks, detections and poses.
+    """Measure the effect of single craters on attention masks, detections and poses.
 
     Compares frames rendered with and without some craters, everything else equal. Writes runs/explain/<name>-causal/
     with the tables of all effects, pictures, claims.json and metrics.json. Leaves a finished run of the same inputs
@@ -131,16 +131,16 @@ def causal(
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     if (nav_dataset is None) != (nav_counterfactual is None):
-        raise UserError("--nav-dataset", "datasets", "one of two", "--nav-dataset and --nav-counterfactual together")
+        raise UserError("--nav-dataset", "datasets", "only one", "--nav-dataset and --nav-counterfactual together")
     # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_folder, causal_run
     from perilune_train.training.begin import held
     from perilune_train.training.runs import NamedRun, RunFolder
 
     name = name or preset
-    own = run or runs / "detect" / name
-    if run is None and not own.is_dir():
-        own = shipped_run("detect")
+    run_folder = run or runs / "detect" / name
+    if run is None and not run_folder.is_dir():
+        run_folder = shipped_run("detect")
     pose = None
     if nav_dataset is not None and nav_counterfactual is not None:
         best = navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt"
@@ -151,11 +151,11 @@ def causal(
     )
     gate = gate or _chosen_gate(runs / "explain" / name)
     with held(causal_folder(named)):
-        made = causal_run(settings, named, RunFolder(own).best, gate, inputs, allow_overlap)
+        made = causal_run(settings, named, RunFolder(run_folder).best, gate, inputs, allow_overlap)
     say(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
 
 
 def _chosen_gate(explained: Path) -> str:
-    """The gate that an explain run chose on validation frames; B_11, the paper's first, if there is no such run."""
+    """The gate that an explain run chose on validation frames; without such a run B_11, the paper's first gate."""
     found = read_metrics(explained).get("detect/strongest_gate") if (explained / METRICS_FILE).is_file() else None
     return found if isinstance(found, str) else "B_11"

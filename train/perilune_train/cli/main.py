@@ -41,7 +41,10 @@ def config(
     config: ConfigFile = None,
     settings: Settings = None,
     show: Annotated[
-        bool, typer.Option("--show/--plain", help="Each setting with meaning, unit and default; or the values only.")
+        bool,
+        typer.Option(
+            "--show/--plain", help="Print each setting with meaning, unit and default, or print the values only."
+        ),
     ] = True,
 ) -> None:
     """Print all settings of detection, navigation and explanation as a configuration file to edit."""
@@ -52,9 +55,9 @@ def config(
 
 @app.command()
 def models() -> None:
-    """List the trained networks that are installed, with size, figure on the locked benchmark and folder.
+    """List the installed networks with their size, their result on the locked benchmark and their folder.
 
-    The folder can be given as --run; its card.md states training data, figures and limits.
+    Pass the folder to --run. The file card.md in the folder states training data, results and limits.
     """
     for model in shipped_models():
         answer_page(f"{model.name}  {model.task}  {model.megabytes:.1f} MB  {model.headline}  {model.folder}")

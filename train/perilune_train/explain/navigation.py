@@ -1,4 +1,4 @@
-"""Evidence on the gates of the stack navigator: correlations of the halves, nulls, interventions, stability."""
+"""Evidence on the gates of the stack navigator: correlation of both mask halves, nulls, interventions, stability."""
 
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def explain_navigator(
     validation: Pairs,
     where: Path,
 ) -> tuple[Evidence, Masks]:
-    """All tables of the stack navigator, and its masks of the test pairs (N, 2 height, width).
+    """All tables of the stack navigator, and its masks for the test pairs (N, 2 height, width).
 
     The gate whose pixels are removed is chosen on the validation pairs. Raises UserError if the network has no
     attention.
@@ -49,13 +49,13 @@ def explain_navigator(
     def masks_of(given: NDArray[np.uint8]) -> Masks:
         return navigator_masks(navigator, given, size_px, where)
 
-    masks, known = masks_of(pairs.images), masks_of(validation.images)
+    masks, validation_masks = masks_of(pairs.images), masks_of(validation.images)
     untrained = untrained_navigator(navigator, architecture, validation.images, settings.seed)
-    blank = navigator_masks(untrained, pairs.images, size_px, where)
+    untrained_masks = navigator_masks(untrained, pairs.images, size_px, where)
     say("navigator: masks and null maps")
-    strongest = strongest_gate(known, validation)
+    strongest = strongest_gate(validation_masks, validation)
     targets, scale = _targets(pairs), pairs.images.shape[2] / size_px
-    nulls = pair_nulls(pairs.images, masks, blank, targets, rng, scale)
+    nulls = pair_nulls(pairs.images, masks, untrained_masks, targets, rng, scale)
     values = pd.concat([pair_values(masks, targets), nulls], ignore_index=True)
     permutations = pair_permutations(masks, targets, rng)
     differences = pd.concat([null_differences(values, {}, rng), permutations], ignore_index=True)
@@ -70,11 +70,13 @@ def explain_navigator(
     measure = MotionPerformance(
         navigator, truth_m[runs], np.array(scales["mean_m"]), np.array(scales["spread_m"]), size_px
     )
-    gates = forced_gates(navigator.backbone, gate_means(known), images, measure, "force gates of the navigator")
+    gates = forced_gates(
+        navigator.backbone, gate_means(validation_masks), images, measure, "force gates of the navigator"
+    )
     edge = f"edge/stage_{strongest[2]}"
     halved = [baseline_maps(half, scale)[edge] for half in np.split(images, 2, axis=1)]
     to_remove = {strongest: masks[strongest][changed], edge: np.concatenate(halved, axis=1)}
-    say(f"navigator: remove pixels by {strongest}, chosen on validation pairs, and by edges")
+    say(f"navigator: removing the pixels selected by {strongest} (chosen on validation pairs) and by the edge map")
     removal = removal_effect(images, to_remove, dict.fromkeys(to_remove, 1), measure, rng, settings.removed_share)
 
     few = images[: max(2, settings.n_changed // 2)]
@@ -96,7 +98,7 @@ def explain_navigator(
 def untrained_navigator(
     trained: StackNavigator, architecture: dict[str, Any], pairs: NDArray[np.uint8], seed: int
 ) -> StackNavigator:
-    """A network of the same form with random weights; its batch statistics are measured on pairs (N, 2 h, w)."""
+    """A network of the same architecture with random weights; batch statistics are measured on `pairs` (N, 2 h, w)."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network: Any = build(architecture)
@@ -112,7 +114,7 @@ def _targets(pairs: Pairs) -> PairTargets:
 
 
 def strongest_gate(masks: Masks, validation: Pairs) -> str:
-    """The gate up to stride 8 of the largest mean PCC4 on validation pairs; the first gate if none is defined."""
+    """The gate up to stride 8 with the largest mean PCC4 on validation pairs; the first gate if PCC4 is undefined."""
     values = pair_values(masks, _targets(validation))
     rows = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
     means = rows.groupby("map", sort=False)["value"].mean()

@@ -49,8 +49,8 @@ _DRAWN = ["position_error_m", "orientation_error_deg", "error_x_m", "error_y_m",
 def evaluate_navigator(run: Path, evaluated: EvaluatedSplit, out: Path) -> Path:
     """Evaluate a run's best weights, the classical methods and the nominal motion on a split; returns `out`.
 
-    Raises UserError if `run` is no navigation run, if `out` is the run's own folder, or on test terrain that the
-    network was fitted to, unless that is accepted.
+    Raises UserError if `run` is not a navigation run, if `out` is the run's own folder, or if the network was trained
+    on the test terrain (`evaluated.allow_overlap` permits this).
     """
     if out.resolve() == run.resolve():
         expected = "another folder; a run keeps the metrics of its training"
@@ -92,15 +92,14 @@ def _check_area(path: Path, known: Provenance, dataset: Dataset, split: str) -> 
     """Raise UserError unless a split is over the landing area that a pose network was trained on."""
     trained = {use.sha256 for use in known.uses if use.use == "trained"}
     if trained and not {use.sha256 for use in split_terrain(dataset, split, "tested")} <= trained:
-        expected = f"the landing area of the training of {path}, which estimates poses over it only"
+        expected = f"the landing area that {path} was trained on; it estimates poses there only"
         raise UserError(dataset.store, "terrain", "another one", expected)
 
 
 def _evaluate_pose(
     network: Any, architecture: dict[str, Any], split: str, trajectories: list[Trajectory], out: Path, details: Metrics
 ) -> None:
-    """Evaluate a pose network together with the mean pose of its training, the only floor that its checkpoint
-    contains."""
+    """Evaluate a pose network, and the mean pose of its training frames, the only baseline in a checkpoint."""
     scales = Scales(**architecture["scales"])
     poses, seconds = _timed(predict_pose, network, architecture, trajectories)
     mean = np.array(scales.mean_m), np.array(scales.mean_rotation)
@@ -118,7 +117,7 @@ def _evaluate_pose(
 
 
 def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
-    """Which network a checkpoint holds. Raises UserError if it does not hold a navigator."""
+    """The kind of navigator in a checkpoint. Raises UserError if the checkpoint contains no navigator."""
     fusion = architecture.get("fusion")
     if fusion not in ("warp", "stack"):
         raise UserError(path, "architecture", sorted(map(str, architecture)), "a navigate run's checkpoint")
@@ -131,7 +130,7 @@ def _timed(
     architecture: dict[str, Any],
     trajectories: list[Trajectory],
 ) -> tuple[list[Motion | Pose], float]:
-    """Motions or poses of all trajectories, and seconds."""
+    """Motions or poses of all trajectories, and the time that this took, seconds."""
     started = time.monotonic()
     with progress_bar() as progress:
         task = progress.add_task("evaluate", total=len(trajectories), unit="trajectories", note="")
@@ -154,7 +153,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         metrics = read_metrics(folder)
         method, split = metrics.get("evaluation/method"), metrics.get("evaluation/split")
         if not isinstance(method, str) or not isinstance(split, str):
-            expected = "one of `perilune-train navigate train` or `evaluate`"
+            expected = "a method, as `perilune-train navigate train` and `evaluate` record it"
             raise UserError(folder / METRICS_FILE, "evaluation/method", method, expected)
         name, mark = _name(folder), metrics.get("terrain/mark")
         if metrics.get("terrain/status") == "overlap" and not allow_overlap:
@@ -174,7 +173,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         listed.add((target, *where[:-1]))
     head = ["run (network) or method", "dataset", "split", "protocol", "pairs", "terrain", *_COLUMNS.values()]
     text = "\n".join(table(head, rows)) + "\n"
-    note = "In brackets: 95 % intervals, or the value of each unit if there are fewer than five."
+    note = "In brackets: 95 % intervals, or the value of each scene (trajectory, image) if there are fewer than five."
     write_markdown(out / "compare.md", f"# Comparison of navigation runs\n\n{note}\n\n{text}")
     draw_errors(out / "errors.png", errors)
     mark_files(out, ("compare.md", "errors.png"), "; ".join(marks))
@@ -191,7 +190,7 @@ def _cells(metrics: Metrics, prefix: str) -> list[str]:
 
 
 def _read_errors(path: Path) -> pd.DataFrame:
-    """Read the table of pairs. Raises UserError if it is missing or another table."""
+    """Read the table of pairs. Raises UserError if the file is missing or lacks columns."""
     if not path.is_file():
         raise UserError(path, "errors", "no such file", "one that `perilune-train navigate train` or `evaluate` writes")
     try:

@@ -12,18 +12,18 @@ from perilune_shared.storage.files import write_bytes, written_aside
 
 
 def save_figure(path: Path, figure: Figure, dpi: int = 110) -> None:
-    """Write a figure in the format of the file's suffix. Names in it are drawn as they are, signs of formulas too."""
-    # Matplotlib writes the numbers at logarithmic axes as formulas.
-    of_axes = {id(text) for axis in figure.findobj(Axis) for text in axis.findobj(Text) if text is not axis.label}
+    """Write a figure in the format of the file's suffix. Text is drawn literally: `$` does not begin a formula."""
+    # Matplotlib writes the tick labels of logarithmic axes as formulas.
+    axis_texts = {id(text) for axis in figure.findobj(Axis) for text in axis.findobj(Text) if text is not axis.label}
     for text in figure.findobj(Text):
-        if id(text) not in of_axes:
+        if id(text) not in axis_texts:
             text.set_parse_math(False)
     with written_aside(path) as aside:
         figure.savefig(aside, dpi=dpi)
 
 
 def save_image(path: Path, image: NDArray) -> None:
-    """Write an image, grey (height, width) or blue, green, red (height, width, 3), in the format of the suffix."""
+    """Write an image, grey (height, width) or BGR (height, width, 3), in the format of the suffix."""
     encoded, content = cv2.imencode(path.suffix, image)
     if not encoded:
         raise OSError(f"{path}: cannot be written")

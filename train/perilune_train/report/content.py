@@ -1,4 +1,4 @@
-"""The content of a report: sections of figures, tables and labelled frames. Plain data, without HTML of its own."""
+"""The content of a report as plain data: sections of figures, tables and labelled frames."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -35,12 +35,12 @@ class Provenance:
 
     @property
     def anchor(self) -> str:
-        """Anchor of this source in the page; datasets of one name differ by their hashes."""
+        """Anchor of this source in the page; datasets with the same name get different anchors."""
         return "source-" + hashlib.sha256(repr((self.source, self.inputs)).encode()).hexdigest()[:12]
 
     @property
     def facts(self) -> tuple[tuple[str, str], ...]:
-        """All that is known of the source, by name; what the files do not record is `not recorded`."""
+        """Names and values of the facts about the source; `not recorded` if the files do not contain a value."""
         known = {
             "command": self.command,
             "SHA-256 of the configuration": self.settings_sha256,
@@ -88,12 +88,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Mark:
-    """A crater or a detection on a frame: an ellipse, or a box with two axes along the image's."""
+    """A crater or a detection on a frame: an ellipse, or a box with sides along the image axes."""
 
     kind: str
     """found, missed or ignored (labels); matched, false or unjudged (detections)."""
     shape: tuple[float, float, float, float, float]
-    """Ellipse: centre x and y, semi-axes, pixels, direction, degrees. Box: x0, y0, width, height, pixels, score."""
+    """Ellipse: centre x, y and semi-axes, pixels; direction, degrees. Box: x0, y0, width, height, pixels; score."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class FramePicture:
     image: str
     """The frame as a data URI."""
     width_px: int
-    """Width of the frame, in whose pixels the marks are."""
+    """Width of the frame; marks are in pixels of the frame."""
     height_px: int
     """Height of the frame."""
     about: str
@@ -143,9 +143,9 @@ class MaskStack:
     block: str
     """Name of the gate, such as B_11."""
     low: float
-    """Attention drawn darkest."""
+    """Attention value that is drawn darkest."""
     high: float
-    """Attention drawn brightest."""
+    """Attention value that is drawn brightest."""
     images: tuple[str, ...]
     """One data URI for each frame, empty where there is none."""
 
@@ -159,7 +159,7 @@ class Viewer:
     frames: tuple[FramePicture, ...]
     """Frames from high to low."""
     masks: tuple[MaskStack, ...]
-    """Gates; empty if there is no explain run."""
+    """Masks of each gate; empty if there is no explain run."""
     sources: tuple[Provenance, ...]
     """What frames, detections and masks were made from."""
 
@@ -173,10 +173,10 @@ class Report:
     summary: tuple[str, ...]
     """The result, then further results: one sentence each."""
     sections: tuple[Section, ...]
-    """In the order of the page."""
+    """Sections in the order of the page."""
     viewer: Viewer | None
     """None without a detection dataset with frames."""
     provenance: tuple[Provenance, ...]
     """All sources, each once."""
     missing: tuple[str, ...]
-    """Parts that do not exist, and were left out."""
+    """Parts that were left out because their data do not exist."""

@@ -1,8 +1,8 @@
-"""Checkpoints of torch as untrusted input: read what a file holds before any of its tensors.
+"""Torch checkpoints as untrusted input: check the structure of a file before torch reads its tensors.
 
-A checkpoint is a ZIP with a pickle of plain values and, for each tensor, a file of its numbers. The pickle is read here
-with few instructions and few names, none of which executes anything; tensors become records of their shape. Only if
-sizes, names and values are those that perilune writes, torch reads the same file.
+A checkpoint is a ZIP with a pickle of plain values and, for each tensor, a file of its numbers. This module
+reads the pickle with an allowlist of instructions and names, none of which executes code; tensors become records of
+their shape. Torch reads the file only if sizes, names and values are those that perilune writes.
 """
 
 import pickle
@@ -22,11 +22,11 @@ import torch
 from perilune_shared.errors import UserError
 
 MOST_WEIGHT_BYTES, MOST_STATE_BYTES = 2 * 2**30, 12 * 2**30
-"""Largest files: weights of a network of width 2 take half of the first limit; a training state has them four times
-over."""
-_MOST_PICKLE_BYTES = 4_000_000
-_MOST_DIRECTORY_BYTES = 16_000_000
-_MOST_VALUES, _MOST_TEXT, _MOST_DEPTH, _MOST_AXES = 1_000_000, 16_000_000, 50, 8
+"""Maximum sizes of a file of weights and of a training state. The weights of a network of width 2 take half of the
+first limit; a training state contains four tensors for each weight tensor."""
+_MAX_PICKLE_BYTES = 4_000_000
+_MAX_DIRECTORY_BYTES = 16_000_000
+_MAX_VALUES, _MAX_TEXT_CHARACTERS, _MAX_DEPTH, _MAX_AXES = 1_000_000, 16_000_000, 50, 8
 _END, _LOCATOR, _END_64 = struct.Struct("<4s4H2LH"), struct.Struct("<4sLQL"), struct.Struct("<4sQ2H2L4Q")
 _ITEM_BYTES = {
     "DoubleStorage": 8,
@@ -40,7 +40,7 @@ _ITEM_BYTES = {
     "ByteStorage": 1,
     "BoolStorage": 1,
 }
-# The Python version: the C version allocates as much memory as an index into its memo says.
+# The Python implementation: the C implementation allocates a memo as large as any index in the file.
 _Unpickler: Any = vars(pickle)["_Unpickler"]
 _INSTRUCTIONS = (
     pickle.PROTO, pickle.STOP, pickle.MARK, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE, pickle.BININT,
@@ -57,7 +57,7 @@ class _Refused(Exception):
 
 @dataclass(frozen=True)
 class TensorRecord:
-    """A tensor of a file that has not been read."""
+    """Shape of a tensor whose numbers have not been read."""
 
     shape: tuple[int, ...]
     """Its shape."""
@@ -68,11 +68,11 @@ class _Storage:
     """Numbers of tensors, in a file of the ZIP."""
 
     numbers: int
-    """How many."""
+    """Number of stored numbers."""
 
 
 def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
-    """Read a checkpoint to the CPU. Raises UserError on anything that perilune does not write.
+    """Load a checkpoint on the CPU. Raises UserError on anything that perilune does not write.
 
     Memory and time are bounded by the size of the file, which is at most `most_bytes`.
     """
@@ -96,7 +96,7 @@ def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
 def check_weights(path: Path, field: str, state: object) -> None:
     """Raise UserError unless a state is a dictionary of named tensors of finite numbers, with variances of at least 0.
 
-    Networks would compute NaN from other numbers, without a message.
+    With other numbers, networks would silently compute NaN.
     """
     expected = "finite weights"
     if not isinstance(state, dict):
@@ -106,14 +106,14 @@ def check_weights(path: Path, field: str, state: object) -> None:
             raise UserError(path, f"{field}.{name}", type(tensor).__name__, "a tensor")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             wrong = tensor[~torch.isfinite(tensor)]
-            found = f"{wrong.numel()} of {tensor.numel()} numbers not finite, the first {float(wrong[0])}"
+            found = f"{wrong.numel()} of {tensor.numel()} numbers are not finite; the first is {float(wrong[0])}"
             raise UserError(path, f"{field}.{name}", found, expected)
         if name.endswith("running_var") and tensor.numel() and float(tensor.min()) < 0:
             raise UserError(path, f"{field}.{name}", float(tensor.min()), "a variance of at least 0")
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file is a complete checkpoint, as `load_checked` needs it; reads no tensor."""
+    """Whether a file is a complete checkpoint that `load_checked` accepts; reads no tensor."""
     try:
         with path.open("rb") as stream:
             _check(_read_records(stream, path.stat().st_size))
@@ -129,33 +129,33 @@ def _read_records(stream: BinaryIO, size: int) -> Any:
         entries = archive.infolist()
         names = {entry.filename: entry.file_size for entry in entries}
         if len(names) != len(entries) or len({name.partition("/")[0] for name in names}) != 1:
-            raise _Refused("a ZIP with files of one name or of several folders")
+            raise _Refused("a ZIP with duplicate file names or with several folders")
         if any(e.compress_type != zipfile.ZIP_STORED or e.file_size != e.compress_size for e in entries):
             raise _Refused("a compressed ZIP")
         if sum(names.values()) > size:
             raise _Refused("a ZIP whose files overlap")
         folder = entries[0].filename.partition("/")[0]
         pickled = f"{folder}/data.pkl"
-        if names.get(pickled, 0) > _MOST_PICKLE_BYTES:
-            raise _Refused(f"a pickle of {names[pickled]} bytes, which is more than {_MOST_PICKLE_BYTES}")
+        if names.get(pickled, 0) > _MAX_PICKLE_BYTES:
+            raise _Refused(f"a pickle of {names[pickled]} bytes, which is more than {_MAX_PICKLE_BYTES}")
         return _Records(archive.read(pickled), folder, names).load()
 
 
 def _check_directory(stream: BinaryIO, size: int) -> None:
-    """Refuse a file that is not a ZIP, or has a long list of files: `zipfile` would keep the list in memory."""
+    """Refuse a file that is not a ZIP, or has a long directory, which `zipfile` would keep in memory."""
     start = max(0, size - _END.size - 2**16)
     stream.seek(start)
     tail = stream.read(_END.size + 2**16)
     end = tail.rfind(b"PK\x05\x06")
     if end < 0 or len(tail) < end + _END.size:
-        raise _Refused("no checkpoint, or the beginning of one")
+        raise _Refused("not a checkpoint, or a truncated one")
     length = _END.unpack_from(tail, end)[5]
     if length == 0xFFFFFFFF:
         stream.seek(max(0, start + end - _LOCATOR.size))
         stream.seek(_LOCATOR.unpack(stream.read(_LOCATOR.size))[2])
         length = _END_64.unpack(stream.read(_END_64.size))[8]
-    if length > _MOST_DIRECTORY_BYTES:
-        raise _Refused(f"a ZIP with a list of {length} bytes, which is more than {_MOST_DIRECTORY_BYTES}")
+    if length > _MAX_DIRECTORY_BYTES:
+        raise _Refused(f"a ZIP with a directory of {length} bytes, which is more than {_MAX_DIRECTORY_BYTES}")
 
 
 class _Records(_Unpickler):
@@ -201,7 +201,7 @@ class _Records(_Unpickler):
 
     def load_build(self) -> None:
         state = self.stack.pop()
-        # Only torch's own note on versions: other names would replace methods of the dictionary.
+        # Accept torch's version metadata only: other names would replace methods of the dictionary.
         if not isinstance(self.stack[-1], OrderedDict) or set(state) != {"_metadata"}:
             raise _Refused("an object with attributes")
 
@@ -227,12 +227,12 @@ def _ordered() -> OrderedDict:
 def _tensor(
     storage: _Storage, offset: int, shape: tuple, strides: tuple, grad: bool, hooks: dict, _: object = None
 ) -> TensorRecord:
-    """Refuse a tensor beyond its storage, or one that repeats numbers: a copy of it would be larger than the file."""
+    """Refuse a tensor that exceeds its storage or repeats its numbers: its copy would be larger than the file."""
     numbers = (offset, *shape, *strides)
     if not all(type(number) is int and 0 <= number < 2**48 for number in numbers) or len(shape) != len(strides):
-        raise _Refused("a tensor without a shape")
-    if not isinstance(storage, _Storage) or len(shape) > _MOST_AXES or hooks:
-        raise _Refused("a tensor of another kind")
+        raise _Refused("a tensor with an invalid shape")
+    if not isinstance(storage, _Storage) or len(shape) > _MAX_AXES or hooks:
+        raise _Refused("a tensor of an unsupported kind")
     last = offset + sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
     if prod(shape) > storage.numbers or (prod(shape) and last >= storage.numbers):
         raise _Refused(f"a tensor of {shape} in a storage of {storage.numbers} numbers")
@@ -241,18 +241,18 @@ def _tensor(
 
 def _parameter(data: TensorRecord, grad: bool, hooks: dict) -> TensorRecord:
     if not isinstance(data, TensorRecord) or hooks:
-        raise _Refused("a parameter of another kind")
+        raise _Refused("a parameter of an unsupported kind")
     return data
 
 
 def _check(content: Any) -> None:
-    """Refuse deep nesting, and parts that repeat so often that their text would fill the memory."""
+    """Refuse deep nesting, and parts that are referenced so often that their text would fill the memory."""
     values, text, left = 0, 0, [(content, 0)]
     while left:
         value, depth = left.pop()
         values += 1
         text += len(value) if isinstance(value, str) else 0
-        if values > _MOST_VALUES or text > _MOST_TEXT or depth > _MOST_DEPTH:
+        if values > _MAX_VALUES or text > _MAX_TEXT_CHARACTERS or depth > _MAX_DEPTH:
             raise _Refused("more values, text or nesting than a checkpoint has")
         if isinstance(value, dict):
             left += [(part, depth + 1) for pair in value.items() for part in pair]

@@ -32,18 +32,18 @@ from perilune_train.training.runs import (
 )
 
 _STEPS_BETWEEN_CHECKS = 20
-_EARLY_STEPS, _DIVERGED, _LEAST_LOSS = 10, 1e3, 1e-3
-"""Number of first steps that are all checked; a loss above this multiple of the first loss, or of the smallest loss,
-has diverged."""
+_EARLY_STEPS, _DIVERGED, _MIN_FIRST_LOSS = 10, 1e3, 1e-3
+"""Number of first steps whose loss is always checked. Training has diverged if the loss exceeds _DIVERGED times the
+larger of the first loss and _MIN_FIRST_LOSS."""
 _PROCESSES = "processes"
 """Key of the number of processes in last.ckpt. It must not change on resume: it determines the batches of a step."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
 
 
 class StopDiverged(Callback):
-    """End a training whose loss is not finite, or far above the first one; Adam does not return from there.
+    """Stop training if the loss is not finite or far above the first loss; Adam does not recover from this.
 
-    Raises UserError with the epoch, the loss and what to lower. The last state from before stays.
+    Raises UserError with the epoch, the loss and the setting to lower. The last saved state is kept.
     """
 
     def __init__(self, run: RunFolder, rate: str):
@@ -57,12 +57,13 @@ class StopDiverged(Callback):
         self.first = state_dict["first"]
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # Reading the loss makes the GPU wait, so do it rarely. The last one comes before validation and the state.
+        # Reading the loss makes the GPU wait, so do it rarely. The last batch is checked always:
+        # validation and the saving of the state follow.
         early = trainer.global_step <= _EARLY_STEPS
         if early or trainer.is_last_batch or batch_idx % _STEPS_BETWEEN_CHECKS == 0:
             loss = float(outputs["loss"]) * trainer.accumulate_grad_batches
             self.first = abs(loss) if self.first is None else self.first
-            if not math.isfinite(loss) or abs(loss) > _DIVERGED * max(self.first, _LEAST_LOSS):
+            if not math.isfinite(loss) or abs(loss) > _DIVERGED * max(self.first, _MIN_FIRST_LOSS):
                 self._stop(trainer, f"{loss:g}, the first was {self.first:g}")
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
@@ -72,7 +73,7 @@ class StopDiverged(Callback):
             self._stop(trainer, "weights that are not finite")
 
     def _stop(self, trainer: lightning.Trainer, found: str) -> None:
-        expected = f"a loss that falls: lower {self.rate}, and give --overwrite"
+        expected = f"a decreasing loss: lower {self.rate} and run again with --overwrite"
         raise UserError(self.run.root, f"loss in epoch {trainer.current_epoch + 1}", found, expected)
 
 
@@ -107,7 +108,7 @@ class KeepBest(Callback):
 class KeepLast(Callback):
     """Save the whole state after every validated epoch and, with `minutes`, within an epoch at this interval.
 
-    If a run is resumed within an epoch, also calls the task's `on_train_epoch_start`, which Lightning then skips.
+    If a run resumes within an epoch, Lightning skips the task's `on_train_epoch_start`; this callback calls it.
     """
 
     def __init__(self, run: RunFolder, minutes: float | None):
@@ -132,24 +133,24 @@ class KeepLast(Callback):
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
         # The last batch is followed by validation and the checkpoint of the epoch. A state between the batches of one
-        # step would lack the gradients that are summed so far.
+        # step would lack the gradients summed so far.
         between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
         if self.minutes is None or trainer.is_last_batch or between:
             return
-        # Several processes follow the clock of the first. Asking for it makes them wait, so do it rarely.
+        # Several processes follow the clock of the first. The broadcast makes all of them wait, so do it rarely.
         if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_CHECKS == 0:
             due = time.monotonic() - self.saved >= 60 * self.minutes
             if trainer.strategy.broadcast(due):
                 self.save(trainer)
 
     def on_train_epoch_end(self, trainer, pl_module) -> None:
-        # A task with many short epochs validates and saves after some of them only.
+        # A task with many short epochs validates and saves only after some of them.
         if (trainer.current_epoch + 1) % trainer.check_val_every_n_epoch == 0:
             self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        # Loaders raise it between two batches, when the state is complete. Several processes cannot save, since the
-        # others may still train, and before the first batch of an epoch the state of the last epoch is already saved.
+        # Loaders raise DataLost between two batches, when the state is complete. Do not save with several processes,
+        # since others may still train, nor before the first batch of an epoch: that state is already saved.
         done = trainer.fit_loop.epoch_loop.batch_progress.current
         between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
         if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
@@ -168,7 +169,7 @@ class FewerThreadsIfCrowded(Callback):
     """Adapt the number of threads on a CPU to other work on the machine (see `FairThreads`)."""
 
     def __init__(self, enabled: bool):
-        # Validation steps cost less than training steps, so each has its own trials of speed.
+        # Validation steps take less time than training steps, so the two are timed separately.
         self.training, self.validation = FairThreads(enabled), FairThreads(enabled)
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
@@ -216,8 +217,8 @@ class Bar(Callback):
             self.progress.stop()
 
 
-def machines(devices: int, num_nodes: int) -> tuple[int, int]:
-    """Processes on each machine and number of machines: from torchrun's environment, else from the arguments."""
+def process_layout(devices: int, num_nodes: int) -> tuple[int, int]:
+    """Processes per machine and number of machines: from torchrun's environment, else from the arguments."""
     if torch.distributed.is_torchelastic_launched():
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return local, int(os.environ["WORLD_SIZE"]) // local
@@ -225,13 +226,13 @@ def machines(devices: int, num_nodes: int) -> tuple[int, int]:
 
 
 def own_share(devices: int, num_nodes: int) -> Share:
-    """The share of this process; also valid before training (see `is_first_process`)."""
-    return Share(int(rank_zero_only.rank), math.prod(machines(devices, num_nodes)))
+    """The share of the data that this process trains on; known before training too (see `is_first_process`)."""
+    return Share(int(rank_zero_only.rank), math.prod(process_layout(devices, num_nodes)))
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Length of a training, its steps, and when it validates and saves."""
+    """Number of epochs, size of a step, and when to validate and save."""
 
     epochs: int
     """Number of epochs."""
@@ -251,7 +252,7 @@ class Schedule:
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """Devices and processes of a training."""
+    """Devices and processes for training."""
 
     device: str = "auto"
     """auto, cuda or cpu."""
@@ -267,7 +268,7 @@ class Hardware:
 
 @dataclass(frozen=True, slots=True)
 class Wording:
-    """Names in the messages of a training."""
+    """Names in the messages of training."""
 
     progress: str
     """Label of the progress bar."""
@@ -287,8 +288,8 @@ def fit(
 
     Returns the training time in seconds, including the time before a resume.
 
-    The task provides its own loaders, once. Each epoch calls `set_epoch` of the attribute `sampler` of a batch sampler
-    (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several processes, each
+    The task creates its loaders once. Each epoch calls `set_epoch` on the `sampler` of a batch sampler (see
+    data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several processes, each
     loader provides the batches of its own process. The task logs `schedule.monitor` in validation, and has
     `architecture` and `evaluated` (see KeepBest).
 
@@ -296,11 +297,11 @@ def fit(
     uninterrupted run. The state is saved after every validation. With `schedule.checkpoint_minutes` it is also saved
     within epochs; the task's training batches must then continue at the position of the checkpoint.
 
-    Raises UserError if last.ckpt is damaged, of another network or of another number of processes, if Lightning gives
-    this process another rank than the environment states, or if the loss diverges.
+    Raises UserError if last.ckpt is damaged or belongs to another network or number of processes, if Lightning gives
+    this process a rank other than the one in the environment, or if the loss diverges.
     """
     share = own_share(hardware.devices, hardware.num_nodes)
-    devices, num_nodes = machines(hardware.devices, hardware.num_nodes)
+    devices, num_nodes = process_layout(hardware.devices, hardware.num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
     if resume_from is not None:
         expected = "the state of an interrupted run; --overwrite replaces it"
@@ -312,7 +313,7 @@ def fit(
             raise UserError(resume_from, "processes", devices * num_nodes, expected)
     keep_last = KeepLast(run, schedule.checkpoint_minutes)
     device = choose_device(hardware.device)
-    # Several processes share the cores: Lightning gives each its part.
+    # With several processes, Lightning divides the cores among them.
     threads = FewerThreadsIfCrowded(device == "cpu" and devices * num_nodes == 1)
     warn_if_crowded()
     for name in ("lightning.pytorch", "lightning.fabric"):
@@ -350,7 +351,9 @@ def fit(
             ],
         )
         if trainer.global_rank != share.process:
-            expected = f"{share.process}, which the environment states; start several machines with torchrun or Slurm"
+            expected = (
+                f"{share.process}, as in the environment; start training on several machines with torchrun or Slurm"
+            )
             raise UserError("machines", "rank", trainer.global_rank, expected)
         try:
             trainer.fit(task, ckpt_path=resume_from, weights_only=True)

@@ -1,4 +1,4 @@
-"""Our own interface over ZeroMQ: requests in JSON, replies in JSON with raw arrays (`perilune_shared.client`)."""
+"""The native interface over ZeroMQ: requests in JSON, replies in JSON with raw arrays (`perilune_shared.client`)."""
 
 import json
 from dataclasses import asdict
@@ -31,25 +31,25 @@ class _OfScene(Section):
 
 
 class SceneRequest(Section):
-    """What does the server render?"""
+    """Request: describe what the server renders."""
 
     request: Literal["scene"]
 
 
 class HealthRequest(Section):
-    """Do both interfaces answer?"""
+    """Request: check that both interfaces answer."""
 
     request: Literal["health"]
 
 
 class GroundRequest(_OfScene):
-    """Is a scene in memory, and what is it? If it is not, it is generated."""
+    """Request: describe a scene that is in memory, or start to generate the scene."""
 
     request: Literal["ground"]
 
 
 class FrameRequest(_OfScene):
-    """A frame; `perilune_shared.client.SceneClient.frame` describes the fields."""
+    """Request: render a frame; `perilune_shared.client.SceneClient.frame` describes the fields."""
 
     request: Literal["frame"]
     position_m: _Three
@@ -63,13 +63,13 @@ class FrameRequest(_OfScene):
 
 
 class CratersRequest(_OfScene):
-    """The craters of the ground."""
+    """Request: list the craters of the ground."""
 
     request: Literal["craters"]
 
 
 class HeightsRequest(_OfScene):
-    """Heights of the surface."""
+    """Request: heights of the surface at points."""
 
     request: Literal["heights"]
     x_m: Annotated[tuple[_Number, ...], Field(max_length=100_000)]
@@ -86,8 +86,8 @@ _REQUESTS: dict[str, type[Section]] = {
     "heights": HeightsRequest,
 }
 _LENGTH_TOLERANCE = 0.01
-OF_CONNECTIONS: list[bytes] = []
-"""Returned by `answer` for a request for health, which the thread of the connections answers."""
+ANSWERED_BY_CONNECTIONS: list[bytes] = []
+"""Result of `answer` for a health request: the thread of the connections then sends the reply."""
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
@@ -98,7 +98,7 @@ def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
     try:
         request = _parsed(content)
         if isinstance(request, HealthRequest):
-            return OF_CONNECTIONS
+            return ANSWERED_BY_CONNECTIONS
         simulated = grounds.simulated(request.scene, client) if isinstance(request, _OfScene) else grounds.first
         if simulated is None:
             return _reply({"ready": False}, {})
@@ -110,7 +110,7 @@ def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
 
 
 def refusal(text: str, *, busy: bool = False) -> list[bytes]:
-    """A reply that says what is wrong; if the server is `busy`, the same request may be answered later."""
+    """A reply with an error message; with `busy`, the client may send the request again later."""
     head: dict[str, Any] = {"error": one_line(text)[:900]}
     return [json.dumps(head | {"busy": True} if busy else head).encode()]
 
@@ -120,7 +120,7 @@ def _parsed(content: bytes) -> Section:
     try:
         plain = json.loads(content)
     except (ValueError, RecursionError):
-        raise UserError("request", "JSON", "none", "an object") from None
+        raise UserError("request", "JSON", "invalid JSON", "a JSON object") from None
     kind = plain.get("request") if isinstance(plain, dict) else None
     if not isinstance(kind, str) or kind not in _REQUESTS:
         raise UserError("request", "request", kind, f"one of {', '.join(_REQUESTS)}")
@@ -137,7 +137,7 @@ def _answer(simulated: SimulatedScene, request: Section) -> list[bytes]:
         return _reply({}, _frame(simulated, request))
     if isinstance(request, HeightsRequest):
         if len(request.x_m) != len(request.y_m):
-            raise UserError("request", "y_m", f"{len(request.y_m)} numbers", f"{len(request.x_m)}, as x_m")
+            raise UserError("request", "y_m", f"{len(request.y_m)} numbers", f"{len(request.x_m)}, as many as in x_m")
         heights = simulated.heights_m(np.array(request.x_m), np.array(request.y_m), boulders=request.boulders)
         return _reply({}, {"height_m": heights})
     if isinstance(request, CratersRequest):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from perilune_render.server.connection import Connection, Limits
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.native import zmtp
-from perilune_render.server.native.answers import OF_CONNECTIONS, answer, refusal
+from perilune_render.server.native.answers import ANSWERED_BY_CONNECTIONS, answer, refusal
 from perilune_render.server.serve import Interface, answers
 
 MOST_WITHOUT_PLACE = 256
@@ -80,7 +80,7 @@ class Native:
             text = f"{type(error).__name__}: {error}"
             self.note(f"perilune_shared.client: {text}")
             return refusal(text)
-        return await self._health() if reply is OF_CONNECTIONS else reply
+        return await self._health() if reply is ANSWERED_BY_CONNECTIONS else reply
 
     async def _health(self) -> list[bytes]:
         """The interfaces with their addresses, or an error that names the one that does not answer."""

@@ -1,6 +1,6 @@
-"""Resample an elevation model about its site where its own map is not a smooth map of the ground.
+"""Resample an elevation model around its site, if the site is near a pole or a cut of the model's map projection.
 
-Around a pole of a cylindrical map, and where a map is cut, neighbouring places of the ground have columns far apart.
+There, neighbouring points on the ground are in distant columns of the raster.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from perilune_render.terrain.elevation.site import RasterMap, Site
 from perilune_render.terrain.elevation.window import places_of, repeat_px
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
 
-_MOST_PX = 4096
-_LEAST_PX = 16
-"""Least number of pixels around the ground."""
-_AROUND = 1.25
+_MAX_SIDE_PX = 4096
+_MARGIN_PX = 16
+"""Margin around the ground, pixels, in addition to _MARGIN_FACTOR."""
+_MARGIN_FACTOR = 1.25
 _PAD_PX = 16
-"""Rows and columns around a raster; further values change a spline by less than 1e-9."""
+"""Rows and columns added on each side of a raster; values farther out change a spline by less than 1e-9."""
 _ROWS_AT_ONCE = 64
 
 
@@ -26,13 +26,13 @@ def resampled(
 ) -> tuple[Array, np.ndarray, RasterMap]:
     """Heights (N, N), whether they are known, and their map: azimuthal equidistant about the site, north up.
 
-    `height_m` and `known` (rows, columns) are the pixels of `raster`. The pixels are `pixel_m` wide, or wider, so that
-    they are at most _MOST_PX; they cover square ground of side `ground_m` with a margin.
+    `height_m` and `known` (rows, columns) are the pixels of `raster`. The new pixels are `pixel_m` wide, or wider if a
+    side would need more than _MAX_SIDE_PX of them. They cover a square of ground of side `ground_m` with a margin.
     """
     import rasterio
 
-    half = ground_m / 2 * _AROUND + _LEAST_PX * pixel_m
-    n = min(2 * int(np.ceil(half / pixel_m)), _MOST_PX)
+    half = ground_m / 2 * _MARGIN_FACTOR + _MARGIN_PX * pixel_m
+    n = min(2 * int(np.ceil(half / pixel_m)), _MAX_SIDE_PX)
     pixel = 2 * half / n
     centre = (np.arange(n) + 0.5 - n / 2) * pixel
     padded = ndimage.spline_filter(_padded(height_m, raster), order=3, mode="nearest")
@@ -59,7 +59,7 @@ def resampled(
 
 
 def _padded(height_m: Array, raster: RasterMap) -> Array:
-    """Heights extended by _PAD_PX on each side: beyond an edge where the map repeats, and over its poles."""
+    """Heights extended by _PAD_PX on each side: periodic if the map shows all longitudes, continued across poles."""
     around, columns = repeat_px(raster), height_m.shape[1]
     if not around:
         return np.pad(height_m, _PAD_PX, mode="edge")
@@ -79,7 +79,7 @@ def _padded(height_m: Array, raster: RasterMap) -> Array:
 
 
 def _at_poles(raster: RasterMap) -> tuple[bool, bool]:
-    """Whether the upper and the lower edge of a raster are a pole, to half a pixel."""
+    """Whether the upper and the lower edge of a raster lie at a pole, to within half a pixel."""
     rows, columns = raster.shape
     latitude, _ = raster.selenographic([columns / 2] * 4, [0.5, 1.5, rows - 0.5, rows - 1.5])
     first, second, last, before = np.abs(latitude)

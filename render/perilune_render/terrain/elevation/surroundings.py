@@ -1,8 +1,8 @@
 """Relief of the procedural ground around an elevation model, with the model's statistics.
 
-The statistic is the robust deviation (median over 0.6745, insensitive to single pits) of second differences of height
-over a range of baselines. It is measured on the model and on ground with the configured craters alone. A self-affine
-relief is fitted to the part that the craters do not explain.
+The statistic is the robust standard deviation (median absolute value divided by 0.6745, insensitive to single pits) of
+second differences of height at several baselines. It is measured on the model, and on flat ground with only the
+configured craters. A self-affine relief is fitted to the part that the craters do not explain.
 """
 
 import functools
@@ -21,10 +21,10 @@ from perilune_render.terrain.noise import add_waves
 from perilune_shared.geometry.frames import Array
 
 _NORMAL = 0.6745
-"""Median of the absolute value over the standard deviation, for a normal distribution."""
+"""Ratio of the median absolute value to the standard deviation of a normal distribution."""
 _HURST = np.arange(0.4, 1.01, 0.05)
 _LARGEST_TRIAL = 384
-"""Largest number of pixels along a side of the trial ground with craters alone."""
+"""Largest number of pixels along a side of the trial ground, which has only craters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def add_fitted_relief(
 ) -> None:
     """Add the waves of a band of wavelengths to height_m (n_vertices,), in place, beyond the model only.
 
-    `band_m` is the shortest wavelength, included, and the longest, excluded, metres. `beyond_m` (n_vertices,) is the
+    `band_m` is the shortest (inclusive) and the longest (exclusive) wavelength, metres. `beyond_m` (n_vertices,) is the
     distance from known ground of the model, metres. The amplitude of a wave grows with this distance as the model's
     relief of the same wavelength fades (`continuation.fade`).
     """
@@ -101,10 +101,10 @@ def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
     return height.reshape(2 * n_half + 1, -1)
 
 
-def _response(share: Array) -> Array:
-    """Deviation of second differences of gradient noise of amplitude 1, for ratios (...) of baseline to wavelength."""
+def _response(ratio: Array) -> Array:
+    """Deviation of second differences of unit gradient noise, for ratios (...) of baseline to wavelength."""
     baselines, deviations = _measured_response()
-    return np.interp(share, baselines, deviations)
+    return np.interp(ratio, baselines, deviations)
 
 
 @functools.cache

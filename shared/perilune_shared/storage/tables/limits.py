@@ -1,4 +1,4 @@
-"""Limits of each kind of table from outside. `docs/reference/limits.md` lists them."""
+"""Limits of each kind of table that is not part of a dataset. `docs/reference/limits.md` lists them."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ MOST_COLUMNS = 1_000
 MOST_VALUE_CHARACTERS = 1_000
 """Maximum length of a value in a column that is read as text."""
 MOST_TEXT_CHARACTERS = 100_000_000
-"""Maximum length of all different values of one column that is read as text."""
+"""Maximum total length of the distinct values of one column that is read as text."""
 SPARE_ROWS, BYTES_PER_ROW = 200_000, 4
 """A Parquet file of n bytes has at most SPARE_ROWS + n / BYTES_PER_ROW rows. Measurements do not compress better."""
 

@@ -387,7 +387,7 @@ def test_label_files_that_two_pictures_share_are_refused(tmp_path):
     for name in ("a.png", "a.jpg"):
         picture(tmp_path / name)
     written(tmp_path / "a.txt", yolo_rows())
-    with pytest.raises(UserError, match=r"a\.png: labels: got a\.txt, also of a\.jpg"):
+    with pytest.raises(UserError, match=r"a\.png: labels: got a\.txt, also the label file of a\.jpg"):
         read_images(tmp_path)
     (tmp_path / "a.jpg").unlink()
     written(tmp_path / "a.xml", voc([]))

@@ -80,7 +80,7 @@ def test_the_prior_states_site_and_columns(tmp_path):
     assert found.radius_m.tolist() == [70]
     assert np.allclose(found.centre_m, 0, atol=1e-6)
     for change, part in (
-        ({"site_latitude_deg": None}, "site_latitude_deg and site_longitude_deg, or none of them"),
+        ({"site_latitude_deg": None}, "site_latitude_deg and site_longitude_deg, or neither"),
         ({"catalogue_columns": {"longitude_deg": "l"}}, "longitude_deg, latitude_deg and one size"),
     ):
         write_yaml(folder / "prior.yaml", content | change)

@@ -67,7 +67,7 @@ def to_ns(time_s, start_ns=UNIX_NS):
             ["imu.csv: time_s: got 1403715529.85 to ", "frames, 10 to 12 s", "the starts differ by 1403715519.85 s"],
         ),
         ("frames/frames.csv", lambda t: (t * 1e9).round(), ["imu.csv", "10000000000 to 12000000000 s", "nanoseconds"]),
-        ("frames/frames.csv", lambda t: ((t - 10) * 1e9).round(), ["those of the frames may be", "seconds"]),
+        ("frames/frames.csv", lambda t: ((t - 10) * 1e9).round(), ["the times of the frames may be", "seconds"]),
         ("frames/frames.csv", lambda t: pd.Series(to_ns(t)), ["frames.csv:2: time_s", "these may be nanoseconds"]),
         ("frames/frames.csv", lambda t: t - 10.0, ["imu.csv: time_s: got 4.95 to", "frames, 0 to 2 s"]),
         ("ranges.csv", lambda t: t + 1e6, ["ranges.csv: time_s: got 1000005 to 1000011.5 s", "10 to 12 s"]),

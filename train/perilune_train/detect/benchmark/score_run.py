@@ -1,4 +1,4 @@
-"""Score a run, or a table of detections, on the locked benchmark; writes page, figures and pictures."""
+"""Score a run, or a table of detections, on the locked benchmark; write a page, figures and pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ def score_run(
 ) -> Score:
     """Score the best weights of a run at the run's own threshold.
 
-    Raises UserError if the benchmark is missing or changed, or if the network was fitted to its terrain, unless
-    `allow_overlap`.
+    Raises UserError if the benchmark is missing or changed, or if the network was trained on the benchmark's terrain
+    (`allow_overlap` permits this).
     """
     # torch takes seconds to load, and a table of detections does not need it.
     from perilune_train.detect.inference.detector import open_detector
@@ -64,8 +64,10 @@ def score_submission(
     loaded = load_parts(parts)
     ids = {name: split.frames.table["frame_id"].tolist() for name, split in next(iter(loaded.values())).items()}
     submitted = read_submission(detections, ids)
-    about = [f"detections of {code_span(name)}; training data and choices are as its authors state"]
-    about.append(f"threshold {threshold:g}, as given; it must be chosen on other frames")
+    about = [f"detections of {code_span(name)}; training data and settings as stated by the authors"]
+    about.append(
+        f"threshold {threshold:g}, given with the detections; it must not have been chosen on benchmark frames"
+    )
     return _write(out, parts, loaded, _Entry(submitted, threshold, about, {"scored": f"detections of {name}"}, []))
 
 
@@ -79,7 +81,7 @@ class _Entry:
     """Minimum score of the detections that count in precision, recall and F1."""
     about: list[str]
     """Lines of Markdown: what was scored and how."""
-    entries: Metrics
+    extra_metrics: Metrics
     """Further entries of benchmark.json."""
     checks: Sequence[TerrainCheck]
     """Checks of the terrain of each part."""
@@ -95,5 +97,5 @@ def _write(out: Path, parts: Sequence[Part], loaded: dict[str, dict[str, DetectS
         mark_files(out / selection, _PICTURES, mark)
     write_markdown(out / PAGE, page_of(result, about))
     mark_files(out, [PAGE], mark)
-    write_metrics(out, result.figures() | entry.entries | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
+    write_metrics(out, result.figures() | entry.extra_metrics | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
     return result

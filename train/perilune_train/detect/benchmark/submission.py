@@ -19,8 +19,8 @@ COLUMNS: dict[str, Kind] = {
     "y1_px": "number",
     "score": "number",
 }
-"""Columns of a submission. A box contains the whole ellipse, also off the image; the first pixel extends from 0 to
-1."""
+"""Columns of a submission. A box contains the whole ellipse, also its part outside the image; the first pixel
+extends from 0 to 1."""
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 
 

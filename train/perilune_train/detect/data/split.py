@@ -33,7 +33,7 @@ class DetectSplit:
     n_frames: int
     """Number of frames of the whole split."""
     share: Share = ALONE
-    """Which frames of the split these are."""
+    """The share of the split that is in memory."""
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -80,11 +80,11 @@ def check_frame_size(dataset: Dataset) -> None:
         if size % COARSEST_STRIDE:
             nearest = max(1, round(size / COARSEST_STRIDE)) * COARSEST_STRIDE
             expected = f"a multiple of {COARSEST_STRIDE}, the network's coarsest stride"
-            raise UserError(dataset.store, field, size, f"{expected}; render or develop the frames with {nearest}")
+            raise UserError(dataset.store, field, size, f"{expected}; render or develop the frames at {nearest} px")
 
 
 def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
-    """Smallest and largest selected radius, pixels; a limit that the selection does not set is that of all labels."""
+    """Smallest and largest selected radius, pixels. A limit that the settings leave open comes from all labels."""
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()
         least, largest = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))

@@ -1,14 +1,14 @@
-"""Read labelled images from other sources, in the layouts in which people have them.
+"""Read labelled images from other sources, in their common layouts.
 
 | Source | Layout |
 |---|---|
-| COCO | a JSON file, or a folder that holds one, or one for each split |
+| COCO | a JSON file, or a folder with one JSON file or with one per split |
 | YOLO | a data.yaml or its folder, a list of images (.txt), or folders images/ and labels/ |
 | CVAT for images | an XML file, or a folder that holds annotations.xml |
 | Pascal VOC, LabelMe, YOLO, tables of boxes | a file beside each image, or in labels/, Annotations/ or annotations/ |
 
-Of a folder with splits (train, val or valid, test) one is read. Coordinates begin at the outer corner of the top-left
-pixel of the upright picture.
+If a folder has splits (train, val or valid, test), one of them is read. The origin of coordinates is the outer corner
+of the top-left pixel of the upright image.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,22 +44,22 @@ _DEFAULT_SPLIT = "test"
 
 @dataclass(frozen=True)
 class Request:
-    """What to read of a source."""
+    """What to read from a source."""
 
     split: str | None = None
-    """train, val or test; None for test, or the only one."""
+    """train, val or test; None for test, or for the only split."""
     categories: tuple[str, ...] = ()
-    """Names of the categories that are craters; () for crater and craters."""
+    """Names of the categories that count as craters; () for "crater" and "craters"."""
     image_folder: Path | None = None
-    """Folder of the images that a COCO or CVAT file names; None for the folders near the file."""
+    """Folder of the images that a COCO or CVAT file names; None to search the folders near the file."""
 
 
 def read_images(source: Path, request: Request = Request()) -> ImageSet:
     """Read the labelled images of a folder or a label file. Raises UserError, naming file and line."""
     if source.is_dir():
-        label_file, split = _of_folder(source, request)
+        label_file, split = _from_folder(source, request)
     elif source.is_file():
-        label_file, split = _of_file(source, request)
+        label_file, split = _from_file(source, request)
     else:
         raise UserError(source, "--images", "no such folder", "a folder of images with labels, or a label file")
     if request.split is not None and not split:
@@ -69,48 +69,50 @@ def read_images(source: Path, request: Request = Request()) -> ImageSet:
     return replace(image_set(label_file, request.categories), split=split)
 
 
-def _of_file(path: Path, request: Request) -> tuple[LabelFile, str]:
+def _from_file(path: Path, request: Request) -> tuple[LabelFile, str]:
     suffix = path.suffix.lower()
     if suffix in _YAML:
-        return _of_yaml(path, request)
+        return _from_yaml(path, request)
     if suffix == ".xml":
         return read_cvat(path, request.image_folder), ""
     if suffix == ".txt":
-        return _yolo(path, yolo.listed_pictures(path), {}), ""
+        return _from_yolo(path, yolo.listed_pictures(path), {}), ""
     return read_coco(path, read_content(path), request.image_folder), ""
 
 
-def _of_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
+def _from_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
     for name in _COCO_NAMES:
         if (folder / name).is_file():
-            return _of_file(folder / name, request)
+            return _from_file(folder / name, request)
     yamls = sorted(path for path in folder.iterdir() if path.suffix.lower() in _YAML and "names" in _head(path))
     if yamls:
-        return _of_yaml(yamls[0], request)
+        return _from_yaml(yamls[0], request)
     if (folder / "annotations.xml").is_file():
-        return _of_file(folder / "annotations.xml", request)
+        return _from_file(folder / "annotations.xml", request)
     jsons = _coco_files(folder)
     if jsons:
         key, text = _split({_split_of(path.stem.rpartition("_")[2]): path for path in jsons}, jsons, request, folder)
-        return _of_file(key, request)[0], text
+        return _from_file(key, request)[0], text
     splits = {_split_of(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
     splits.pop("", None)
     if splits:
         part, text = _split(splits, list(splits.values()), request, folder)
-        return _of_folder(part, replace(request, split=None))[0], text
-    return _beside(folder, request)
+        return _from_folder(part, replace(request, split=None))[0], text
+    return _from_image_folder(folder, request)
 
 
 def _split(by_split: dict[str, Path], paths: list[Path], request: Request, source: Path) -> tuple[Path, str]:
-    """Choose one of several splits; returns its path and a text that names it, "" for a single part without a split's
-    name."""
+    """Choose one of several splits. Returns its path and a text that names it.
+
+    The text is "" for a single part that is not named after a split.
+    """
     named = {split: path for split, path in by_split.items() if split}
     if len(paths) == 1 and not (named and request.split):
         return paths[0], ""
     wanted = request.split or (_DEFAULT_SPLIT if _DEFAULT_SPLIT in named else None)
     if wanted is None or wanted not in named:
         names = ", ".join(named) or ", ".join(path.name for path in paths)
-        raise UserError(source, "splits", names, f"{wanted or 'test'} among them, or --split, or the path of one")
+        raise UserError(source, "splits", names, f"{wanted or 'test'} among them, or --split, or the path of one split")
     return named[wanted], f"split {wanted} of {', '.join(named)}"
 
 
@@ -140,7 +142,7 @@ def _head(path: Path) -> str:
         return file.read(2**16).decode("utf-8", "replace")
 
 
-def _of_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
+def _from_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
     content = yolo.read_data_yaml(path)
     values = {split: content[key] for split, keys in yolo.SPLIT_KEYS.items() for key in keys if content.get(key)}
     if not values:
@@ -149,10 +151,10 @@ def _of_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
     if wanted not in values:
         raise UserError(path, "splits", ", ".join(values), f"{wanted} among them, or --split")
     text = f"split {wanted} of {', '.join(values)}"
-    return _yolo(path, yolo.pictures_of_split(path, values[wanted]), yolo.class_names(content)), text
+    return _from_yolo(path, yolo.pictures_of_split(path, values[wanted]), yolo.class_names(content)), text
 
 
-def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFile:
+def _from_yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFile:
     """Pictures with their YOLO label files; a picture without a file has no objects."""
     root = source.resolve().parent if source.is_file() else source.resolve()
     entries, n_absent = [], 0
@@ -166,8 +168,8 @@ def _yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFil
         )
         entries.append(Entry(name, picture, objects, text))
     if not entries or n_absent == len(entries):
-        raise UserError(source, "labels", "no image with a text of labels", "labels/a.txt for images/a.png")
-    notes = (f"{n_absent} images without a text of labels are taken as images without craters",) if n_absent else ()
+        raise UserError(source, "labels", "no image with a label file", "labels/a.txt for images/a.png")
+    notes = (f"{n_absent} images without a label file count as images without craters",) if n_absent else ()
     return LabelFile(source, entries, names or _numbers_as_names(entries), notes=notes)
 
 
@@ -175,8 +177,8 @@ def _numbers_as_names(entries: Sequence[Entry]) -> dict[str, str]:
     return {item.category: item.category for entry in entries for item in entry.objects}
 
 
-def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
-    """Images that have a label file each, next to them or in another folder."""
+def _from_image_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
+    """Read images with one label file each, beside the image or in another folder."""
     images = pictures_of(folder)
     root = folder
     if not images:
@@ -196,26 +198,26 @@ def _beside(folder: Path, request: Request) -> tuple[LabelFile, str]:
     kinds = [suffix for suffix, files in by_suffix.items() if files]
     if not kinds:
         missing = images[0].with_suffix(".txt")
-        raise UserError(missing, "boxes", "no such file", "a file of labels for each image (.txt, .xml or .json)")
+        raise UserError(missing, "boxes", "no such file", "a label file for each image (.txt, .xml or .json)")
     if len(kinds) > 1:
         raise UserError(folder, "labels", f"files of {len(kinds)} kinds: {', '.join(kinds)}", "one kind")
     files = by_suffix[kinds[0]]
-    return _of_pairs(folder, root, files, len(images) - len(files)), ""
+    return _from_pairs(folder, root, files, len(images) - len(files)), ""
 
 
-def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: int) -> LabelFile:
+def _from_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: int) -> LabelFile:
     """Read the label file of each picture."""
     pictures_by_label: dict[Path, Path] = {}
     for picture, path in files.items():
         if path in pictures_by_label:
-            found = f"{path.name}, also of {pictures_by_label[path].name}"
+            found = f"{path.name}, also the label file of {pictures_by_label[path].name}"
             raise UserError(picture, "labels", found, "one image for each label file")
         pictures_by_label[path] = picture
     suffix = next(iter(pictures_by_label)).suffix.lower()
     notes = [f"{n_unlabelled} images without labels are left out"] if n_unlabelled else []
-    entries, clip, n_shapes = [], True, 0
+    entries, clip, n_without_area = [], True, 0
     names: dict[str, str] = {}
-    read = _reader_of_texts(list(pictures_by_label)) if suffix == ".txt" else None
+    read = _text_reader(list(pictures_by_label)) if suffix == ".txt" else None
     for path, picture in pictures_by_label.items():
         name = picture.relative_to(root).as_posix()
         if suffix == ".xml":
@@ -223,19 +225,19 @@ def _of_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled: i
         elif suffix == ".json":
             entry, without_area = read_labelme(path, picture, name)
             entries.append(entry)
-            n_shapes += without_area
+            n_without_area += without_area
         elif read is not None:
             entries.append(Entry(name, picture, read[0](path, picture), path))
             clip = read[1]
-    if n_shapes:
-        notes.append(f"{n_shapes} points and lines are left out")
+    if n_without_area:
+        notes.append(f"{n_without_area} points and lines are left out")
     if suffix == ".txt" and clip:
         names = _names_beside(folder)
     return LabelFile(folder, entries, names or _numbers_as_names(entries), clip, tuple(notes))
 
 
-def _reader_of_texts(paths: list[Path]) -> tuple[Callable[[Path, Path], list[LabelledObject]], bool]:
-    """Choose the reader of YOLO or of tables by the first text that is not empty; also whether boxes are clipped."""
+def _text_reader(paths: list[Path]) -> tuple[Callable[[Path, Path], list[LabelledObject]], bool]:
+    """The reader for YOLO files or tables, chosen by the first non-empty file, and whether boxes are clipped."""
     first = next((text for path in paths if (text := read_text(path, "boxes")).strip()), "")
     if yolo.is_yolo(first):
         return yolo.read_yolo_text, True

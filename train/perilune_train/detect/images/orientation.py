@@ -1,6 +1,6 @@
 """Orientation of a picture: the EXIF or TIFF tag 274, which says how stored rows turn into the upright picture.
 
-All formats follow one rule: the tag is obeyed, so pixels, labels and detections refer to the upright picture. Otherwise
+In all formats the tag is applied, so pixels, labels and detections refer to the upright picture. Otherwise
 a photograph that a camera marked as rotated would be compared with labels drawn on the upright picture that every
 viewer shows.
 """

@@ -21,16 +21,16 @@ def by_gate(effects: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Mean change of every gate and version, with a 95 % interval over scenes: map, version, change, low, high, n.
 
     `effects` is the table of `mask_effects`. low and high are NaN with fewer than five scenes. n is the number of
-    crater views with a value; without any, the change is NaN.
+    crater views with a value; if n is 0, the change is NaN.
     """
     rows = []
-    for (block, version), every in effects.groupby(["map", "version"], sort=False):
-        defined = every.dropna(subset="change")
+    for (gate, version), views in effects.groupby(["map", "version"], sort=False):
+        defined = views.dropna(subset="change")
         low, high = scene_interval(
             defined["change"].to_numpy(), defined["scene_id"].tolist(), defined["frame_id"].tolist(), rng
         )
         change = defined["change"].mean()
-        rows.append({"map": block, "version": version, "change": change, "low": low, "high": high, "n": len(defined)})
+        rows.append({"map": gate, "version": version, "change": change, "low": low, "high": high, "n": len(defined)})
     return pd.DataFrame(rows)
 
 
@@ -39,30 +39,30 @@ def scene_interval(
 ) -> tuple[float, float]:
     """95 % interval of the mean of values (N,) by bootstrap over scenes; NaN with fewer than five scenes."""
     resamples = draw_resamples(scene_ids, [""] * len(scene_ids), frame_ids, rng)
-    every = np.arange(len(values))
+    all_rows = np.arange(len(values))
 
     def mean(drawn: Resamples) -> dict[str, NDArray[np.float64]]:
-        return {"mean": drawn.totals(every, values) / np.maximum(drawn.totals(every), 1)}
+        return {"mean": drawn.totals(all_rows, values) / np.maximum(drawn.totals(all_rows), 1)}
 
-    interval = spreads(mean, every, resamples)["mean"].interval if resamples.unit == "scene" else None
+    interval = spreads(mean, all_rows, resamples)["mean"].interval if resamples.unit == "scene" else None
     return interval or (float("nan"), float("nan"))
 
 
 def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
     """Draw the mean change of every gate in each version, with intervals if they exist."""
-    blocks = list(dict.fromkeys(gates["map"]))
+    gate_names = list(dict.fromkeys(gates["map"]))
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     axis = figure.subplots()
     for k, (version, (label, colour)) in enumerate(VERSIONS.items()):
-        rows = gates[gates["version"] == version].set_index("map").reindex(blocks)
-        position = np.arange(len(blocks)) + 0.27 * k
+        rows = gates[gates["version"] == version].set_index("map").reindex(gate_names)
+        position = np.arange(len(gate_names)) + 0.27 * k
         axis.bar(position, rows["change"], 0.26, color=colour, label=label)
         errors = np.abs(np.vstack([rows["change"] - rows["low"], rows["high"] - rows["change"]]))
         if np.isfinite(errors).any():
             axis.errorbar(position, rows["change"], errors, fmt="none", ecolor="black", capsize=1.5, linewidth=0.8)
-    axis.set_xticks(np.arange(len(blocks)) + 0.27, blocks, rotation=60)
+    axis.set_xticks(np.arange(len(gate_names)) + 0.27, gate_names, rotation=60)
     axis.axhline(0, color="black", linewidth=0.8)
-    axis.set_ylabel("mask with crater - without,\nstandard deviations of the gate", fontsize=9)
+    axis.set_ylabel("mask with minus without crater,\nstandard deviations of the gate", fontsize=9)
     axis.legend(fontsize=8)
     axis.grid(axis="y", alpha=0.3)
     save_figure(path, figure)

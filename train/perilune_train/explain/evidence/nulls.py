@@ -1,7 +1,7 @@
-"""Null maps: how large a correlation is without a trained network that looks at craters.
+"""Null maps: how large correlations are for maps that do not show a trained network's attention to these craters.
 
-A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if to the gates of stage k, and "<null>/<gate>"
-if to one gate.
+A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if it applies to the gates of stage k,
+and "<null>/<gate>" if it applies to one gate.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ def detector_nulls(
     """The long table of PCC1 and PCC2 of all null maps of N frames (N, height, width).
 
     Nulls: "edge", "contrast" and "brightness" of the images (`baseline_maps`); "untrained", the masks of an untrained
-    network; "other frame", each gate's mask of a frame of another scene. The last has no PCC2, which does not depend on
-    the order of the frames.
+    network; "other frame", each gate's mask of a frame of another scene. PCC2 is
+    omitted for "other frame", because it does not depend on the order of the frames.
     """
     maps = baseline_maps(images) | renamed("untrained", untrained)
     exchanged = renamed("other frame", of_other_rows(masks, targets.scene_ids, rng))
@@ -45,7 +45,7 @@ def pair_nulls(
 ) -> pd.DataFrame:
     """The long table of PCC3 and PCC4 of all null maps of N pairs (N, 2 height, width), the earlier frame above.
 
-    Only over the overlap of the two frames.
+    Correlations use only the overlap of the two frames.
 
     Nulls: the baselines of both images; "untrained", the stacked masks (N, 2 height, width) of an untrained network;
     "other pair", each gate's mask with the lower half of another pair.
@@ -65,7 +65,7 @@ def renamed(null: str, masks: Masks) -> Masks:
 
 
 def of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generator) -> Masks:
-    """Masks (N, height, width) of other frames, in the order of `other_rows`; NaN if there is one frame."""
+    """Masks (N, height, width) of other frames, in the order of `other_rows`; NaN if there is only one frame."""
     if len(scene_ids) < 2:
         return {gate: np.full_like(gate_masks, np.nan) for gate, gate_masks in masks.items()}
     other = other_rows(scene_ids, rng)
@@ -73,10 +73,10 @@ def of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generat
 
 
 def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray:
-    """For each of N rows the number (N,) of a random row of another scene; of another row if there is one scene."""
+    """For each of N rows, the index (N,) of a random row of another scene (of the same scene if there is only one)."""
     scenes = np.asarray(scene_ids)
     if len(scenes) < 2:
-        raise ValueError(f"{len(scenes)} frames, at least 2 expected")
+        raise ValueError(f"got {len(scenes)} frames, expected at least 2")
     rows = np.arange(len(scenes))
     alone = len(np.unique(scenes)) == 1
     return np.array([rng.choice(rows[rows != n] if alone else rows[scenes != scenes[n]]) for n in rows])

@@ -29,7 +29,7 @@ def draw_correlations(
     """Draw one row for each measure: bars of the gates with 95 % intervals, and the means of their nulls as markers.
 
     A filled bar beats every null, an open one does not; a missing bar means that the mask is constant in every image.
-    PCC1 of nulls is drawn with the sign that the gate was expected to have, so that strengths compare. `measures` maps
+    PCC1 of nulls is drawn with the expected sign of the gate, so that magnitudes can be compared. `measures` maps
     names to labels; the three tables are those of `Evidence`.
     """
     figure = Figure(figsize=(12, 3.3 * len(measures)), layout="constrained")
@@ -73,7 +73,7 @@ def _draw_nulls(axis: Axes, gates: pd.DataFrame, differences: pd.DataFrame) -> N
 
 
 def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
-    """Draw the mean harm of forcing each gate, stage, and all gates to their means; dots are the means of scenes."""
+    """Draw the mean harm of forcing each gate, each stage and all gates to their means; dots are means per scene."""
     harm = (gates["before"] - gates["after"]) * (1 if higher_is_better else -1)
     table = gates.assign(harm=harm)
     scopes = list(dict.fromkeys(table["scope"]))
@@ -93,7 +93,7 @@ def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: boo
 
 
 def draw_removal(path: Path, removal: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
-    """Draw the mean harm of removing pixels, by map and way of filling, for the four choices of pixels."""
+    """Draw the mean harm of removing pixels, by map and fill method, for the four choices of pixels."""
     harm = (removal["before"] - removal["after"]) * (1 if higher_is_better else -1)
     means = removal.assign(harm=harm).groupby(["map", "how", "which"], sort=False)["harm"].mean()
     groups = list(dict.fromkeys((name, how) for name, how, _ in means.index))
@@ -118,7 +118,7 @@ def draw_removal(path: Path, removal: pd.DataFrame, unit: str, higher_is_better:
 
 
 def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
-    """Draw the rank correlation of each gate's mask with the trained one as stages are randomised, both cascades."""
+    """Draw the rank correlation of each gate's mask with the trained mask as stages are randomised in both orders."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     for axis, (direction, rows) in zip(
         figure.subplots(1, 2), randomisation.groupby("direction", sort=False), strict=True
@@ -133,7 +133,7 @@ def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
 
 
 def draw_stability(path: Path, stability: pd.DataFrame) -> None:
-    """Draw the mean correlation of each gate's mask with that of the changed image, by change."""
+    """Draw the mean correlation of each gate's mask before and after each change of the image."""
     table = stability.pivot_table(index="change", columns="map", values="pearson", sort=False, dropna=False)
     figure = Figure(figsize=(3 + 0.55 * table.shape[1], 3.6), layout="constrained")
     axis = figure.subplots()
@@ -145,7 +145,7 @@ def draw_stability(path: Path, stability: pd.DataFrame) -> None:
         axis.text(column, row, text, ha="center", va="center", fontsize=7, color="black" if value > 0.6 else "white")
     axis.set_xticks(np.arange(table.shape[1]), table.columns, rotation=60, fontsize=8)
     axis.set_yticks(np.arange(len(table)), table.index, fontsize=8)
-    figure.colorbar(picture, ax=axis, label="correlation with the mask before")
+    figure.colorbar(picture, ax=axis, label="correlation with the mask of the unchanged image")
     save_figure(path, figure, dpi=110)
 
 
@@ -154,9 +154,9 @@ def draw_localisation(path: Path, summary: pd.DataFrame) -> None:
     rows = summary[summary["measure"] == "auc"]
     for null in ("untrained", "other frame"):
         # There is one of these nulls for each gate: draw the strongest.
-        ones = rows["map"].str.startswith(f"{null}/")
-        best = rows.loc[ones, "value"].max()
-        rows = rows[~ones | (rows["value"] == best)]
+        is_null = rows["map"].str.startswith(f"{null}/")
+        best = rows.loc[is_null, "value"].max()
+        rows = rows[~is_null | (rows["value"] == best)]
     rows = rows.reset_index(drop=True)
     colours = rows["kind"].map({"gate": BLUE, "null": GREY, "attribution": ORANGE})
     figure = Figure(figsize=(12, 3.6), layout="constrained")

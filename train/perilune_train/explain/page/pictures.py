@@ -26,11 +26,11 @@ from perilune_train.records.pictures import save_image
 
 _DETECT = {
     "pcc1_craterness": "PCC1: mask and craters\n(above 0: stronger on craters)",
-    "pcc1_partial": "the same, given\nbrightness and gradient",
+    "pcc1_partial": "PCC1 given brightness\nand gradient",
     "pcc2": "PCC2: masks of\ntwo frames",
 }
 _NAVIGATE = {
-    "pcc3": "PCC3: halves",
+    "pcc3": "PCC3: the two halves\nof a mask",
     "pcc4": "PCC4: halves, lower one\nmoved by the true motion",
     "pcc4_minus_pcc3": "PCC4 - PCC3",
 }
@@ -42,10 +42,9 @@ _SHARED = {
     "removal": "Harm of replacing a share of the pixels: most attended, two controls, least attended.",
     "randomisation": "Similarity of masks to the trained ones when stages get random weights, from the top and from the"
     " bottom.",
-    "stability": "Mean correlation of the masks with those of the same image with noise, shifted, or through another"
-    " lens.",
-    "before_after": "The same image with the most attended pixels, random ones of the same brightness, the same shape"
-    " elsewhere, and the least attended pixels inpainted.",
+    "stability": "Mean correlation of the masks before and after a change of the image: noise, shift or another lens.",
+    "before_after": "One image after inpainting: the most attended pixels, random pixels of equal brightness, the same"
+    " shape elsewhere, the least attended pixels.",
 }
 _LOCALISATION = (
     "ROC-AUC of maps on crater pixels (chance: 0.5). Blue: gates, grey: image maps, orange: attribution methods."

@@ -62,7 +62,7 @@ class Surroundings:
 
 
 def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
-    """Update flights by one range at the present time; returns whether it was accepted (F,).
+    """Update flights by one range at the current time; returns whether it was accepted (F,).
 
     A range that is not a positive, finite length is refused.
     """
@@ -120,7 +120,7 @@ class Lander:
 
     @property
     def state(self) -> State:
-        """The state at the present time."""
+        """The state at the current time."""
         if self._since is not None:
             (self.state,) = self._since.states()
         return self._state
@@ -145,14 +145,14 @@ class Lander:
         self._stretch.coast(until_s)
 
     def range(self, range_m: float) -> bool:
-        """Update by a range at the present time; returns whether it was accepted.
+        """Update by a range at the current time; returns whether it was accepted.
 
         A range that is not a positive, finite length is refused.
         """
         return bool(range_update(self._stretch, range_m, [self._around])[0])
 
     def sightings(self, seen: Sightings) -> Located | None:
-        """Update by the craters of a frame at the present time; returns the fix if it was accepted."""
+        """Update by the craters of a frame at the current time; returns the fix if it was accepted."""
         located = self._matched(seen)
         if self._keep_poses:
             self.state = self.state.keeping_pose()

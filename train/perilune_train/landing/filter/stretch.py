@@ -1,16 +1,17 @@
-"""Flights between two frames: inertial measurements and ranges.
+"""Update flights between two frames by inertial measurements and ranges.
 
 Inertial measurements and ranges change and measure only 16 parts of the error state: the first 15 and the height of the
 ground (the core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
-errors at the start of the stretch. So the other parts wait (compressed filter, Guivant & Nebot 2001, doi
-10.1109/70.938382):
+errors at the start of the stretch. The other parts are therefore updated once, at its end (compressed filter, Guivant
+& Nebot 2001, doi 10.1109/70.938382):
 
-1. `inertial`, `coast` and `range` change the core, its covariance and its derivative by the core at the start.
-2. `range` also keeps its derivative by the core at the start, and its innovation.
+1. `inertial`, `coast` and `range` change the core, its covariance and its derivative with respect to the core at the
+   start.
+2. `range` also keeps the innovation, and the range's derivative with respect to the core at the start.
 3. `states` applies all kept ranges to the other parts at once.
 
 The result equals that of the whole filter, and a range costs as much as if there were no craters. Only the attitudes of
-earlier frames differ, by products of two corrections: corrections are added up, not applied one after the other.
+earlier frames differ, by second-order terms: corrections are summed, not applied one after the other.
 
 All flights of a stretch have measurements at the same times, and every operation acts on all of them at once.
 """
@@ -43,15 +44,18 @@ CORE = np.r_[0:_INERTIAL, GROUND]
 _GROUND_S = 10.0
 """Correlation time of the height of the ground below a lander, seconds, at 10 to 30 m/s over ground."""
 _GAP_S = 0.05
+"""Shortest gap between inertial measurements that counts as missing measurements, seconds."""
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
 """Standard deviations of acceleration and angular rate while inertial measurements are missing."""
 
 
 class Stretch:
-    """F flights since the same frame."""
+    """F flights from one frame to the next."""
 
     def __init__(self, states: Sequence[State], noise: InertialNoise, relief_m: float):
-        """From the states at the frame; `relief_m` is the deviation of the ground's height, a Gauss-Markov process."""
+        """Start at a frame's states.
+
+        `relief_m` is the standard deviation of the ground's height, a Gauss-Markov process, metres."""
         self._begin, self._noise, self._relief_m = list(states), noise, relief_m
         self.time_s = states[0].time_s
         self._moving = Moving(
@@ -64,18 +68,18 @@ class Stretch:
         self._ground_m = np.array([state.ground_m for state in states])
         self._covariance = np.stack([state.covariance[np.ix_(CORE, CORE)] for state in states])
         self._change = np.tile(np.eye(len(CORE)), (len(states), 1, 1))
-        self._told: list[tuple[Array, Array]] = []
+        self._kept_ranges: list[tuple[Array, Array]] = []
 
     time_s: float
-    """Present time, seconds since the first frame."""
+    """Current time, seconds since the first frame."""
 
     @property
     def position_m(self) -> Array:
-        """Present positions (F, 3), O_L."""
+        """Current positions (F, 3), O_L."""
         return self._moving.position_m
 
     def inertial(self, measured: Increments) -> None:
-        """Propagate to the end of inertial measurements; those that are older, or not finite, are ignored."""
+        """Propagate to the end of inertial measurements; measurements that are older or not finite are ignored."""
         measured = measured.measured()
         measured = measured.part(slice(int(np.searchsorted(measured.time_s, self.time_s, side="right")), None))
         if not len(measured):
@@ -90,7 +94,7 @@ class Stretch:
         self._propagate(measured.part(slice(n_done, None)))
 
     def _propagate(self, measured: Increments) -> None:
-        """Propagate by measurements that follow one another; each begins where the one before ends."""
+        """Propagate by consecutive measurements; each begins where the previous one ends."""
         if not len(measured):
             return
         measured = replace(measured, interval_s=np.diff(measured.time_s, prepend=self.time_s))
@@ -101,7 +105,7 @@ class Stretch:
         self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
 
     def coast(self, until_s: float) -> None:
-        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
+        """Propagate without inertial measurements, at constant velocity and attitude; add the uncertainty of both."""
         gap_s = until_s - self.time_s
         self._moving = replace(self._moving, position_m=self.position_m + self._moving.velocity_mps * gap_s)
         change = np.eye(_INERTIAL)
@@ -110,7 +114,9 @@ class Stretch:
         self._moved(until_s, change, np.diag(sigmas**2), 1.0)
 
     def _moved(self, time_s: float, change: Array, added: Array, kept: float) -> None:
-        """Apply a change of the first 15 errors, the covariance that is added, and the share kept of the ground's."""
+        """Apply the transition matrix `change` and the process noise `added` of the first 15 errors.
+
+        `kept` is the share of the ground's height error that remains."""
         whole, noise = np.zeros_like(self._covariance), np.zeros_like(self._covariance)
         whole[:, :_INERTIAL, :_INERTIAL], whole[:, _HEIGHT, _HEIGHT] = change, kept
         noise[:, :_INERTIAL, :_INERTIAL], noise[:, _HEIGHT, _HEIGHT] = added, self._relief_m**2 * (1 - kept**2)
@@ -119,10 +125,10 @@ class Stretch:
         self.time_s = time_s
 
     def range(self, range_m: float, ground_m: Array, sigma_m: float) -> NDArray[np.bool_]:
-        """Update by a distance to the ground along -Z_B; whether it was accepted (F,).
+        """Update by a range to the ground along -Z_B; returns whether each flight accepted the range (F,).
 
-        `ground_m` (F,) are the heights of the ground as the nearest craters have it, `sigma_m` the deviation of the
-        instrument.
+        `ground_m` (F,) are the heights of the ground at the nearest craters; `sigma_m` is the standard deviation of
+        the instrument, metres.
         """
         rotation, height_m = self._moving.rotation_site_from_body, self.position_m[:, 2] - ground_m - self._ground_m
         cosine = rotation[:, 2, 2]
@@ -133,12 +139,12 @@ class Stretch:
         innovation = range_m - height_m / cosine
         spread = (by_error * crossed).sum(axis=1) + sigma_m**2
         accepted = innovation**2 / spread <= gate(1)
-        # In units of the innovation's deviation; nothing where the range is refused.
+        # Divide by the innovation's standard deviation; 0 where the range is rejected.
         scale = accepted / np.sqrt(spread)
         innovation, crossed, by_error = innovation * scale, crossed * scale[:, None], by_error * scale[:, None]
-        told = (by_error[:, None] @ self._change)[:, 0]
-        self._told.append((told, innovation))
-        self._change = self._change - crossed[:, :, None] * told[:, None, :]
+        by_start = (by_error[:, None] @ self._change)[:, 0]
+        self._kept_ranges.append((by_start, innovation))
+        self._change = self._change - crossed[:, :, None] * by_start[:, None, :]
         self._covariance = self._covariance - crossed[:, :, None] * crossed[:, None, :]
         self._correct(crossed * innovation[:, None])
         return accepted
@@ -156,8 +162,8 @@ class Stretch:
         self._ground_m = self._ground_m + error[:, _HEIGHT]
 
     def states(self) -> list[State]:
-        """The states at the present time."""
-        if not self._told and self.time_s == self._begin[0].time_s:
+        """The states at the current time."""
+        if not self._kept_ranges and self.time_s == self._begin[0].time_s:
             return self._begin
         return [self._state(number) for number in range(len(self._begin))]
 
@@ -165,10 +171,10 @@ class Stretch:
         before, moving, change = self._begin[number], self._moving, self._change[number]
         from_core = before.covariance[:, CORE]
         covariance, error = before.covariance.copy(), np.zeros(len(before.covariance))
-        if self._told:
-            told = from_core @ np.stack([derivative[number] for derivative, _ in self._told], axis=1)
-            covariance -= told @ told.T
-            error = told @ np.array([innovation[number] for _, innovation in self._told])
+        if self._kept_ranges:
+            crossed = from_core @ np.stack([derivative[number] for derivative, _ in self._kept_ranges], axis=1)
+            covariance -= crossed @ crossed.T
+            error = crossed @ np.array([innovation[number] for _, innovation in self._kept_ranges])
         from_core = from_core @ change.T
         covariance[:, CORE], covariance[CORE] = from_core, from_core.T
         core = self._covariance[number]

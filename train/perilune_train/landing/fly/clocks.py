@@ -9,19 +9,19 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.filter.flight import Instruments
 from perilune_train.landing.fly.tables import unit_of
 
-_LEAST_SHARE = 0.01
+_MIN_SHARE = 0.01
 """Share of the time of the frames that inertial measurements must cover."""
 
 
 def check_clocks(frames: Path, frame_time_s: Array, imu: Path, ranges: Path | None, instruments: Instruments) -> None:
-    """Raises UserError if inertial measurements or ranges are not from the time of the frames."""
+    """Raise UserError unless inertial measurements and ranges overlap the frames in time."""
     inertial = instruments.inertial
     start_s, end_s = float(frame_time_s[0]), float(frame_time_s[-1])
     if end_s <= start_s:
         return
     first_s, last_s = float(inertial.time_s[0] - inertial.interval_s[0]), float(inertial.time_s[-1])
     covered_s = min(last_s, end_s) - max(first_s, start_s)
-    if covered_s <= _LEAST_SHARE * (end_s - start_s):
+    if covered_s <= _MIN_SHARE * (end_s - start_s):
         raise _other_clock(imu, (first_s, last_s), frames, (start_s, end_s))
     time_s = instruments.range_time_s
     if ranges is None or not len(time_s):
@@ -32,17 +32,19 @@ def check_clocks(frames: Path, frame_time_s: Array, imu: Path, ranges: Path | No
         raise _other_clock(ranges, (float(time_s[0]), float(time_s[-1])), frames, (start_s, end_s))
 
 
-def _other_clock(path: Path, own_s: tuple[float, float], frames: Path, frames_s: tuple[float, float]) -> UserError:
-    """The error about two ranges of time, with the unit or the offset that would explain them."""
-    own, others = own_s[1] - own_s[0], frames_s[1] - frames_s[0]
-    expected = f"the clock of {frames}, {_text(frames_s[0])} to {_text(frames_s[1])} s"
-    if own > 0 and (unit := unit_of(own / others)) is not None:
+def _other_clock(
+    path: Path, span_s: tuple[float, float], frames: Path, frames_span_s: tuple[float, float]
+) -> UserError:
+    """The error about two different time spans, with the unit or the offset that would explain the difference."""
+    length_s, frames_length_s = span_s[1] - span_s[0], frames_span_s[1] - frames_span_s[0]
+    expected = f"the clock of {frames}, {_text(frames_span_s[0])} to {_text(frames_span_s[1])} s"
+    if length_s > 0 and (unit := unit_of(length_s / frames_length_s)) is not None:
         expected += f"; these may be {unit[0]}: divide by {unit[1]:g}"
-    elif own > 0 and (unit := unit_of(others / own)) is not None:
-        expected += f"; those of the frames may be {unit[0]}: divide them by {unit[1]:g}"
+    elif length_s > 0 and (unit := unit_of(frames_length_s / length_s)) is not None:
+        expected += f"; the times of the frames may be {unit[0]}: divide these by {unit[1]:g}"
     else:
-        expected += f"; the starts differ by {_text(own_s[0] - frames_s[0])} s"
-    return UserError(path, "time_s", f"{_text(own_s[0])} to {_text(own_s[1])} s", expected)
+        expected += f"; the starts differ by {_text(span_s[0] - frames_span_s[0])} s"
+    return UserError(path, "time_s", f"{_text(span_s[0])} to {_text(span_s[1])} s", expected)
 
 
 def _text(time_s: float) -> str:

@@ -25,7 +25,7 @@ from perilune_train.landing.fly.catalogue import CatalogueUse
 
 _LARGEST_FILE_BYTES = 100_000
 _UNIT_TOLERANCE = 1e-3
-_Far = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Deviation = Annotated[float, Field(gt=0, le=1e5)]
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -51,13 +51,13 @@ class UnitErrors(Section):
 
 
 class FlightPrior(Section):
-    """prior.yaml: the expected state at the first frame and the errors of all that is measured."""
+    """prior.yaml: the expected state at the first frame and the errors of all measurements."""
 
-    position_m: tuple[_Far, _Far, _Far]
+    position_m: tuple[_Coordinate, _Coordinate, _Coordinate]
     """Expected position of the camera, O_L."""
-    velocity_mps: tuple[_Far, _Far, _Far]
+    velocity_mps: tuple[_Coordinate, _Coordinate, _Coordinate]
     """Expected velocity, O_L."""
-    rotation_wxyz: tuple[_Far, _Far, _Far, _Far]
+    rotation_wxyz: tuple[_Coordinate, _Coordinate, _Coordinate, _Coordinate]
     """Expected rotation_camera_from_site, unit quaternion."""
     position_sigma_m: _Deviation
     """Standard deviation of the position on each axis."""
@@ -70,17 +70,17 @@ class FlightPrior(Section):
     range_sigma_m: _Deviation = RANGE_SIGMA_M
     """Standard deviation of a range."""
     relief_m: _Deviation = RELIEF_M
-    """Standard deviation of the ground's height about that of the nearest craters."""
+    """Standard deviation of the ground's height relative to the nearest craters."""
     catalogue_position_sigma_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Standard deviation of a crater's position in the catalogue on each axis."""
     catalogue_diameter_sigma_share: _Share = 0.03
-    """Standard deviation of a crater's diameter in the catalogue, divided by it."""
+    """Standard deviation of a crater's diameter in the catalogue, divided by the diameter."""
     site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    """Latitude of the origin of O_L, degrees, for a catalogue by latitude and longitude."""
+    """Latitude of the origin of O_L, degrees, for a catalogue in latitude and longitude."""
     site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
     """Longitude of the origin of O_L, east positive, degrees."""
     catalogue_columns: dict[CatalogueColumn, str] = Field(default_factory=dict)
-    """Columns of a catalogue by latitude and longitude; without them known catalogues are recognised."""
+    """Columns of a catalogue in latitude and longitude; if empty, known catalogues are recognised."""
 
     @model_validator(mode="after")
     def _unit_quaternion(self) -> "FlightPrior":
@@ -91,7 +91,7 @@ class FlightPrior(Section):
     @model_validator(mode="after")
     def _site_and_columns(self) -> "FlightPrior":
         if (self.site_latitude_deg is None) != (self.site_longitude_deg is None):
-            raise ValueError("site_latitude_deg and site_longitude_deg, or none of them")
+            raise ValueError("site_latitude_deg and site_longitude_deg, or neither")
         sizes = set(self.catalogue_columns) & set(METRES)
         if self.catalogue_columns and (len(self.catalogue_columns) != 3 or len(sizes) != 1):
             raise ValueError("catalogue_columns with longitude_deg, latitude_deg and one size")
@@ -123,7 +123,7 @@ class FlightPrior(Section):
 
 
 def read_camera(path: Path) -> CameraRecord:
-    """camera.yaml: the fields of `camera` in dataset.json, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
+    """Read camera.yaml: the fields of `camera` in dataset.json, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
 
     Distortion and mounting may be absent. Raises UserError on a missing file, a wrong value, or a camera that is not at
     the body's origin.
@@ -132,7 +132,7 @@ def read_camera(path: Path) -> CameraRecord:
     if isinstance(content, Calibration):
         rotation, content = content.rotation_camera_from_body, _fields_of(content)
         if rotation is not None:
-            # Calibrations have few digits.
+            # Calibration files give few digits: make the matrix orthogonal again.
             u, _, v = np.linalg.svd(rotation)
             content["rotation_camera_from_body"] = (
                 u @ v if np.abs(u @ v - rotation).max() < 1e-3 else rotation
@@ -141,7 +141,9 @@ def read_camera(path: Path) -> CameraRecord:
     defaults = {"distortion": NO_DISTORTION, "rotation_camera_from_body": rows, "position_in_body_m": [0.0, 0.0, 0.0]}
     camera = _validated(CameraRecord, defaults | content, path, "camera")
     if any(camera.position_in_body_m):
-        expected = "[0, 0, 0]: the filter takes the camera to be at the inertial unit; remove a negligible distance"
+        expected = (
+            "[0, 0, 0]: the filter assumes that the camera is at the inertial unit; set a negligible distance to 0"
+        )
         raise UserError(path, "camera.position_in_body_m", list(camera.position_in_body_m), expected)
     if camera.intrinsics().folds_back():
         raise UserError(path, "camera.distortion", list(camera.distortion), "a distortion that does not fold back")
@@ -153,7 +155,7 @@ def _fields_of(calibration: Calibration) -> dict[str, Any]:
 
 
 def read_prior(path: Path) -> FlightPrior:
-    """prior.yaml. Raises UserError on a missing file, an unknown key or a wrong value."""
+    """Read prior.yaml. Raises UserError on a missing file, an unknown key or a wrong value."""
     return _validated(FlightPrior, _read_yaml(path, "prior"), path, "prior")
 
 

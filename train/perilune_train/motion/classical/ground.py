@@ -15,7 +15,7 @@ _HEIGHT_SHARE = 0.01
 _LENGTH_SHARE = 0.35
 """Correlation length of the heights, divided by the width of the ground in view."""
 _NEW_SHARE = 0.03
-"""Share by which heights tend towards a plane from one frame to the next: finer relief comes into view."""
+"""Share of the estimated heights that is forgotten from one frame to the next, since finer relief comes into view."""
 
 
 @dataclass(frozen=True, slots=True)

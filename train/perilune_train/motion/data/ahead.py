@@ -12,19 +12,19 @@ _POLL_S = 0.1
 
 
 class Ahead(Generic[Key, Item]):
-    """Computes items while others are used, at most `most` ahead.
+    """Computes items in a background thread while others are used, at most `n_ahead` in advance.
 
     `make(keys)` runs in the thread and yields the items of these keys. `following(key)` yields a key and the keys that
-    are needed after it. If another key than the expected one is taken, the thread restarts at that key.
+    are needed after it. If `take` is called with a key other than the expected one, the thread restarts at that key.
     """
 
     def __init__(
         self,
         make: Callable[[Iterator[Key]], Iterator[tuple[Key, Item]]],
         following: Callable[[Key], Iterator[Key]],
-        most: int,
+        n_ahead: int,
     ):
-        self._make, self._following, self._most = make, following, most
+        self._make, self._following, self._most = make, following, n_ahead
         self._expected: Iterator[Key] = iter(())
         self._made: queue.Queue[tuple[Key, Item] | BaseException] = queue.Queue()
         self._stop, self._thread = threading.Event(), threading.Thread()
@@ -40,7 +40,7 @@ class Ahead(Generic[Key, Item]):
         return result[1]
 
     def close(self) -> None:
-        """Stop the thread; if it waits for a reply, it stops after the reply."""
+        """Stop the thread; wait up to _STOP_S seconds if it is computing an item."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(_STOP_S)

@@ -20,10 +20,11 @@ def stored_features(
     bf16: bool,
     views: Sequence[Trajectory] = (),
 ) -> list[Tensor]:
-    """Averages (pairs, inputs), float32, of the frozen backbone's features over all pairs of each trajectory.
+    """The frozen backbone's averaged features (pairs, inputs), float32, of the pairs of each trajectory.
 
-    Features of `views`, further versions of the trajectories in equal order (`other_views`), follow. The backbone is in
-    evaluation mode and each frame has one warp, so all coarse epochs have equal features. They stay on the device.
+    The features of `views` follow; these are further versions of the trajectories in the same order (`other_views`).
+    The backbone is in evaluation mode and each frame has one warp, so all coarse epochs share the features. The
+    features stay on the device.
     """
     modes = [(module, module.training) for module in network.backbone.modules()]
     network.backbone.eval()

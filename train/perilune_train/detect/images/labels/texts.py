@@ -18,14 +18,14 @@ _DOCUMENT_TYPES = ("<!DOCTYPE", "<!ENTITY")
 def read_text(path: Path, field: str, largest: int = _LARGEST_TEXT) -> str:
     """A text file in UTF-8. Raises UserError if it is missing, too large or of another encoding."""
     if not path.is_file():
-        raise UserError(path, field, "no such file", "a file of labels")
+        raise UserError(path, field, "no such file", "a label file")
     size = path.stat().st_size
     if size > largest:
         raise UserError(path, field, f"{size} bytes", f"at most {largest} bytes")
     try:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise UserError(path, field, "bytes that are not UTF-8 text", "a file of labels in UTF-8") from None
+        raise UserError(path, field, "bytes that are not UTF-8 text", "a label file in UTF-8") from None
 
 
 def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = None) -> Any:
