@@ -66,7 +66,7 @@ def _named_by(spice: Any, path: Path) -> list[Path]:
 
 
 def _check_regular(where: Path, path: Path, expected: str) -> None:
-    """Raise UserError about `where` for a path that is no regular file."""
+    """Raise UserError about `where` for a path that is not a regular file."""
     field = "kernel" if where == path else _LISTED
     prefix = "" if where == path else f"{path}: "
     try:
