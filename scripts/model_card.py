@@ -65,10 +65,10 @@ def _detector(one: Shipment) -> list[str]:
         f"`{shape['attention']}`, strides {' '.join(map(str, shape['strides']))}"
     )
     rows = [
-        f"| {rule} | {scoring} | {_figure(figures, f'{rule}/{prefix}ap50_paper')} | "
-        f"{_figure(figures, f'{rule}/{prefix}f1')} |"
-        for rule in ("visible", "paper")
-        for scoring, prefix in (("usual", ""), ("edge", "edge/"), ("strict", "strict/"))
+        f"| {selection} | {scoring_rule} | {_figure(figures, f'{selection}/{prefix}ap50_paper')} | "
+        f"{_figure(figures, f'{selection}/{prefix}f1')} |"
+        for selection in ("visible", "paper")
+        for scoring_rule, prefix in (("usual", ""), ("edge", "edge/"), ("strict", "strict/"))
     ]
     bins = [
         f"| {_bin_title(key)} | {value:.3f} |"
@@ -85,7 +85,8 @@ def _detector(one: Shipment) -> list[str]:
         "",
         "## Locked benchmark",
         "",
-        f"**AP {figures['headline/ap50_paper']:.3f}, F1 {figures['headline/f1']:.3f}** by the least favourable rule.",
+        f"**AP {figures['headline/ap50_paper']:.3f}, F1 {figures['headline/f1']:.3f}** by the least favourable "
+        "scoring rule.",
         "",
         "| labels | scoring rule | AP | F1 |",
         "|---|---|---|---|",
@@ -95,9 +96,9 @@ def _detector(one: Shipment) -> list[str]:
         "",
         "- `visible`: craters above a threshold of contrast in the frame",
         "- `paper`: all craters of 2 to 50 px radius, however faint",
-        "- usual: detections of other craters are neither right nor wrong; edge: detections of craters below 2 px are "
-        "false positives",
-        "- strict: every detection without a label is a false positive",
+        "- usual: detections on other craters are ignored",
+        "- edge: detections of 1.5 to 2 px that overlap no crater are false positives",
+        "- strict: every unmatched detection is a false positive",
         "",
         "| bin, labels by `visible`, usual scoring rule | AP |",
         "|---|---|",
@@ -116,9 +117,9 @@ def _seeds(one: Shipment) -> list[str]:
     """The same figures of trainings with other seeds, from the least favourable training on."""
     if not one.others:
         return ["- The figures are of one training."]
-    rules = {"paper/strict/": "labels `paper`, strict", "visible/edge/": "labels `visible`, edge"}
+    scoring_rules = {"paper/strict/": "labels `paper`, strict", "visible/edge/": "labels `visible`, edge"}
     found = []
-    for prefix, title in rules.items():
+    for prefix, title in scoring_rules.items():
         values = sorted(other[f"{prefix}ap50_paper"] for other in one.others)
         found.append(f"{', '.join(f'{value:.3f}' for value in values)} ({title})")
     count = len(one.others)

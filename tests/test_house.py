@@ -150,7 +150,7 @@ def test_text_reaches_terminals_pages_and_tables_through_one_function_each():
 
 MARKDOWN_WRITERS = {
     "train/perilune_train/records/markdown.py",
-    # Both pages put every text into code spans, and have a comment or a head that is no Markdown.
+    # Both pages put every text into code spans, and have a comment or a head that is not Markdown.
     "shared/perilune_shared/export/hugging_face.py",
     "shared/perilune_shared/export/card.py",
     # The page of HTML, which Jinja2 escapes.

@@ -6,10 +6,10 @@
         frame = scene.frame((0.0, 0.0, 800.0), (0.0, 1.0, 0.0, 0.0), labels=True)
         print(frame.image.shape, len(frame.labels["crater_id"]))
 
-A request is one message of ZeroMQ: JSON. A reply is several: JSON, then the bytes of each array that it lists, in C
-order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone. A head without arrays may say
-that the same request may be answered later: with `"ready": false` the scene of the request is not generated yet, with
-`"busy": true` the server has too many clients. Other heads with `"error"` say what is wrong with the request.
+A request is a ZeroMQ message of one part: JSON. A reply has several parts: a head in JSON, then the bytes of each array
+that the head lists, in C order. Other languages therefore need only a ZeroMQ library and a JSON library. A head may ask
+the client to repeat the request later: `"ready": false` means that the scene is not generated yet, `"busy": true` that
+the server has too many clients. In any other head, `"error"` says what is wrong with the request.
 """
 
 import json
@@ -26,7 +26,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 PORT = 10364
-"""Port of the interface, unless the server has another."""
+"""Default port of the interface."""
 CRATER_COLUMNS = (
     "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m", "depth_m", "latitude_deg",
     "longitude_deg",
@@ -64,7 +64,7 @@ class ServedFrame:
 
 @dataclass(frozen=True, slots=True)
 class ServedScene:
-    """What a server renders."""
+    """Camera, site and Sun of a server, with its number of scenes."""
 
     camera: Camera
     """Camera of the frames."""
@@ -137,17 +137,18 @@ class SceneClient:
         self._context.term()
 
     def scene(self) -> ServedScene:
-        """What the server renders."""
+        """Camera, site and Sun of the server, with its number of scenes."""
         head, _ = self._ask({"request": "scene"})
         camera = dict(head["camera"])
         camera["distortion"] = tuple(camera["distortion"])
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
     def health(self) -> dict[str, str]:
-        """Names and addresses (host:port) of the server's interfaces, each of which it has just connected to.
+        """Names and addresses (host:port) of the server's interfaces.
 
-        Raises UserError, which names an interface that does not answer, as for other requests. The reply waits for
-        the requests of other clients, so it also says that frames are rendered.
+        The server has just connected to each. Raises UserError, as other requests do; the error names an interface that
+        does not answer. The reply comes after earlier requests of other clients, so it also shows that frames are
+        rendered.
         """
         head, _ = self._ask({"request": "health"})
         try:
@@ -156,7 +157,7 @@ class SceneClient:
             raise UserError(self.address, "interfaces", "none", "a reply of `perilune-render serve`") from None
 
     def ground(self, scene: int, *, wait: bool = True) -> ServedGround | None:
-        """What a scene is, once it is generated; without `wait`, None if it is not yet."""
+        """Wait for a scene to be generated, and describe it; without `wait`, None if it is not generated."""
         head, _ = self._ask({"request": "ground", "scene": scene}, wait=wait)
         if head.get("ready") is False:
             return None
@@ -182,9 +183,9 @@ class SceneClient:
 
         `position_m` (3,) is in O_L, `rotation_wxyz` (4,) is rotation_camera_from_site as in a manifest, `velocity_mps`
         (3,), O_L, and `angular_velocity_radps` (3,), O_C, blur the frame, `sun_deg` is azimuth and elevation of the
-        Sun. `index` sets the noise; without it each frame that this client received has the next one. With `depth` the
-        frame has depth and normals. `scene` is the number of the scene; one that is not in the server's memory is
-        waited for.
+        Sun. `index` selects the noise; without it, the client counts the frames that it receives. With `depth` the
+        frame has depth and normals. `scene` is the number of the scene; the call waits for a scene that is not in the
+        server's memory.
         """
         request: dict[str, Any] = {
             "request": "frame",
@@ -214,13 +215,13 @@ class SceneClient:
     def heights(
         self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True, scene: int = 0
     ) -> Array:
-        """Heights (N,) of the surface at places (N,) of O_L, metres; NaN off the ground."""
+        """Heights (N,) of the surface at points (N,) of O_L, metres; NaN outside the scene's ground."""
         coordinates = [[float(value) for value in values] for values in (x_m, y_m)]
         request = {"request": "heights", "x_m": coordinates[0], "y_m": coordinates[1], "boulders": boulders}
         return self._ask(request | _of(scene))[1]["height_m"]
 
     def _ask(self, request: dict[str, Any], wait: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Head and arrays by name of the reply to a request; with `wait`, once its scene is generated."""
+        """Head of the reply to a request, and its arrays by name; with `wait`, after the scene is generated."""
         end = time.monotonic() + _GENERATION_S
         while True:
             head, arrays = self._ask_until_answered(request)
@@ -228,20 +229,18 @@ class SceneClient:
                 return head, arrays
             if time.monotonic() > end:
                 found = f"not generated in {_GENERATION_S:g} s"
-                raise UserError(
-                    self.address, f"scene {request.get('scene', 0)}", found, "a server with less other work"
-                )
+                raise UserError(self.address, f"scene {request.get('scene', 0)}", found, "a server with a lower load")
             time.sleep(_POLL_S)
 
     def _ask_until_answered(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Send a request, and again while the server is busy; returns the head of the reply and its arrays by name."""
+        """Send a request, repeatedly while the server is busy; returns the head of the reply and its arrays by name."""
         end = time.monotonic() + self._timeout_ms / 1000
         while True:
             head, arrays = self._ask_once(request)
             if "error" not in head:
                 return head, arrays
             if head.get("busy") is not True or time.monotonic() > end:
-                expected = "a request that it can render"
+                expected = "a request that the server can answer"
                 raise UserError(self.address, str(request["request"]), head["error"], expected)
             time.sleep(_POLL_S)
 
@@ -263,12 +262,12 @@ class SceneClient:
                 description["name"]: _array(description, part) for description, part in zip(arrays, parts, strict=True)
             }
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(self.address, "reply", error, "one of `perilune-render serve`") from None
+            raise UserError(self.address, "reply", error, "a reply of `perilune-render serve`") from None
         return head, arrays_by_name
 
 
 def _of(scene: int) -> dict[str, int]:
-    """The field `scene` of a request; none for scene 0, which every server has."""
+    """The field `scene` of a request; omitted for scene 0, which every server has."""
     return {"scene": scene} if scene else {}
 
 

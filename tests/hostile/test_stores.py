@@ -97,7 +97,7 @@ LIES = {
     "a key without a name": added(""),
     "a key of 10^6 letters": added("/hostile0/data/" + "x" * 1_000_000),
     "10^5 keys": listed(lambda found: found.update({f"/hostile0/data/x/{k:06d}": {"size": 1} for k in range(100_000)})),
-    "a size that is no number": listed(lambda found: [value.update(size=None) for value in found.values()]),
+    "a size that is not a number": listed(lambda found: [value.update(size=None) for value in found.values()]),
     "a size that is text": listed(lambda found: [value.update(size="a lot") for value in found.values()]),
     "a negative size": listed(lambda found: [value.update(size=-1) for value in found.values()]),
     "no size": listed(lambda found: [value.pop("size") for value in found.values()]),

@@ -18,7 +18,7 @@ from perilune_shared.storage.store import open_store
 
 Scene = Annotated[
     Path | None,
-    typer.Option(help="YAML file whose section `dataset` overrides the preset; `dataset.scene` has the Sun."),
+    typer.Option(help="YAML file whose section `dataset` overrides the preset; `dataset.scene` sets the Sun."),
 ]
 CameraFile = Annotated[
     Path | None,
@@ -30,8 +30,8 @@ CameraFile = Annotated[
 CameraAxes = Annotated[
     str | None,
     typer.Option(
-        help="Axes of the camera in the poses that point right, down and forward in the image: `opencv` (x,y,z), "
-        "`blender` (x,-y,-z) or three axes. [default: those that the file states, or opencv]"
+        help="Which camera axes of the poses point right, down and forward in the image: `opencv` (x,y,z), "
+        "`blender` (x,-y,-z) or three axes. [default: as the file states, else opencv]"
     ),
 ]
 
@@ -39,7 +39,7 @@ CameraAxes = Annotated[
 def frames(
     poses: Annotated[
         Path,
-        typer.Option(help="Poses: CSV, Parquet, TUM, EuRoC or KITTI, with the frame stated in its header."),
+        typer.Option(help="Poses: CSV, Parquet, TUM, EuRoC or KITTI; the header states the frame of reference."),
     ],
     out: Annotated[str, typer.Option(help="Folder or address of the new dataset.")],
     scene: Scene = None,
@@ -60,10 +60,9 @@ def frames(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render frames at given poses: an ordinary dataset with labels, over one scene.
+    """Render frames at given poses over one scene, into an ordinary dataset with labels.
 
-    A trajectory of the poses is the unit of work: an interrupted one starts again. Run the same command again to
-    resume.
+    Run the same command again to resume. Finished trajectories are kept; an interrupted trajectory starts again.
     """
     options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     config = with_camera(
@@ -89,7 +88,7 @@ def frames(
 
 
 def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
-    """A configuration with the camera of a file, if there is one. Raises UserError if it has several cameras."""
+    """A configuration with the camera of a file, if one is given. Raises UserError if `dataset.cameras` is set too."""
     if path is None:
         return config
     if config.cameras:

@@ -1,4 +1,4 @@
-"""Warn of a Sun that never stands so high at the landing site."""
+"""Warn if the Sun is never as high at the landing site as the settings state."""
 
 from pathlib import Path
 
@@ -17,10 +17,10 @@ def highest_sun_deg(latitude_deg: float) -> float:
 
 
 def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None:
-    """Warn if the Sun never stands this high at the site; `where` names the setting.
+    """Warn if the Sun never reaches this elevation at the site; `where` names the setting.
 
-    The site must be stated, by an elevation model or by the user's `dataset.terrain.latitude_deg`: other ground is
-    procedural and belongs to no place. Raises UserError if the elevation model cannot be read.
+    Without an elevation model or a latitude from the user (`dataset.terrain.latitude_deg`) there is no warning: such
+    ground has no place on the Moon. Raises UserError if the elevation model cannot be read.
     """
     latitude = _stated_latitude_deg(config)
     if latitude is None or elevation_deg <= highest_sun_deg(latitude):
@@ -28,12 +28,12 @@ def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None
     place = f"{abs(latitude):.1f} degrees {'south' if latitude < 0 else 'north'}"
     say(
         f"warning: {where}: got {elevation_deg:g} degrees, expected at most {highest_sun_deg(latitude):.1f}: at {place}"
-        " the Sun never stands higher"
+        " the Sun is never higher"
     )
 
 
 def warn_of_suns(config: DatasetConfig, kinds: tuple[Kind, ...]) -> None:
-    """Warn of the highest Sun that may be drawn for datasets of these kinds."""
+    """Warn if datasets of these kinds may draw a higher Sun than the site ever has."""
     for kind in kinds:
         warn_of_sun(config, f"dataset.{kind}.sun.elevation_deg", config.kind(kind).sun.elevation_deg.high)
 

@@ -25,7 +25,7 @@ def survey(
         float, typer.Option(help="Angle between the two camera axes, degrees.")
     ] = _DEFAULT.convergence_deg,
     sun_azimuth_offset_deg: Annotated[
-        float, typer.Option(help="Azimuth of the Sun, relative to that of the descents, degrees.")
+        float, typer.Option(help="Azimuth of the Sun, relative to the descents' Sun, degrees.")
     ] = _DEFAULT.sun_azimuth_offset_deg,
     sun_elevation_deg: Annotated[
         float, typer.Option(help="Elevation of the Sun, degrees.")
@@ -73,5 +73,5 @@ def survey(
         counts = made.info.counts
         answer(
             f"{made.store}: {counts.frames} frames of {plan.camera.width_px} px over {counts.scenes} scenes; "
-            f"`perilune-train navigate map --dataset {made.store}` makes catalogues of them"
+            f"make catalogues from them with `perilune-train navigate map --dataset {made.store}`"
         )

@@ -31,8 +31,8 @@ MOST_TRAJECTORIES, MOST_FRAMES = 200_000, 10_000_000
 MOST_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
 _LEAST_LIMIT = 3.0
-"""Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis; about half of all draws keep
-it."""
+"""Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis; about half of all draws
+stay below it."""
 
 
 class FlightConfig(Section):
@@ -57,7 +57,7 @@ class FlightConfig(Section):
     attitude_correlation_time_s: Seconds | None = None
     """Correlation time of the perturbation of the attitude, seconds; null takes correlation_time_s."""
     max_perturbation_mps2: Annotated[float, Field(gt=0, le=1000)] | None = None
-    """Largest acceleration by the perturbation of the position, metres per second squared; null for no limit."""
+    """Largest acceleration due to the perturbation of the position, metres per second squared; null for no limit."""
 
     @model_validator(mode="after")
     def _end_below_start(self) -> "FlightConfig":
@@ -89,7 +89,7 @@ class InstrumentsConfig(Section):
     inertial_rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
     """Inertial measurements per second."""
     range_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Measurements of the laser altimeter per second; 0 for none. Given poses have one at each frame's time."""
+    """Measurements of the laser altimeter per second; 0 for none. With given poses: one at each frame's time."""
     range_sigma_m: Deviation = 0.2
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0005
@@ -123,9 +123,9 @@ class KindConfig(Section):
     split_by: SplitUnit
     """Unit of the split: each scene, trajectory or frame belongs to one split as a whole."""
     val_share: Share = 0.1
-    """Share of the units of the split that are in the validation split."""
+    """Share of scenes, trajectories or frames (`split_by`) in the validation split."""
     test_share: Share = 0.1
-    """Share of the units of the split that are in the test split; 1 makes a test set without other splits."""
+    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 makes a test set alone."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()
@@ -175,7 +175,7 @@ class LightConfig(Section):
     bounce: bool = False
     """Whether to add light that other ground scattered once; without it and earthshine, shadows are black."""
     earthshine: bool = False
-    """Whether the Earth also lights the ground where it is above the horizon."""
+    """Whether the Earth, if it is above the horizon, also lights the ground."""
 
 
 class SensorConfig(Section):
@@ -218,8 +218,8 @@ class SensorConfig(Section):
     motion_blur: bool = True
     """Whether the camera's motion during the exposure blurs the frame."""
     blur_poses: Annotated[int, Field(ge=1, le=256)] = 1
-    """Number of poses during the exposure that are rendered and averaged: exact blur, at this multiple of the cost.
-    With 1 a single rendering is blurred along the motion of each pixel."""
+    """Number of poses during the exposure that are rendered and averaged; blur is exact, at that many times the
+    cost. With 1 a single rendering is blurred along the motion of each pixel."""
     row_time_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Time between the exposures of two neighbouring rows (rolling shutter), seconds; 0 exposes all rows at once."""
 
@@ -234,7 +234,7 @@ class RenderConfig(Section):
     """Settings of the renderer."""
 
     engine: Literal["cycles", "heightfield"] = "cycles"
-    """Cycles of Blender, or rays over the height field, which are faster but render no bounce and no earthshine."""
+    """Blender's Cycles, or rays over the height field: faster, but without bounce and earthshine."""
     samples: Annotated[int, Field(ge=1, le=4096)] = 4
     """Camera rays per pixel."""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
@@ -334,7 +334,7 @@ class DatasetConfig(Section):
         return self.detect if name == "detect" else self.nav
 
     def removed_from(self, scene_seed: int) -> tuple[int, ...]:
-        """Ids of the craters that are removed from the ground of a scene, given by its random seed."""
+        """Ids of the craters that are removed from the ground of the scene with this random seed."""
         return self.counterfactual.removed.get(scene_seed, ()) if self.counterfactual is not None else ()
 
     def ground_flight(self, kind: str) -> FlightConfig:

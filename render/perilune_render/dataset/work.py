@@ -30,7 +30,7 @@ OF_TRAJECTORY = ("frames", "labels", *OPTIONAL_TABLES)
 
 
 def committed(store: Store) -> set[str]:
-    """Names of all finished trajectories, as scene-0000.trajectory-0000, by one listing."""
+    """Names of all finished trajectories, such as scene-0000.trajectory-0000, by one listing."""
     listed = (item.path for item in store.list(f"{FOLDER}/index"))
     return {stem_of(path) for path in listed if path.endswith(".parquet") and not stem_of(path).startswith(".")}
 

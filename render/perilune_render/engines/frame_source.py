@@ -40,7 +40,8 @@ class Shot:
     index: int = 0
     """Index of the frame in the sequence. Frames that differ in seed or index have independent noise."""
     approach_deg: int = 0
-    """Direction from which the trajectory comes (`NominalTrajectory.approach_deg`); used only for ground in levels."""
+    """Direction from which the trajectory comes (`NominalTrajectory.approach_deg`); used only if the ground has several
+    levels (`perilune_render.terrain.levels`)."""
     angular_velocity_radps: Array = field(default_factory=lambda: np.zeros(3))
     """Angular velocity of the camera, O_C, radians per second (3,)."""
 
@@ -60,7 +61,7 @@ class Shot:
         return bool(np.any(self.velocity_mps) or np.any(self.angular_velocity_radps))
 
     def pose_at(self, time_s: float) -> Pose:
-        """Position and rotation some time after the middle of the exposure of the middle row, seconds."""
+        """Position and rotation `time_s` seconds after the middle of the exposure of the middle row."""
         if time_s == 0:
             return self.pose
         return moved(self.pose, self.velocity_mps, self.angular_velocity_radps, time_s)
@@ -78,10 +79,10 @@ class Engine(Protocol):
         """Unit vector towards the Sun, O_L (3,)."""
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int) -> Radiance:
-        """The rendering, in the pixels of `camera`, at a position (3,), O_L, metres, with a rotation matrix (3, 3)."""
+        """Render the scene for `camera` from a position (3,), O_L, metres, with a rotation matrix (3, 3)."""
 
     def render_rows(self, poses: RowPoses, seed: int, approach_deg: int) -> Radiance:
-        """The rendering with a pose for each row of the sensor (rolling shutter)."""
+        """Render the scene with a pose for each row of the sensor (rolling shutter)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +120,7 @@ class FrameSource:
     def of(
         cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles, name: str | None = None
     ) -> "FrameSource":
-        """The source with a configuration's sensor and label limits. Its seed determines the fixed pattern.
+        """The source for a configuration, whose seed determines the fixed pattern of the sensor.
 
         `name` is the name of the camera if there are several: each has its own fixed pattern. Raises ValueError
         if the engine's camera does not cover the view of `camera`.
@@ -130,13 +131,13 @@ class FrameSource:
         return cls(engine, camera, circles, config.sensor, pattern, config.labels)
 
     def take(self, shot: Shot) -> Frame:
-        """Render and develop one frame. Raises what the engine raises: OSError if Blender wrote no readable frame."""
+        """Render and develop one frame. Raises the engine's errors, such as OSError if Blender wrote no frame."""
         return self.develop(shot, self.render(shot))
 
     def render(self, shot: Shot) -> Radiance:
-        """The engine's rendering of a shot, in the pixels of its camera. Raises what the engine raises.
+        """The engine's rendering of a shot, in the pixels of its camera. Raises the engine's errors.
 
-        If the sensor has several poses in an exposure and the camera moves, it is also rendered at these.
+        If `sensor.blur_poses` is above 1 and the camera moves, `blurred` is the mean of renderings at these poses.
         """
         middle = self._render_at(shot, 0.0, shot.render_seed)
         n = self.sensor.blur_poses
@@ -150,7 +151,7 @@ class FrameSource:
         return replace(middle, blurred=(total / n).astype(np.float32))
 
     def _render_at(self, shot: Shot, time_s: float, seed: int) -> Radiance:
-        """The rendering of a shot at a time of its exposure, seconds from its middle, with the shutter's row times."""
+        """The rendering `time_s` seconds from the middle of the exposure, with a pose per row for a rolling shutter."""
         if not self._rolls(shot):
             return self.engine.render(*shot.pose_at(time_s), seed, shot.approach_deg)
         return self.engine.render_rows(self._row_poses(shot, time_s), seed, shot.approach_deg)
@@ -160,12 +161,12 @@ class FrameSource:
         return bool(self.sensor.row_time_s) and shot.moves
 
     def _row_poses(self, shot: Shot, time_s: float = 0.0) -> RowPoses:
-        """Poses of the rows of a shot at a time of its exposure, seconds from its middle."""
+        """Poses of the rows of a shot `time_s` seconds from the middle of the exposure."""
         times_s = row_times_s(self.camera.height_px, self.sensor.row_time_s)
         return RowPoses(sensor_rows(self.camera, self.engine.camera), times_s, lambda t: shot.pose_at(time_s + t))
 
     def places_m(self, frame: Frame) -> Array:
-        """Places (h, w, 3), O_L, metres, that pixels of the engine's camera show at their rows' poses; NaN for sky."""
+        """Points (h, w, 3), O_L, metres, that the engine's camera sees, each from the pose of its row; NaN for sky."""
         shot, camera, depth_m = frame.shot, self.engine.camera, frame.radiance.depth_m.astype(np.float64)
         depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan)[..., None]
         rays = camera.rays(camera.pixel_centres())
@@ -192,7 +193,7 @@ class FrameSource:
         return self.with_contrast(label_frame(circles, self.camera, *frame.shot.pose, seen, limits), frame)
 
     def with_contrast(self, labels: Labels, frame: Frame) -> Labels:
-        """Labels of a frame with their contrast in its exposure."""
+        """The labels with their contrast, computed from the frame's exposure."""
         shown = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
         return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, shown)
 
@@ -202,7 +203,7 @@ class FrameSource:
         return crater_index(circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
 
     def _seen_circles(self, shot: Shot) -> RimCircles:
-        """The rims, moved so that the shot's pose sees each as the pose of the row of its centre does."""
+        """The rims, each moved so that the shot's pose sees it where the pose of its centre's row sees the real rim."""
         if not self._rolls(shot):
             return self.circles
         moving = Moving(*(each[None] for each in (*shot.pose, shot.velocity_mps, shot.angular_velocity_radps)))

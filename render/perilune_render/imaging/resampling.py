@@ -11,7 +11,7 @@ from perilune_shared.geometry.camera import Camera
 
 
 def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
-    """Resample an image (h, w) of the camera `source` to `camera` (Lanczos, 8 x 8 px); unchanged if they are the same.
+    """Resample an image (h, w) of the camera `source` to `camera` (Lanczos, 8 x 8 px); unchanged if both are equal.
 
     `source` must cover the view of `camera`. OpenCV rounds sample positions to 1/32 px. If the pixels of `source` are
     finer, several samples per pixel are averaged, to avoid aliasing.
@@ -36,7 +36,7 @@ def resample_nearest(image: np.ndarray, camera: Camera, source: Camera) -> np.nd
 
 
 def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
-    """A rendering by `source` in the pixels of `camera`, by the nearest pixel."""
+    """A rendering of the camera `source`, resampled to `camera` by the nearest pixel."""
     if camera == source:
         return radiance
     images = {field.name: getattr(radiance, field.name) for field in fields(radiance)}

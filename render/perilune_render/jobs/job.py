@@ -35,7 +35,7 @@ class Job:
     def with_threads(self, n_threads: int | None, n_workers: int) -> "Job":
         """The job with this number of threads in each process.
 
-        None keeps the configured number. If that is 0, all cores, it divides the cores among several workers.
+        None keeps the configured number; if that is 0 (all cores), several workers share the cores.
         """
         if n_threads is None and (self.config.render.threads or n_workers <= 1):
             return self
@@ -52,10 +52,10 @@ class Job:
         return len(self.plan.trajectories[index].splits)
 
     def name(self, index: int) -> str:
-        """Name of a trajectory, as scene-0000/trajectory-0000."""
+        """Name of a trajectory, such as scene-0000/trajectory-0000."""
         return trajectory_name(self.plan.trajectories[index])
 
 
 def trajectory_name(trajectory: TrajectoryPlan) -> str:
-    """Name of a trajectory in messages, as scene-0000/trajectory-0000."""
+    """Name of a trajectory in messages, such as scene-0000/trajectory-0000."""
     return f"{trajectory.scene_id}/{trajectory.trajectory_id}"

@@ -2,7 +2,8 @@
 
 `start_worker` starts `python -m perilune_render.jobs.worker DESCRIPTOR PARENT SCRATCH ENGINE`: the descriptor of its
 end of the connection, the parent's process id, a folder for temporary files, which the parent removes, and the engine
-to load before the job arrives. What the parent needs is imported quickly, so that a command can start a worker first.
+to load before the job arrives. The parent's part of this module imports quickly: a command can
+start a worker before it loads other libraries.
 """
 
 import contextlib
@@ -19,9 +20,9 @@ from multiprocessing.connection import Connection, Pipe
 from perilune_shared.errors import ends_run
 
 WORKER = ("-m", "perilune_render.jobs.worker")
-"""What Python runs in a worker process."""
+"""Arguments of Python that start a worker process."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""The number of threads of linear algebra changes the last digits of results."""
+"""Variables set to 1 in a worker: the number of threads of linear algebra changes the last digits of results."""
 _END_S = 5.0
 """Longest time for a worker to end by itself, seconds."""
 _PR_SET_PDEATHSIG = 1
@@ -44,7 +45,7 @@ class Worker:
     """Number of trajectories that it has rendered."""
 
     def send(self, command: str, target: object) -> None:
-        """Send a command. That a worker has ended is noticed when its messages are received."""
+        """Send a command. Raises nothing if the worker has ended: receiving its messages shows that."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send((command, target))
 
@@ -55,7 +56,7 @@ class Worker:
         return f"worker killed by {signal.Signals(-code).name}" if code < 0 else f"worker ended with code {code}"
 
     def end(self, *, at_once: bool = False) -> None:
-        """End the process; all that it reported as done is on the disk. Without effect if it has ended."""
+        """End the process; all that it reported as done is on the disk. Has no effect if it has already ended."""
         self.connection.close()
         if at_once:
             self.process.kill()
@@ -77,7 +78,7 @@ def start_worker(scratch: str, engine: str) -> Worker:
             pass_fds=[theirs.fileno()],
             env={**os.environ, **dict.fromkeys(ONE_THREAD, "1")},
             stdin=subprocess.DEVNULL,
-            # Ctrl-C goes to this process alone, which then ends its workers.
+            # Ctrl-C reaches only the parent, which then ends its workers.
             process_group=0,
         )
     return Worker(process, ours)
@@ -95,7 +96,7 @@ def early_worker(engine: str) -> Iterator[Worker]:
 
 
 def main() -> None:
-    """Serve the parent until it closes the connection, or a trajectory fails: the next worker starts afresh."""
+    """Serve the parent until it closes the connection or a trajectory fails; a failure needs a new worker."""
     _end_with(int(sys.argv[2]))
     tempfile.tempdir = sys.argv[3]
     connection = Connection(int(sys.argv[1]))

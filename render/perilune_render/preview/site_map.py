@@ -18,7 +18,7 @@ from perilune_shared.geometry.frames import Array
 _N_HALF = 450
 """Vertex spacings from the middle of the map to its edge."""
 LARGEST_WIDTH = 8.0
-"""Largest width of the map, as a multiple of the ground's: of a larger model only the part around the site is shown."""
+"""Largest width of the map, as a multiple of the ground's; a larger model is shown only around the site."""
 _MARGIN = 1.03
 _LIFT = 0.02
 """Height above the ground at which rays to the Sun begin, in vertex spacings."""
@@ -29,11 +29,11 @@ class SiteMap:
     """A square map in O_L's plane. Row 0 is the northern edge (smallest y), column 0 the western one (largest x)."""
 
     height_m: Array
-    """Heights above the site (n, n), metres; NaN where nothing is known."""
+    """Heights above the site (n, n), metres; NaN where no height is known."""
     shade: Array
-    """Cosine of the angle between the ground's normal and the Sun (n, n), from 0."""
+    """Cosine of the angle between the ground's normal and the Sun (n, n), at least 0."""
     sunlit: np.ndarray
-    """Whether the middle of the Sun is seen from there (n, n)."""
+    """Whether the centre of the Sun is visible from each point (n, n)."""
     centre_m: tuple[float, float]
     """x and y of the map's middle, metres."""
     half_width_m: float
@@ -47,8 +47,8 @@ class SiteMap:
 def site_map(scene: Scene, model: ElevationModel | None, sun: Array) -> SiteMap:
     """The map of a scene's ground, and of the elevation model around it, lit from `sun` (3,), O_L.
 
-    The ground of the scene ends where frames see no further; beyond it the map has the heights of the model, whose
-    shadows the frames do not show.
+    The ground of the scene covers what frames show. Beyond it the map has the heights of the model, which cast no
+    shadows in frames.
     """
     ground_half = scene.grid.extent_m / 2
     outline = outline_m(model) if model is not None else None
@@ -81,7 +81,7 @@ def site_map(scene: Scene, model: ElevationModel | None, sun: Array) -> SiteMap:
 
 
 def _grid(ground_half_m: float, outline: Array | None) -> Grid:
-    """The vertices of the map: the ground of the scene and the whole model, or what fits of it."""
+    """The vertices of the map: the ground of the scene and the whole model, or the part of it that fits."""
     corners = np.array([[-ground_half_m, -ground_half_m], [ground_half_m, ground_half_m]])
     if outline is not None:
         corners = np.stack([np.minimum(corners[0], outline.min(axis=0)), np.maximum(corners[1], outline.max(axis=0))])

@@ -14,13 +14,13 @@ class SeenGround:
     z_m: Array
     """Height of the camera above O_L's plane, ascending, metres (N,)."""
     height_m: Array
-    """Lowest height of that camera above the ground in view, metres (N,)."""
+    """Lowest height of a camera at `z_m` above the ground in view, metres (N,)."""
     nearest_m: Array
     """Smallest distance of the nominal trajectory from the site, metres (N,)."""
     farthest_m: Array
     """Largest distance of the nominal trajectory from the site, metres (N,)."""
     margin_m: Array
-    """Largest |dx| or |dy| of the ground in view from the nominal trajectory, metres (N,)."""
+    """Largest distance in x or in y between the nominal trajectory and ground in view, metres (N,)."""
 
     def box_m(self, approach_deg: int) -> tuple[Array, Array]:
         """Smallest and largest x and y, (N, 2) each, metres, of the ground that a trajectory's frames show.
@@ -38,15 +38,15 @@ class SeenGround:
 class ViewEnvelope:
     """The views that a scene's mesh is made for: they determine its extent and vertex spacing.
 
-    Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` away; in between, the
-    value is interpolated linearly. Ground beyond the last reach is never seen. The envelope of a flight is
+    Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` away; between the
+    reaches, the height is interpolated linearly. Ground beyond the last reach is never seen. For a flight, use
     `perilune_render.flight.view.view_envelope`. Raises ValueError if a column is not finite, positive and ascending.
     """
 
     height_m: Array
-    """Smallest distance of the camera from the ground in view, mostly its height, ascending, metres (N,)."""
+    """Smallest distance of the camera from the ground in view, usually its height, ascending, metres (N,)."""
     reach_m: Array
-    """Distance max(|x|, |y|) of that ground from the site, not descending, metres (N,)."""
+    """Distance max(|x|, |y|) of that ground from the site, non-decreasing, metres (N,)."""
     focal_px: float
     """Largest focal length of the camera, pixels: a pixel shows at least height / focal_px metres of ground."""
     seen: SeenGround | None = None

@@ -32,8 +32,8 @@ class _Waves(NamedTuple):
 def add_waves(field: Array, grid: Grid, wavelength_m: float, amplitude: float, rng: np.random.Generator) -> None:
     """Add amplitude times gradient noise of a wavelength to field (n_vertices,), in place.
 
-    The wave fades where the grid is too coarse for it: full amplitude up to a spacing of a sixth of the wavelength,
-    half at a third, none from a half.
+    The wave fades where the grid is too coarse for it: full amplitude up to a spacing of 1/6 of the
+    wavelength, half the amplitude at 1/3, none from 1/2.
     """
     shares = np.clip(1.5 - 3 * grid.spacings_m / wavelength_m, 0, 1)
     if not shares.any():
@@ -62,7 +62,7 @@ def _add_waves(field, n_half, half_widths, waves):
         du, dv = lines[row, 2] / wavelength, lines[row, 3] / wavelength
         for k in range(number):
             x, y = u + k * du, v + k * dv
-            # Cell and place in it; the weights of its corners are quintic, so that slope and curvature are continuous.
+            # Cell, and position in the cell; corner weights are quintic, so that slope and curvature are continuous.
             i, j = int(x), int(y)
             fx, fy = x - i, y - j
             wx = fx * fx * fx * (fx * (6 * fx - 15) + 10)

@@ -44,7 +44,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def _new_dataset(out: str, overwrite: bool, *inputs: str) -> AbstractContextManager[str]:
-    """Where to write the dataset at `out`, made of the datasets `inputs`."""
+    """The address to write the new dataset `out` to, as a context manager; `inputs` are its source datasets."""
     return replaceable(out, ("dataset.json",), overwrite=overwrite, inputs=inputs)
 
 
@@ -102,7 +102,7 @@ def split(
     dataset: DatasetArgument,
     out: OutOption,
     by: Annotated[
-        SplitUnit, typer.Option(help="Unit of the split. frame is the paper's protocol: its splits share terrain.")
+        SplitUnit, typer.Option(help="Unit of the split. `frame` follows the paper: such splits share terrain.")
     ] = "scene",
     val: Annotated[float, typer.Option(help="Share of units in the split val.")] = 0.1,
     test: Annotated[float, typer.Option(help="Share of units in the split test.")] = 0.1,
@@ -129,7 +129,7 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
         answer("no difference")
         return
     rows = [(one.place, one.column, one.rows, one.example, one.first, one.second) for one in found]
-    answer_table(("where", "column", "rows", "for example", "first", "second"), rows)
+    answer_table(("where", "column", "rows", "example", "first", "second"), rows)
     raise typer.Exit(EXIT_DIFFERENT)
 
 
@@ -174,7 +174,10 @@ def attach(
     frames: Annotated[str, typer.Option(help="Folder written by `perilune-render regenerate --out`.")],
     out: OutOption,
     rehash: Annotated[
-        bool, typer.Option("--rehash", help="Accept frames with other hashes and record their hashes.")
+        bool,
+        typer.Option(
+            "--rehash", help="Accept frames whose hashes differ from the manifest, and record the new hashes."
+        ),
     ] = False,
     link: LinkOption = False,
     overwrite: OverwriteFolder = False,

@@ -1,7 +1,7 @@
-"""Compare what the footer of a Parquet part states about values with the values.
+"""Compare the statistics in the footer of a Parquet part with its values.
 
-Readers skip row groups by these statements, so a false one hides rows. pyarrow does not show all of the footer: other
-programs also read the older fields of minimum and maximum, and trust writers whose statistics pyarrow ignores.
+Readers use these statistics to skip row groups, so a false one hides rows. pyarrow does not show all of the footer:
+other programs also read the older fields of minimum and maximum, and trust writers whose statistics pyarrow ignores.
 """
 
 from collections.abc import Iterator
@@ -21,14 +21,14 @@ _EXTREMES = {1: "max", 2: "min", 5: "max", 6: "min"}
 _OF_GROUP = {4: "a sort order"}
 _OF_CHUNK = {1: "values in another file", 4: "a page index", 6: "a page index"}
 _OF_COLUMN = {14: "a Bloom filter"}
-"""Other statements by which programs select or find rows. No version of this package writes one."""
+"""Other footer entries by which programs select or find rows. No version of this package writes them."""
 _BYTES = {pa.int64(): "<i8", pa.int32(): "<i4", pa.float64(): "<f8", pa.float32(): "<f4", pa.bool_(): "?"}
 
 
 def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[UserError]:
-    """Yield what is wrong in the footer about a row group: `stated` is its RowGroup, `rows` has columns of it.
+    """Yield an error for each false statistic of a row group: `stated` is its RowGroup, `rows` has columns of it.
 
-    Statements that cannot be checked, such as Bloom filters, are wrong too.
+    Entries that cannot be checked, such as Bloom filters, are errors too.
     """
     for number in _OF_GROUP.keys() & stated.keys():
         yield UserError(part.address, "row group", _OF_GROUP[number], "none")
@@ -44,7 +44,7 @@ def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[Use
 
 
 def _leaves(column: pa.Array) -> Iterator[pa.Array]:
-    """Yield the arrays that Parquet stores as columns, in its order; without the elements of lists that are null."""
+    """Yield the arrays that Parquet stores as columns, in Parquet's order, without the elements of null lists."""
     if pa.types.is_struct(column.type):
         for index in range(column.type.num_fields):
             yield from _leaves(pc.struct_field(column, index))
@@ -55,7 +55,7 @@ def _leaves(column: pa.Array) -> Iterator[pa.Array]:
 
 
 def _false_of_column(address: str, path: str, chunk: Fields, values: pa.Array) -> Iterator[UserError]:
-    """Yield what is wrong about one column: `chunk` is its ColumnChunk."""
+    """Yield an error for each false statistic of one column: `chunk` is its ColumnChunk."""
     metadata = chunk[_METADATA]
     for notes, fields in ((_OF_CHUNK, chunk), (_OF_COLUMN, metadata)):
         for number in sorted(notes.keys() & fields.keys()):
@@ -82,7 +82,7 @@ def _false_of_column(address: str, path: str, chunk: Fields, values: pa.Array) -
 
 
 def _value(raw: bytes, kind: pa.DataType) -> object:
-    """Decode a value of the statistics. Raises ValueError if it has another length than its type."""
+    """Decode a value of the statistics. Raises ValueError if its length does not fit its type."""
     if pa.types.is_string(kind):
         return raw.decode(errors="replace")
     if pa.types.is_binary(kind):

@@ -15,7 +15,7 @@ def summary(dataset: Dataset) -> pd.DataFrame:
     Columns: scenes, trajectories, frames, labels, labels per frame, quantiles of the radius in pixels, mean visible
     fraction, craters in view that are too large for a label (None if not known) and size of the PNGs (10^6 bytes).
 
-    Raises UserError if there are no frames or keys are broken.
+    Raises UserError if there are no frames or keys are inconsistent.
     """
     frames = dataset.table("frames", [*FRAME_COLUMNS, "split", "png_bytes", "n_craters_above_max_radius"])
     keys = KeyCheck(dataset, frames)

@@ -1,4 +1,4 @@
-"""Export to YOLO: a text file per image, a line `class cx cy w h` per crater, as fractions of the image size.
+"""Export to YOLO: one text file per image, with a line `class cx cy w h` per crater, in fractions of its size.
 
 Format: https://docs.ultralytics.com/datasets/detect (read by all tools derived from Darknet). Trainers expect the
 labels of `images/a/b.png` in `labels/a/b.txt`. Boxes are clipped to the image. The format has no ignored objects:
@@ -54,16 +54,16 @@ def export_yolo(
             ):
                 lines[frame_id].append(f"{CRATER_CLASS} {x:.8f} {y:.8f} {w:.8f} {h:.8f}\n")
             n_boxes += int(not_empty.sum())
-            for frame_id, own_split in zip(scene.frames["frame_id"], scene.frames["split"], strict=True):
+            for frame_id, frame_split in zip(scene.frames["frame_id"], scene.frames["split"], strict=True):
                 files.write_text(
                     files.inside(folder, f"labels/{frame_id}.txt"), "".join(lines[frame_id]), durable=False
                 )
-                lists[own_split].append(f"./images/{frame_id}.png\n")
+                lists[frame_split].append(f"./images/{frame_id}.png\n")
             _write_images(dataset, scene.frames, folder, link=link)
             progress.advance(task)
         for name, entries in lists.items():
             files.write_text(folder / f"{name}.txt", "".join(entries))
-        # Without `path`, the lists are searched beside this file, so the folder can be moved.
+        # Without `path`, readers look for the lists next to this file, so the folder can be moved.
         present = [f"{name}: {name}.txt\n" for name in SPLITS if name in lists]
         files.write_text(folder / "data.yaml", "".join(present) + f"names:\n  {CRATER_CLASS}: crater\n")
     return n_boxes

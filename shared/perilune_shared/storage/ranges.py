@@ -1,4 +1,4 @@
-"""Read an object by ranges, with few requests."""
+"""Read an object in byte ranges, with few requests."""
 
 import contextlib
 import io
@@ -7,28 +7,28 @@ from typing import Any
 
 _BLOCK_BYTES = 2**22
 _MAX_GAP_BYTES = 2**18
-"""Ranges this close to each other are read by one request: a request costs more than these bytes."""
+"""Ranges this close to each other are read with one request: a request costs more than these bytes."""
 _MARGIN_BYTES = 2**14
 """Bytes read beyond each range, for readers that do not know where a header ends."""
 
 
 class Ranges(io.RawIOBase):
-    """An object as a file for reading. Bytes that are neither kept nor fetched are read in blocks of 4 MiB."""
+    """A stored object as a read-only file. Bytes that are neither kept nor fetched are read in blocks of 4 MiB."""
 
     def __init__(self, read: Callable[[int, int], bytes], size_bytes: int):
-        """`read` returns the bytes [start, end) of the object, by one request."""
+        """`read` returns the bytes [start, end) of the object, with one request."""
         self._read, self.size_bytes, self._at = read, size_bytes, 0
         self._kept: list[tuple[int, bytes]] = []
         self._fetched: list[tuple[int, bytes]] = []
         self._block = (0, b"")
 
     def keep(self, start: int) -> None:
-        """Read the bytes from `start` to the end by one request, and keep them."""
+        """Read the bytes from `start` to the end with one request, and keep them."""
         self._kept.append((start, self._read(start, self.size_bytes)))
 
     @contextlib.contextmanager
     def fetched(self, ranges: Iterable[tuple[int, int]]) -> Iterator[None]:
-        """Keep ranges (start, end) within the block; each needs one request, neighbours one together."""
+        """Keep ranges (start, end) inside the `with` block; neighbouring ranges share a request."""
         joined: list[list[int]] = []
         for start, end in sorted(ranges):
             first, last = max(start, 0), min(end + _MARGIN_BYTES, self.size_bytes)

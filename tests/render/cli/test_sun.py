@@ -25,7 +25,7 @@ def test_a_sun_too_high_for_the_stated_site(capsys):
     assert warning("dataset.terrain.latitude_deg=10") == ""
     assert warning("dataset.terrain.latitude_deg=-85").splitlines() == [
         f"warning: dataset.{kind}.sun.elevation_deg: got {high} degrees, expected at most 6.5: at 85.0 degrees south "
-        "the Sun never stands higher"
+        "the Sun is never higher"
         for kind, high in (("detect", 65), ("nav", 60))
     ]
 

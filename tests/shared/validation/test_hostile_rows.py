@@ -254,7 +254,7 @@ SHARDS = {
         "name",
     ),
     "no shard": (lambda root: [pack(root), (root / TRAIN).unlink()], "frame_id"),
-    "a shard that is none": (lambda root: [pack(root), (root / TRAIN).write_bytes(b"x")], "content"),
+    "a file that is not a shard": (lambda root: [pack(root), (root / TRAIN).write_bytes(b"x")], "content"),
     "a shard of another table": (
         lambda root: [pack(root), (root / TRAIN).write_bytes(part_of(root, "frames").read_bytes())],
         "perilune.table",

@@ -56,7 +56,7 @@ def test_without_the_installed_detector_the_frames_are_those_of_the_run(shown):
 
 def test_the_landing_is_a_headline(shown):
     lines = gather("demo", "demo", *shown).summary
-    assert any("error of position of 1.458 m over the test descents, and of 0.500 m at their end" in x for x in lines)
+    assert any("position error of 1.458 m over the test descents, and of 0.500 m at their end" in x for x in lines)
 
 
 def test_tiny_says_what_it_is_for(shown, monkeypatch):

@@ -111,8 +111,8 @@ def evaluate_again(
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
     """Write compare.md and precision_recall.png into `out`; returns the table.
 
-    Raises UserError if a folder has no metrics or no curve, or was evaluated on terrain that its network was trained
-    on, unless `allow_overlap`; then table and picture are marked.
+    Raises UserError if a folder has no metrics or no curve, or if a network was evaluated on its training terrain.
+    `allow_overlap` accepts such a network, and marks table and picture.
     """
     rows, curves, marks = [], {}, []
     for folder in folders:
@@ -140,7 +140,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         cells = [for_markdown(name), *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        # AP of the whole curve; the file has fewer points.
+        # Take AP from the metrics: the curve in the file has fewer points.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]

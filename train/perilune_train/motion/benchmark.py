@@ -33,7 +33,7 @@ _COLUMNS = {
     "orientation_rmse_angle_deg": "orientation RMSE, angle (deg)",
     "drift_final_m": "drift at the end (m)",
     "stated_position_rmse_vector_m": "stated position RMSE, vector (m)",
-    "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is right)",
+    "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is correct)",
 }
 _OF_BINS = tuple(_COLUMNS)[:3]
 """Figures that are also computed by region, altitude and Sun."""

@@ -35,7 +35,7 @@ _PERCENTILES = (5, 50, 95)
 _SCORED = ("position_rmse_vector_m", "position_rmse_m")
 _SCORED_ANGLES = ("orientation_rmse_angle_deg", "attitude_rmse_deg")
 _METHOD_PICTURES = {
-    "altitude.png": "Errors of position over ground by altitude: median, and 5 to 95 %.",
+    "altitude.png": "Position errors over ground by altitude: median, and 5 to 95 %.",
     "flights.png": "Errors of the filter along each descent, within three standard deviations.",
     "matches_high.png": "First frame: detections matched (cyan) and not (red), catalogue at the pose (yellow).",
     "matches_low.png": "Last frame, likewise.",
@@ -49,8 +49,8 @@ _LANDING_COLUMNS = {
     "in_band_share": "share in the 95 % band",
 }
 _LANDING_PICTURES = {
-    "errors.png": "Errors of position over all draws: 50, 95 and 100 %, and the median of three stated sigmas.",
-    "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is right.",
+    "errors.png": "Position errors over all draws: 50, 95 and 100 %, and the median of three stated sigmas.",
+    "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is correct.",
 }
 _METHOD_COLUMNS = {
     "kind": "kind",
@@ -128,7 +128,7 @@ def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
     lead: tuple[str, ...] = ()
     if len(absolute):
         best = absolute.iloc[0]
-        lead = (f"Lowest error of position over ground: {best['method']}, {number(best['position_rmse_m'])} m RMSE.",)
+        lead = (f"Lowest position error over ground: {best['method']}, {number(best['position_rmse_m'])} m RMSE.",)
     return Section("methods", "Methods of navigation", lead, (table,), tuple(figures))
 
 
@@ -163,7 +163,7 @@ def landing_headline(rows: pd.DataFrame) -> str:
     own = run_summary(rows)
     over, end = number(own["position_rmse_m"]), number(own["position_end_rmse_m"])
     return (
-        f"The filter with the installed detector has an r.m.s. error of position of {over} m over the test descents, "
+        f"The filter with the installed detector has an r.m.s. position error of {over} m over the test descents, "
         f"and of {end} m at their end."
     )
 

@@ -142,7 +142,7 @@ def _check_own(run: RunFolder, task: str) -> None:
         # A folder with only inputs.json is a run that was killed before it wrote its configuration.
         if [path.name for path in run.root.iterdir() if not path.name.startswith(".")] == [run.inputs.name]:
             return
-        raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", expected)
+        raise UserError(run.root, "--name", "a folder that is not a run (no config.yaml)", expected)
     sections = list(read_config_file(run.config))
     if sections != [task]:
         raise UserError(run.config, "--name", f"the sections {', '.join(sections) or 'none'}", expected)

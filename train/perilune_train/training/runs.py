@@ -105,7 +105,7 @@ def save_weights(
 ) -> None:
     """Write a network's weights with the plain settings (`architecture`) that rebuild it.
 
-    `terrain` is the plain record of the terrain that it was fitted to (provenance.py); None leaves it unknown.
+    `terrain` is the plain record of the terrain that the network was fitted to (provenance.py); None leaves it unknown.
     """
     # Save to memory first: torch reports a full disk as a RuntimeError, not as an OSError.
     content = io.BytesIO()
@@ -150,7 +150,7 @@ def check_architecture(path: Path, found: Mapping[str, Any], expected: Mapping[s
     """Raise UserError naming the first setting of `expected` that differs in a checkpoint's architecture."""
     for key, value in expected.items():
         if found.get(key) != value:
-            raise UserError(path, key, found.get(key), f"{value}; the checkpoint is of another architecture")
+            raise UserError(path, key, found.get(key), f"{value}; the checkpoint has another architecture")
 
 
 def load_state(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
@@ -166,7 +166,7 @@ def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Mod
         found = tuple(state[key].shape) if key in state else "nothing"
         expected = str(tuple(tensors[key].shape)) if key in tensors else "no such tensor"
         if str(found) != expected:
-            raise UserError(path, key, found, f"{expected}; the checkpoint is of another architecture")
+            raise UserError(path, key, found, f"{expected}; the checkpoint has another architecture")
 
 
 def choose_device(device: str) -> str:

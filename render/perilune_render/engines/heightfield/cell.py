@@ -1,6 +1,6 @@
-"""Intersect a ray with what is in one cell of the mesh: its two triangles, and the boulders that touch it.
+"""Intersect a ray with the contents of one cell of the mesh: its two triangles and the boulders that touch it.
 
-Over a triangle the ray's height above the ground is linear. The ray crosses the ground where this height changes its
+Over a triangle the ray's height above the ground is linear. The ray crosses the ground where this height changes
 sign, so no ray slips between two triangles. A boulder is convex: an intersection of half-spaces.
 """
 
@@ -12,7 +12,7 @@ from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS,
 from perilune_render.provenance.kernels import njit
 
 NO_PART = -1
-"""Part of the mesh in `NO_FACET`; 0 is the inner square, 1 to 4 are the sectors."""
+"""Value of `Facet.part` in `NO_FACET`."""
 
 
 class Facet(NamedTuple):
@@ -21,9 +21,9 @@ class Facet(NamedTuple):
     part: int
     """Part of the mesh: 0 for the inner square, 1 to 4 for the sectors."""
     row: int
-    """Row of the cell along y, or its ring."""
+    """Row of the cell along y; in a sector, its ring."""
     column: int
-    """Column of the cell along x, or its spoke."""
+    """Column of the cell along x; in a sector, its spoke."""
     triangle: int
     """Triangle of the cell, 0 or 1; -1 for a boulder."""
     rock: int
@@ -39,7 +39,7 @@ NO_FACET = Facet(NO_PART, -1, -1, -1, -1, -1)
 class Ray(NamedTuple):
     """The ray (x, y, z) + t (dx, dy, dz).
 
-    It is relative to the grid's centre, in metres, or in the coordinates of a part of the mesh.
+    The coordinates are metres from the grid's centre, or coordinates of a part of the mesh.
     """
 
     x: float
@@ -59,20 +59,21 @@ def enters_rock(rows, planes, k, ray, span):
     `rows` and `planes` are the fields of `Rocks`.
     """
     dx, dy, dz = ray.dx, ray.dy, ray.dz
-    # First a sphere around the boulder, which most rays miss.
+    # First test a sphere around the boulder: most rays miss it.
     px, py, pz = ray.x - rows[k, 0], ray.y - rows[k, 1], ray.z - rows[k, 2]
     middle = -(px * dx + py * dy + pz * dz) / (dx * dx + dy * dy + dz * dz)
     cx, cy, cz = px + middle * dx, py + middle * dy, pz + middle * dz
     if cx * cx + cy * cy + cz * cz > rows[k, 12] ** 2:
         return np.inf, -1
-    # The ray in the boulder's axes and diameters: start q, direction e.
+    # The ray in the boulder's axes, in units of its diameters: start q, direction e.
     qx = rows[k, 3] * px + rows[k, 4] * py + rows[k, 5] * pz
     qy = rows[k, 6] * px + rows[k, 7] * py + rows[k, 8] * pz
     qz = rows[k, 9] * px + rows[k, 10] * py + rows[k, 11] * pz
     ex = rows[k, 3] * dx + rows[k, 4] * dy + rows[k, 5] * dz
     ey = rows[k, 6] * dx + rows[k, 7] * dy + rows[k, 8] * dz
     ez = rows[k, 9] * dx + rows[k, 10] * dy + rows[k, 11] * dz
-    # A convex solid is the intersection of half-spaces: the ray is in it from the last one entered to the first left.
+    # A convex solid is the intersection of half-spaces: the ray is
+    # inside from where it enters the last half-space to where it leaves the first.
     enter, leave, face = -np.inf, np.inf, -1
     for f in range(int(rows[k, 13]), int(rows[k, 14])):
         nx, ny, nz = planes[f, 0], planes[f, 1], planes[f, 2]
@@ -109,7 +110,7 @@ def first_rock(rocks, cell, ray, span):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def crossing(above_0, above_1, t0, t1):
-    """Parameter at which a height above a triangle, linear from t0 to t1, changes its sign; inf if it does not."""
+    """Parameter at which a height above a triangle, linear from t0 to t1, changes sign; inf if it does not."""
     if (above_0 > 0) == (above_1 > 0):
         return np.inf
     return t0 + (t1 - t0) * above_0 / (above_0 - above_1)
@@ -117,7 +118,7 @@ def crossing(above_0, above_1, t0, t1):
 
 @njit(**INLINED)
 def cross_inner(ground, row, column, ray, span):
-    """Where a ray crosses the two triangles of a cell of the inner square: parameter and triangle; inf and -1.
+    """Where a ray crosses the triangles of a cell of the inner square: parameter and triangle; inf and -1 if nowhere.
 
     `ray` is in cells: x is a column, y a row, z a height in metres.
     """
@@ -135,7 +136,7 @@ def cross_inner(ground, row, column, ray, span):
     )
     # Slopes of the first and second triangle along the columns and along the rows.
     ax, ay, bx, by = h1 - h0, h2 - h1, h2 - h3, h3 - h0
-    # Split the ray at the diagonal: on the first triangle, right of it, p - column >= q - row.
+    # Split the ray at the diagonal. The first triangle, right of the diagonal, has p - column >= q - row.
     s0, s1 = (p0 - column) - (q0 - row) + t0 * (dp - dq), (p0 - column) - (q0 - row) + t1 * (dp - dq)
     n_pieces, split = 1, t1
     if (s0 > 0) != (s1 > 0):
@@ -158,7 +159,7 @@ def cross_inner(ground, row, column, ray, span):
 
 @njit(**INLINED)
 def cross_sector(ground, side, cell, ray, span):
-    """Where a ray crosses the two triangles of a cell, (ring, spoke), of a sector: parameter and triangle; inf and -1.
+    """Where a ray crosses the triangles of a cell (ring, spoke) of a sector: parameter and triangle, or inf and -1.
 
     `ray` is in the sector's coordinates: x is `along`, y is d, z a height, metres.
     """
@@ -178,7 +179,7 @@ def cross_sector(ground, side, cell, ray, span):
     u0, u1 = spoke / n - 1, (spoke + 1) / n - 1
     a_first, a_last = near * u0, far * u1
     width = far - near
-    # Split the ray at the diagonal: on the first triangle, with the vertex at far u0, this cross product is positive.
+    # Split the ray at the diagonal. This cross product is positive on the first triangle, with the vertex at far u0.
     s0 = (a_last - a_first) * (d0 + t0 * dd - near) - width * (a0 + t0 * da - a_first)
     s1 = (a_last - a_first) * (d0 + t1 * dd - near) - width * (a0 + t1 * da - a_first)
     n_pieces, split = 1, t1

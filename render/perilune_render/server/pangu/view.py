@@ -1,8 +1,8 @@
-"""PANGU's conventions for viewpoints, and what is not known of them as options.
+"""PANGU's conventions for viewpoints, with options for the unknown ones.
 
 The world is right-handed with z up; here it is O_L. The camera has x to the right, y down and z forward. Yaw 0 and
-pitch 0 look along +y; positive yaw turns to the left, negative pitch looks down. Which of these were seen in a client
-and which are deduced: docs/reference/pangu.md.
+pitch 0 look along +y; positive yaw turns to the left, negative pitch looks down. docs/reference/pangu.md states which
+of these were seen in a client and which are deduced.
 """
 
 from typing import Literal
@@ -13,9 +13,9 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 SunZero = Literal["clockwise-from-y", "anticlockwise-from-x"]
-"""Direction of the Sun's azimuth 0 in the world, and its sense seen from above; not known of PANGU."""
+"""Direction of the Sun's azimuth 0 in the world, and its sense seen from above; PANGU's convention is unknown."""
 RollSense = Literal["left", "right"]
-"""Side to which positive roll leans the top of the camera; not known of PANGU."""
+"""Side to which positive roll leans the top of the camera; PANGU's convention is unknown."""
 
 
 def rotation_from_angles(yaw_rad: float, pitch_rad: float, roll_rad: float, roll_sense: RollSense = "left") -> Array:
@@ -25,7 +25,7 @@ def rotation_from_angles(yaw_rad: float, pitch_rad: float, roll_rad: float, roll
 
 
 def rotation_from_quaternion(q: Array) -> Array:
-    """rotation_camera_from_site (3, 3) of a quaternion (4,), scalar first, that turns camera vectors into the world's.
+    """rotation_camera_from_site (3, 3) of a quaternion (4,), scalar first, that turns camera vectors to the world.
 
     Raises ValueError if its length is 0; it need not be 1.
     """
@@ -44,7 +44,7 @@ def sun_from_angles(azimuth_rad: float, elevation_rad: float, zero: SunZero) -> 
 
 
 def camera_from_angles(width_px: int, height_px: int, field_of_view_rad: float, aspect: float) -> Camera:
-    """A pinhole of a horizontal field of view; `aspect` is the height of a pixel over its width, as tangents.
+    """A pinhole with a horizontal field of view; `aspect` is a pixel's height over its width, both at depth 1.
 
     Raises ValueError if the field of view is not between 0.01 and 170 degrees, or the aspect not between 0.1 and 10.
     """

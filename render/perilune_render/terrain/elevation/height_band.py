@@ -32,11 +32,11 @@ _LEAST_RELIEF = 7e-4
 _WIDEST_RELIEF = 25.0
 """Range of heights of the whole Moon, in kilometres, with a margin: larger ones are not kilometres."""
 _FEWEST_M = 1000.0
-"""Least width of the ground to which this test is applied, metres."""
+"""Smallest width of the ground, metres, at which heights are tested for kilometres."""
 _LEAST_PLATEAU = 4
-"""Number of equal values from which they may be fill."""
+"""Smallest number of equal values that may be fill."""
 _ISIS_SPECIAL = 3.4e38
-"""Absolute values from which on an ISIS cube has no data (Null, and saturated or out of range)."""
+"""Smallest absolute value of pixels without data in an ISIS cube (Null, and saturated or out of range)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class HeightBand:
     nodata: float | None
     """Value, before scale and offset, that the configuration gives to pixels without a height."""
     special: bool
-    """Whether values of the largest magnitudes are pixels without a height, as in ISIS cubes."""
+    """Whether values of the largest magnitudes mark pixels without a height, as in ISIS cubes."""
 
     @property
     def exact(self) -> bool:
@@ -81,11 +81,11 @@ class HeightBand:
         return height
 
     def in_metres(self, height: Array, width_m: float) -> Array:
-        """Heights (rows, columns), or radii, in metres, of ground of a width in metres; changes `height` in place.
+        """Convert heights or radii (rows, columns) to metres of height, in place; the ground is `width_m` wide.
 
-        Raises UserError if they cannot be heights on the Moon: if there are values beyond the Moon's highest and lowest
-        places, or many equal ones apart from the rest (fill that is not declared), or if they are too flat for metres
-        and no unit is stated.
+        Raises UserError if they cannot be heights on the Moon: if values are beyond the Moon's highest and lowest
+        points, if many are equal and far from the rest (undeclared fill), or if the ground is too flat for metres and
+        no unit is stated.
         """
         height[np.isinf(height)] = np.nan
         known = height[np.isfinite(height)]
@@ -120,7 +120,7 @@ class HeightBand:
             raise UserError(
                 self.path,
                 "heights",
-                f"{len(beyond)} of {len(known)} beyond what the Moon has, as {worst:.9g}",
+                f"{len(beyond)} of {len(known)} outside the Moon's heights, such as {worst:.9g}",
                 f"{low:.6g} to {high:.6g}{self._hint(worst, metres)}",
             )
 
@@ -161,7 +161,7 @@ def height_band(path: Path, files: RasterFiles, raster: Any, config: ElevationCo
     eight_bits = raster.dtypes[index - 1] in ("uint8", "int8")
     if eight_bits and unit is None and config.band is None and raster.scales[index - 1] == 1:
         expected = f"heights; if these are some, --set {_FIELD}.band={index}"
-        raise UserError(path, "heights", "a picture of 8 bits, as a hillshade", expected)
+        raise UserError(path, "heights", "an 8-bit picture, such as a hillshade", expected)
     metres = None if unit is None else METRES_PER_UNIT[unit]
     return HeightBand(path, raster, index, metres, config.nodata, files.driver == "ISIS3")
 

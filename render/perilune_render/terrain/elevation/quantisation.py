@@ -6,9 +6,9 @@ from scipy import ndimage
 from perilune_shared.geometry.frames import Array
 
 _LEAST_SLOPE = 1e-3
-"""Largest step that makes no visible terraces, in pixel sizes."""
+"""Largest step that makes no visible terraces, as a multiple of the pixel size."""
 _FEWEST_REPEATS = 4
-"""Mean number of pixels per distinct height from which heights may be quantised."""
+"""Smallest mean number of pixels per distinct height of quantised heights."""
 _WIDEST_TERRACE_PX = 64
 _GENTLE = 3.5
 """Range of heights over 3 x 3 pixels, in steps, below which roughness is attributed to rounding, not to the ground."""
@@ -17,7 +17,7 @@ _GENTLE = 3.5
 def step_of(height_m: Array, pixel_m: float) -> float:
     """The quantisation step, metres, of known heights (N,); 0 without a step that makes visible terraces.
 
-    A step is found if heights repeat and all are within a twentieth of a step of its multiples.
+    There is a step if heights repeat and each is within a twentieth of a step of a multiple of the step.
     """
     distinct = np.unique(height_m)
     if len(distinct) < 3 or len(height_m) < _FEWEST_REPEATS * len(distinct):

@@ -82,7 +82,7 @@ def read_craters(
     """Read a catalogue, CSV or Parquet. `names` states its columns; without it they are recognised.
 
     `setting` is the setting of `names`, for messages. `others` are optional columns of numbers. Raises UserError on a
-    file without such columns, and on the first value that is no place on the Moon or no size.
+    file without such columns, and on the first value that is not a place on the Moon or not a size.
     """
     with open_table(path, CATALOGUE) as table:
         chosen = _stated(path, setting, table.names, names) if names else recognised(path, setting, table.names)

@@ -167,7 +167,7 @@ def test_undeclared_fill_never_becomes_ground(tmp_path, fill):
         model = read_elevation(path)
         assert (~model.known).sum() == 600 and np.isfinite(model.height_m).all()
         return
-    with pytest.raises(UserError, match=r"heights: got 600 of 160000 beyond .*nodata=") as caught:
+    with pytest.raises(UserError, match=r"heights: got 600 of 160000 outside .*nodata=") as caught:
         read_elevation(path)
     stated = float(str(caught.value).split("nodata=")[1].split(",")[0])
     model = read_elevation(path, ElevationConfig(nodata=stated))
@@ -240,7 +240,7 @@ def test_pictures_are_refused(tmp_path):
     grey = np.random.default_rng(1).integers(0, 255, (4, 100, 100)).astype("uint8")
     for name, bands, options, text in (
         ("rgba", grey, {"photometric": "rgb", "alpha": "yes"}, "a picture in colours"),
-        ("shade", grey[0], {}, "a picture of 8 bits"),
+        ("shade", grey[0], {}, "an 8-bit picture"),
     ):
         path = write(tmp_path / f"{name}.tif", bands, POLAR, PLACED, nodata=None, dtype="uint8", **options)
         with pytest.raises(UserError, match=text):

@@ -57,8 +57,8 @@ def test_a_detector_that_finds_every_label_is_perfect_by_the_papers_rule(places,
     done = submitted(places, truth(places[0]), tmp_path)
     assert done.returncode == 0, done.stderr
     figures = json.loads((tmp_path / "out/benchmark.json").read_text())
-    for account in ("", "edge/", "strict/"):
-        assert figures[f"paper/{account}ap50_paper"] == figures[f"paper/{account}f1"] == 1
+    for scoring_rule in ("", "edge/", "strict/"):
+        assert figures[f"paper/{scoring_rule}ap50_paper"] == figures[f"paper/{scoring_rule}f1"] == 1
     # By `visible`, the boxes on eroded craters are ignored, but count as false positives by the strict scoring rule.
     assert figures["visible/ap50_paper"] == 1 and figures["visible/strict/ap50_paper"] < 1
     assert figures["headline/ap50_paper"] == figures["visible/strict/ap50_paper"]
@@ -77,8 +77,10 @@ def test_the_headline_is_the_lowest_of_all_scoring_rules(places, tmp_path):
     done = submitted(places, truth(places[0], lambda labels: labels.iloc[::2]), tmp_path)
     assert done.returncode == 0, done.stderr
     figures = json.loads((tmp_path / "out/benchmark.json").read_text())
-    accounts = [f"{rule}/{prefix}ap50_paper" for rule in ("visible", "paper") for prefix in ("", "edge/", "strict/")]
-    assert figures["headline/ap50_paper"] == min(figures[key] for key in accounts) < 0.6
+    scoring_rules = [
+        f"{rule}/{prefix}ap50_paper" for rule in ("visible", "paper") for prefix in ("", "edge/", "strict/")
+    ]
+    assert figures["headline/ap50_paper"] == min(figures[key] for key in scoring_rules) < 0.6
     assert figures["paper/recall"] == pytest.approx(0.5, abs=0.01)
     found = {name: figures[f"paper/region/{name}/ap50_paper"] for name in ("highland", "mare")}
     assert all(0.4 < ap < 0.6 for ap in found.values())

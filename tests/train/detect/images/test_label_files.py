@@ -86,7 +86,7 @@ def test_polygons_without_a_box(tmp_path, empty):
     for odd, message in (
         ([[1, 2, 3]], "segmentation: got"),
         ([], "bbox: got"),
-        ({"counts": "a", "size": [1, 1]}, "mask of runs"),
+        ({"counts": "a", "size": [1, 1]}, "run-length mask"),
         ([["a", "b"]], "no points"),
         ([[1e9, 1]], "too large"),
         (3, "no points"),

@@ -130,7 +130,9 @@ def test_what_lies_off_the_map_is_left_out_and_told(run, tmp_path, capsys):
     count = predict_images([path], run, settings_of(run), tmp_path / "out", PredictSettings(Tiling(tile_px=128)))
     shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())["features"]
     assert 0 < len(shapes) < count == len(pd.read_parquet(tmp_path / "out" / "detections.parquet"))
-    assert f"disc[b].tif: {count - len(shapes)} craters are off the map" in " ".join(capsys.readouterr().err.split())
+    assert f"disc[b].tif: {count - len(shapes)} craters have no map coordinates" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_an_image_wholly_off_its_map_is_refused(tmp_path):
@@ -207,7 +209,7 @@ def test_an_image_of_another_body_is_detected_in_pixels(run, tmp_path, capsys, c
     shapes = json.loads((out / "detections.geojson").read_text())["features"]
     assert len(shapes) == count - of_earth
     text = " ".join(capsys.readouterr().err.split())
-    assert "e.tif: not in detections.geojson, since its map cannot be used" in text and said in text
+    assert "e.tif: not in detections.geojson, since its georeference cannot be used" in text and said in text
 
 
 def test_a_broken_projection_or_a_place_off_the_map_leaves_pixels(run, tmp_path, capsys):

@@ -44,8 +44,8 @@ def test_a_run_leaves_all_its_files(finished):
     assert list(finished.root.glob("events.out.tfevents*"))
     assert not list(finished.root.rglob(".*part*"))
     metrics = json.loads(finished.metrics.read_text())
-    for account in ("test/", "test/strict/", "val/"):
-        assert 0 <= metrics[account + "ap50_paper"] <= 1
+    for scoring_rule in ("test/", "test/strict/", "val/"):
+        assert 0 <= metrics[scoring_rule + "ap50_paper"] <= 1
     assert metrics["test/strict/precision"] <= metrics["test/precision"]
     assert metrics["test/frames"] == 8
     assert metrics["train/epochs"] == 2
@@ -195,8 +195,8 @@ def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
     assert {value.dtype for value in weights if value.is_floating_point()} == {torch.float32}
     assert all(value.isfinite().all() for value in weights)
     metrics = json.loads(run.metrics.read_text())
-    for account in ("test/", "test/strict/", "test/edge/", "val/"):
-        assert 0 <= metrics[account + "ap50_paper"] <= 1
+    for scoring_rule in ("test/", "test/strict/", "test/edge/", "val/"):
+        assert 0 <= metrics[scoring_rule + "ap50_paper"] <= 1
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ def lander(seed, off_m=20.0, claimed_m=20.0, moved_m=0.0):
 
 
 def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda k: True):
-    """Fly a straight line; returns errors of position (n, 3), normalised errors squared (n,), and statuses by frame."""
+    """Fly a straight line; returns position errors (n, 3), normalised errors squared (n,), and statuses by frame."""
     # What repeats with a crater is drawn once.
     shift = STATIC_SHARE * WORLD.radius_m[:, None] * rng.normal(size=(len(WORLD), 3)) * [1, 1, 0]
     apparent = dataclasses.replace(WORLD, centre_m=WORLD.centre_m + shift)

@@ -27,7 +27,7 @@ def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
 
 
 def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, float]) -> tuple[NDArray, Array]:
-    """Enlarge or shrink a frame (height, width) and its boxes (M, 4) within the same image size.
+    """Enlarge or shrink a frame (height, width) and its boxes (M, 4); the image size is kept.
 
     `offset` in [0, 1] selects, in x and y, the part of an enlarged frame to keep or the position of a shrunk one. A
     shrunk frame is surrounded by its mean grey.
@@ -36,7 +36,7 @@ def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, fl
     shift = np.array([width, height]) * (1 - 1 / factor) * np.array(offset)
     if factor < 1:
         image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / factor**2 - 1))
-    # OpenCV counts from the centre of the first pixel, boxes from its edge.
+    # OpenCV's coordinates are 0 at the centre of the first pixel, box coordinates at its outer corner.
     origin = shift + 0.5 / factor - 0.5
     matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -45,7 +45,7 @@ def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, fl
 
 
 def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Output value of each of the 256 grey levels of a frame: stretch, gamma, gain, clipped at 255."""
+    """Output value of each of the 256 grey levels of a frame, after stretch, gamma and gain; at most 255."""
     level = np.arange(256) / 255
     if settings.stretch:
         below = np.bincount(image.ravel(), minlength=256).cumsum() / image.size
@@ -64,7 +64,7 @@ def augment(
     settings: AugmentSettings,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-    """Augment a frame: returns it (height, width) in float32 grey levels, its boxes (M, 4) and which are selected (M,).
+    """Augment a frame; return grey levels (height, width) float32, boxes (M, 4) and whether each is selected (M,).
 
     A crater is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is
     removed if it becomes much smaller than that range or leaves the image.

@@ -13,18 +13,18 @@ positives:
 - Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
   labelled range), if its radius sqrt(w h) / 2 is outside the labelled range, or if its centre is off the image. The
   labels cannot decide whether such a detection is right.
-- Edge (`edge_range`): a detection somewhat below the smallest radius is a false positive too, unless it overlaps a
-  crater, selected or not. By the usual rule a detector can report boxes just below the smallest radius everywhere:
+- Edge (`edge_range`): a detection down to 0.75 of the smallest radius is a false positive too, unless it overlaps
+  a crater, selected or not. By the usual rule a detector can report boxes just below the smallest radius everywhere:
   some of them match a label and count, and the others are ignored.
 - Strict: every unmatched detection is a false positive.
 
 A crowd (`FrameLabels.crowd`, COCO's `iscrowd`) is a region with any number of craters that are not labelled one by one.
-As in COCO a detection lies on it by the share of the detection inside the region, in place of IoU, and is ignored.
+As in COCO, the share of a detection inside the region replaces its IoU, and a matching detection is ignored.
 
-There are two differences from COCO. In COCO an ignored label that is no crowd takes only one detection; here it takes
-any number, since detections on an ignored crater cannot be evaluated. COCO gives the same metrics if each ignored label
-is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the image as a
-false positive, because its labels have no such centres.
+There are two differences from COCO. In COCO an ignored label that is not a crowd takes only one detection; here it
+takes any number, since detections on an ignored crater cannot be evaluated. COCO gives the same metrics if each ignored
+label is repeated once for every detection (a test checks this). COCO counts a detection whose centre is off the image
+as a false positive, because its labels have no such centres.
 """
 
 from collections.abc import Sequence
@@ -215,7 +215,7 @@ def match_split(
 
 
 def joined(parts: Sequence[Matches]) -> Matches:
-    """Join the matches of several processes, which each had every n-th frame; sorted by frame.
+    """Join the matches of several processes, each of which had every n-th frame; sorted by frame.
 
     Rows of labels (`label`) are not unique in the result.
     """

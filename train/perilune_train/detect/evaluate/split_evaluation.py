@@ -70,8 +70,9 @@ def report_head(
         f"split {for_markdown(split)}; protocol: {protocol}",
         f"labels: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
         f"threshold {threshold_source}",
-        f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
-        f"at most {settings.max_detections} are kept in a frame; frames evaluated {at_scales(settings.scales)}",
+        f"detections below a score of {settings.min_score:g} are dropped, non-maximum suppression at IoU "
+        f"{settings.nms_iou:g}, at most {settings.max_detections} detections per frame; frames evaluated "
+        f"{at_scales(settings.scales)}",
     ]
 
 

@@ -53,7 +53,7 @@ class PredictSettings:
 
 
 def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
-    """Find craters in images, folders of images, videos and TIFF files of several pages; returns their number.
+    """Find craters in images, folders of images, videos and multi-page TIFF files; returns the number of craters.
 
     A frame of a video, or a page, is an image with its index in the name (sequences.py). Writes all output to the new
     folder `out`, or nothing. Raises UserError on the first image that cannot be read, before detection starts.
@@ -94,7 +94,9 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
                 shapes += located
                 if len(located) < len(detections.boxes):
                     left_out = len(detections.boxes) - len(located)
-                    message = f"{path.name}: {left_out} craters are off the map and not in detections.geojson"
+                    message = (
+                        f"{path.name}: {left_out} craters have no map coordinates and are not in detections.geojson"
+                    )
                     say(message)
         table = pd.concat(tables, ignore_index=True)
         table.to_parquet(folder / "detections.parquet", index=False)
@@ -113,8 +115,10 @@ def _reference(path: Path) -> Georeference | None:
         try:
             return read_georeference(path)
         except UserError as error:
-            # Pixels need no map, and maps of other bodies, or wrong ones, are common.
-            message = f"{path.name}: not in detections.geojson, since its map cannot be used: {error.field}: got"
+            # Detection needs no georeference, and georeferences that are wrong or of other bodies are common.
+            message = (
+                f"{path.name}: not in detections.geojson, since its georeference cannot be used: {error.field}: got"
+            )
             say(f"{message} {error.found}, expected {error.expected}")
             return None
     if path.suffix.lower() in (".tif", ".tiff") or path.with_suffix(".prj").is_file():
@@ -135,7 +139,7 @@ def of_size(detections: Detections, min_size_px: float) -> Detections:
 
 
 def strongest(detections: Detections, top: int | None) -> Detections:
-    """The `top` detections with the highest scores, in their order; all if None."""
+    """The `top` detections with the highest scores, in the given order; all if None."""
     if top is None or len(detections.scores) <= top:
         return detections
     best = np.sort(np.argsort(-detections.scores, kind="stable")[:top])
@@ -154,7 +158,9 @@ def expanded(sources: list[Path], frames: Path) -> list[Path]:
             continue
         images = pictures_of(path)
         if not images:
-            raise UserError(path, "images", "a folder without images", "PNG, TIFF, JPEG or others, not in its folders")
+            raise UserError(
+                path, "images", "a folder without images", "PNG, TIFF, JPEG or other images, not in subfolders"
+            )
         paths += images
     return paths
 

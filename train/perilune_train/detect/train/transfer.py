@@ -1,4 +1,4 @@
-"""Initial weights from an earlier run or from Darknet's weight files, and export to the latter."""
+"""Initial weights from an earlier run or a weight file of Darknet, and export to Darknet's format."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -25,8 +25,8 @@ from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
-"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. Scaling by a
-power of two is exact."""
+"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. The
+deviation is a power of two, so scaling by it is exact."""
 _GATES = "backbone.attentions."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
@@ -36,8 +36,8 @@ def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"
     """Change the stem of a backbone so that it gives the same features for another scale of its input.
 
     Darknet's files were trained on grey values from 0 to 1 (`grey`). Our networks take frames with zero mean and unit
-    standard deviation (`normalised`). Without this change the input of a frozen backbone would be about four times
-    stronger than in its own training. grey = 0.25 normalised + 0.45 is folded into the stem's weights and its batch
+    standard deviation (`normalised`). Without this change the input of a frozen backbone would be about four times as
+    strong as in its training. grey = 0.25 normalised + 0.45 is folded into the stem's weights and its batch
     norm's mean. This is exact except for rounding and for the border, where zero padding then means mean grey.
     """
     stem: Any = backbone.stem
@@ -63,10 +63,10 @@ def check_start(path: Path) -> None:
 def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill the network with weights of an earlier detect run or of a Darknet file.
 
-    A run of the same strides gives all weights and its anchors; a run of other strides gives the backbone. If the
-    attention differs, the gates are not changed; with `detect.init_layers=from_second`, nor is the first convolution
-    with its norm. Raises UserError if width or in_channels differ, or if the backbone is to be frozen with new plain
-    gates.
+    A run with the same strides gives all weights and its anchors; a run with other strides gives only the backbone.
+    The gates are kept if the attention differs. `detect.init_layers=from_second` also keeps the first convolution and
+    its norm. Raises UserError if width or in_channels differ, or if a frozen backbone would have plain gates with
+    random weights.
     """
     stem = {key: value.clone() for key, value in network.backbone.stem.state_dict().items()}
     _fill(network, path, config)
@@ -97,8 +97,8 @@ def _fill(network: YOLOv3, path: Path, config: DetectConfig) -> None:
 def check_gates(path: Path, config: DetectConfig) -> None:
     """Raise UserError if a frozen backbone would have plain gates with random initial weights.
 
-    Each such module scales its input by about 0.25, so that the frozen layers get features they were not trained on:
-    their cosine similarity to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
+    Each such gate scales its input by about 0.25, so that the frozen layers get features they were not trained on:
+    the cosine similarity to the features of the plain backbone falls to about 0.5 (`make bench-transfer`).
     """
     if config.frozen_epochs and config.attention == "cbam" and not config.plain_gates_before_frozen_layers:
         expected = (
@@ -108,10 +108,10 @@ def check_gates(path: Path, config: DetectConfig) -> None:
 
 
 def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
-    """Terrain records of the network of the initial weights and of the teacher.
+    """Terrain records of two networks: the one that gave the initial weights, and the teacher.
 
-    A resumed run has them in its last state, `last`. Darknet's files have none: they were trained on photographs of the
-    Earth. Raises UserError if a checkpoint is missing or damaged.
+    A resumed run reads them from its last saved state, `last`. Darknet's files have no records: they were trained on
+    photographs of the Earth. Raises UserError if a checkpoint is missing or damaged.
     """
     if last is not None:
         content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
@@ -128,7 +128,7 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
     classes with COCO's anchors, and would undo the prior that a cell is empty. The output layers of a file written by
     perilune (15 filters) are used.
 
-    Raises UserError if width is not 1 or in_channels not 3, and on a file of another size; then nothing is changed.
+    Raises UserError, and changes nothing, if width is not 1, in_channels is not 3 or the file has another size.
     """
     for key, value in DARKNET_SHAPE.items():
         if getattr(config, key) != value:

@@ -22,7 +22,7 @@ class Pose:
     """Attitude (3, 3)."""
 
     def changed(self, step: Array) -> "Pose":
-        """The pose after a step (6,): shift in O_L, metres, then turn from the left, radians, O_C."""
+        """The pose after a step (6,): shift in O_L, metres, then a rotation multiplied from the left, radians, O_C."""
         turn = matrix_from_rotation_vector(step[3:])
         return Pose(self.position_m + step[:3], turn @ self.rotation_camera_from_site)
 
@@ -50,8 +50,7 @@ class Projected:
         return self.point_m[:, 2]
 
     def jacobian(self, chosen: NDArray[np.integer] | None = None) -> Array:
-        """Derivatives (K, 3, 6) of centre and logarithm of the radius by a step of the pose, of all craters or of
-        `chosen`.
+        """Derivatives (K, 3, 6) of centre and log radius with respect to a pose step; of all craters or `chosen`.
 
         They neglect the change of the offset between the ellipse's centre and the image of the circle's centre, which
         changes far more slowly.
@@ -64,7 +63,8 @@ class Projected:
 def _derivatives(point_m: Array, rotation_camera_from_site: Array, fx_px: float, fy_px: float) -> Array:
     """`Projected.jacobian` at points (K, 3), O_C.
 
-    A point X = R (c - p) moves by -R times a shift of the camera, and by w x X when it turns by w from the left.
+    A point X = R (c - p) moves by -R times a shift of the camera, and by w x X when it turns by w (R is multiplied
+    from the left).
     """
     derivatives = np.empty((len(point_m), 3, 6))
     for k in range(len(point_m)):
@@ -84,7 +84,7 @@ def _derivatives(point_m: Array, rotation_camera_from_site: Array, fx_px: float,
 def projected(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float = 0.0, least_radius_px: float = 1.0
 ) -> Projected:
-    """Project craters of at least a radius whose centre is in the image or at most `margin_px` outside it."""
+    """Project craters of at least `least_radius_px`, with a centre in the image or at most `margin_px` outside it."""
     index, points = _in_view(catalogue, camera, pose, margin_px, least_radius_px)
     rotation_camera_from_site = pose.rotation_camera_from_site
     if any(camera.distortion):
@@ -104,8 +104,8 @@ def projected(
 def in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> NDArray[np.integer]:
-    """Rows of the craters whose centre is in the image or at most `margin_px` outside it, and whose radius divided by
-    depth is at least `least_radius_px`."""
+    """Rows of the craters whose centre is in the image or at most `margin_px` outside it, and whose radius, times
+    focal length over depth, is at least `least_radius_px`."""
     return _in_view(catalogue, camera, pose, margin_px, least_radius_px)[0]
 
 
@@ -157,20 +157,20 @@ def _visible(
     count = 0
     for number in range(large):
         k = index[number]
-        across, down, depth = _turned(centre_m[k], position_m, rotation_camera_from_site)
+        across, down, depth = _in_camera(centre_m[k], position_m, rotation_camera_from_site)
         column, row = fx_px * across / depth + cx_px, fy_px * down / depth + cy_px
         index[count] = k
         near = (column > -margin_px) & (column < width_px + margin_px)
         count += near & (row > -margin_px) & (row < height_px + margin_px)
     index, points = index[:count].copy(), np.empty((count, 3))
     for number in range(count):
-        points[number] = _turned(centre_m[index[number]], position_m, rotation_camera_from_site)
+        points[number] = _in_camera(centre_m[index[number]], position_m, rotation_camera_from_site)
     return index, points
 
 
 @compiled
-def _turned(point_m: Array, position_m: Array, rotation_camera_from_site: Array) -> tuple[float, float, float]:
-    """A point (3,), O_L, in O_C."""
+def _in_camera(point_m: Array, position_m: Array, rotation_camera_from_site: Array) -> tuple[float, float, float]:
+    """Transform a point (3,) from O_L to O_C."""
     x, y, z = point_m[0] - position_m[0], point_m[1] - position_m[1], point_m[2] - position_m[2]
     return (
         rotation_camera_from_site[0, 0] * x + rotation_camera_from_site[0, 1] * y + rotation_camera_from_site[0, 2] * z,
@@ -213,7 +213,7 @@ def _boxes(
         if depth <= 0 or last >= 0 or edge_on:
             continue
         for axis in range(2):
-            # Relative to the image of the circle's centre: otherwise small, distant circles lose precision.
+            # Compute relative to the image of the circle's centre: otherwise small, distant circles lose precision.
             middle = points[k, axis] / depth
             along = focal_px[axis] * (normal[axis] - middle * normal[2])
             quadratic = focal_px[axis] ** 2 * (1 + middle**2) - along**2

@@ -1,4 +1,4 @@
-"""Find where a camera is from pairs of craters, with no or only rough knowledge of its position.
+"""Find the position of a camera from pairs of craters, with a rough prior position or none.
 
 Two craters determine position, heading and altitude of a level camera. Steps:
 
@@ -7,7 +7,7 @@ Two craters determine position, heading and altitude of a level camera. Steps:
 3. `_placements` looks up each pair of sightings among the pairs of craters in a tree over their ratios of size to
    separation, their separation and their direction. Each hit gives a placement of the camera.
 4. `_agreed` counts the sightings that agree with a crater under each placement.
-5. `search` returns the best placements that differ, as hypotheses.
+5. `search` returns the best distinct placements as hypotheses.
 
 The caller accepts a hypothesis only if it explains far more sightings than the second best.
 """
@@ -24,13 +24,13 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _N_PAIRED = 18
-"""Number of the largest sightings that form pairs: larger craters are rarer."""
+"""Number of sightings that form pairs, the largest ones, since large craters are rare."""
 _N_FIRST, N_TESTED = 24, 60
-"""Number of the largest sightings that test every placement, and of those that test the best placements."""
+"""Numbers of sightings, largest first, that test every placement and that test the best placements."""
 _LEAST_SEPARATION = 0.1
 """Smallest separation of a pair, divided by the width of the image."""
 _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
-"""Standard deviation of the logarithm of a size; number of standard deviations that the limits of an area cover in
+"""Standard deviation of the logarithm of a size; number of standard deviations at an area's limits of
 altitude and heading; largest distance, in standard deviations, between a pair of sightings and a pair of craters."""
 _TEST_PX, _TEST_SIZE = 4.0, 0.35
 """Largest distance, and largest difference of the logarithms of the sizes, at which a sighting agrees with a crater."""
@@ -69,7 +69,7 @@ def search(
     """The best hypotheses, best first; may be empty.
 
     Each is at least 10 px on the ground away from all better ones. `rotation_camera_from_site` is the assumed attitude:
-    its tilt must be right to about a degree.
+    its tilt must be correct to about a degree.
     """
     rays = camera.rays(sightings.centre_px) @ rotation_camera_from_site
     offset, size = rays[:, :2] / -rays[:, 2:], sightings.radius_px / camera.fx_px
@@ -104,7 +104,7 @@ def search(
 
 
 def _in_reach(catalogue: Catalogue, camera: Camera, radius_px: Array, area: Area) -> Catalogue:
-    """The craters that the camera may see, of the sizes that these sightings may have."""
+    """The craters that the camera may see and whose size fits these sightings."""
     low, high = area.altitude_m
     view = np.hypot(camera.width_px, camera.height_px) / 2 / camera.fx_px * high
     near = np.linalg.norm(catalogue.centre_m[:, :2] - area.centre_m, axis=1) < area.reach_m + view
@@ -144,8 +144,10 @@ class _Pairs:
         return _Pairs(self.index[chosen], self.separation[chosen], self.sizes[chosen], self.direction[chosen])
 
     def places(self, log_range: float, heading_rad: float) -> Array:
-        """Points (n, 5) whose distance is the distance of two pairs in standard deviations; a range has `_SIGMAS` of
-        them."""
+        """Points (n, 5), one for each pair; their distances are differences of pairs in standard deviations.
+
+        Differences of `log_range` in separation and `heading_rad` in direction count `_SIGMAS` standard deviations.
+        """
         on_circle = np.column_stack([np.cos(self.direction), np.sin(self.direction)])
         across = 2 * np.sin(min(heading_rad, np.pi) / 2)
         ranged = self.separation[:, None] * _SIGMAS / (log_range + 0.01)
@@ -159,7 +161,7 @@ class _Placements:
     altitude_m: Array
     """Altitudes above the ground (n,), metres."""
     heading_rad: Array
-    """Turns of the heading from that of the assumed attitude (n,), radians."""
+    """Headings (n,), radians, relative to the heading of the assumed attitude."""
     position_m: Array
     """Positions over ground (n, 2), metres, O_L."""
 
@@ -168,13 +170,13 @@ class _Placements:
         return _Placements(self.altitude_m[chosen], self.heading_rad[chosen], self.position_m[chosen])
 
     def on_ground(self, offset: Array) -> Array:
-        """Points (n, M, 2), O_L, at which sightings with offsets (M, 2) on the plane at depth 1 lie."""
+        """Points (n, M, 2), O_L, of sightings with offsets (M, 2) on the plane at depth 1."""
         turned = _turned(offset[None], self.heading_rad[:, None])
         return self.position_m[:, None] + self.altitude_m[:, None, None] * turned
 
 
 def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, area: Area) -> _Placements:
-    """The placements by which a pair of sightings fits a pair of the catalogue."""
+    """The placements under which a pair of sightings fits a pair of catalogue craters."""
     none = _Placements(np.zeros(0), np.zeros(0), np.zeros((0, 2)))
     low, high = area.altitude_m
     width = camera.width_px / camera.fx_px
@@ -186,7 +188,7 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
     if not len(catalogue_pairs.index):
         return none
-    # At the middle of the range of altitudes, separations differ by at most half of the range.
+    # Scale the sightings to the middle altitude: their separations are then wrong by at most half of the range.
     middle = replace(sighting_pairs, separation=sighting_pairs.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
     tree = KDTree(catalogue_pairs.places(log_range, area.heading_rad))

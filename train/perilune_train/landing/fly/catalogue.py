@@ -43,7 +43,7 @@ def read_catalogue(path: Path, use: CatalogueUse) -> Catalogue:
 
     In the site's frame it has x_m, y_m, z_m, diameter_m and, optional, normal_x, normal_y, normal_z; without normals
     the rims are level. By latitude and longitude it has the columns that `read_craters` reads and, optional, height_m
-    above the sphere through the site. Raises UserError on a missing column or a value that is no crater.
+    above the sphere through the site. Raises UserError on a missing column or a value that is not a crater.
     """
     with open_table(path, CATALOGUE) as table:
         if not table.names or set(CRATER_COLUMNS[:3]) & set(table.names):

@@ -78,7 +78,7 @@ def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
 def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
     """Read imu.csv, or samples as of EuRoC, and ranges.csv. Empty values and NaN are missing measurements.
 
-    Raises UserError on a missing column, a value that is no number, or times that do not increase.
+    Raises UserError on a missing column, a value that is not a number, or times that do not increase.
     """
     inertial = _read_inertial(imu)
     if ranges is None:
@@ -101,7 +101,7 @@ def read_euroc(path: Path, limits: TableLimits, columns: dict[str, Kind]) -> Col
 
 
 def plain_name(name: str) -> str:
-    """The name of a column without its unit, as `timestamp [ns]`."""
+    """The name of a column without its unit; the column may be `timestamp [ns]`."""
     return re.sub(r"\s*\[.*$", "", name.lstrip("# "))
 
 

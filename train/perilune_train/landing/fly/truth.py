@@ -30,7 +30,7 @@ class Truth:
 def read_truth(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Truth:
     """Read truth.csv of frames at times (n,), or the poses of the body in a file of EuRoC.
 
-    Raises UserError if it has other times or a value that is no number.
+    Raises UserError if it has other times or a value that is not a number.
     """
     if any("p_RS_R_x" in name for name in column_names(path, POSES)):
         return _of_euroc(path, time_s, rotation_camera_from_body)

@@ -23,7 +23,7 @@ _ENLARGED = 4
 
 
 def draw_by_altitude(path: Path, tables: dict[str, pd.DataFrame]) -> None:
-    """Draw the median error of position and 90 % of all errors by altitude, and the normalised errors squared.
+    """Draw the median position error and 90 % of all errors by altitude, and the normalised errors squared.
 
     Each table has altitude_m, error_m and squared, one row per frame; frames without an estimate have NaN.
     """
@@ -39,9 +39,9 @@ def draw_by_altitude(path: Path, tables: dict[str, pd.DataFrame]) -> None:
         )
         right.plot(table["altitude_m"], table["squared"], ".", color=f"C{k}", markersize=3, label=method)
     left.set_yscale("log")
-    _label(left, "error of position: median and 5 to 95 %", "altitude (m)", "error (m)")
+    _label(left, "position error: median and 5 to 95 %", "altitude (m)", "error (m)")
     left.legend()
-    right.axhspan(*BAND, color="black", alpha=0.1, label="95 % if the covariance is right")
+    right.axhspan(*BAND, color="black", alpha=0.1, label="95 % if the covariance is correct")
     right.set_yscale("log")
     right.legend()
     _label(right, "normalised error squared of position and attitude", "altitude (m)", "")

@@ -15,22 +15,22 @@ from perilune_train.records.markdown import number, table
 from perilune_train.records.pictures import save_figure
 
 WRONG_SQUARED = 60.0
-"""Normalised error squared of six numbers that a right covariance exceeds in 5e-11 of all cases."""
+"""Normalised squared error with six degrees of freedom; a correct covariance exceeds it in 5e-11 of all cases."""
 _COLUMNS = {
     "position_rmse_m": "position RMSE (m)",
-    "position_end_rmse_m": "at the end (m)",
-    "position_end_95_m": "95 % of the ends (m)",
-    "position_end_worst_m": "worst end (m)",
+    "position_end_rmse_m": "position RMSE at the end (m)",
+    "position_end_95_m": "95th percentile at the end (m)",
+    "position_end_worst_m": "largest error at the end (m)",
     "attitude_rmse_deg": "attitude RMSE (deg)",
-    "normalised_error_squared_mean": "normalised error squared (6)",
-    "in_band_share": "in the 95 % band",
-    "lost_share": "lost",
-    "silently_wrong_share": "silently wrong",
+    "normalised_error_squared_mean": "normalised error squared (expected 6)",
+    "in_band_share": "frames in the 95 % band",
+    "lost_share": "frames lost",
+    "silently_wrong_share": "frames silently wrong",
     "ends_silently_wrong": "flights that end silently wrong",
 }
 _CAPTIONS = {
-    "errors.png": "Errors of position over all draws: 50, 95 and 100 %, and the median of three stated sigmas",
-    "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is right",
+    "errors.png": "Position error over all draws: median, 95th percentile, maximum; dashed: median stated 3 sigma",
+    "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is correct",
 }
 _MOST_COLUMNS = 3
 _QUANTILES = (0.5, 0.95, 1.0)
@@ -73,12 +73,12 @@ def page_of(dataset: str, split: str, draws: Draws, rows: pd.DataFrame, seconds:
         f"Descents: {len(by_descent)}, with {draws.count} draws of each, {n_flights} flights, {len(rows)} frames, seed "
         f"{draws.seed}; {seconds / 60:.1f} minutes.",
         "",
-        f"Drawn: errors of the start (60 m, 1 m/s and {draws.attitude_deg:g} degrees on each axis), of the tactical "
-        "inertial unit, and of the catalogue (1 m, 3 % of the diameter, 10 % missing, 5 % false). Not drawn: "
-        "detections and ranges, which are those of the recorded descent. Draws of a descent share their errors, so "
-        "they say how much a result depends on what is drawn, and not how it would be on other ground.",
+        f"The draws vary the initial errors (60 m, 1 m/s and {draws.attitude_deg:g} degrees on each axis), the errors "
+        "of the tactical inertial unit, and of the catalogue (1 m, 3 % of the diameter, 10 % missing, 5 % false). "
+        "Detections and ranges are not drawn: all draws of a descent use the recorded ones, with the same errors. "
+        "The spread over draws therefore shows the effect of the drawn errors, not the effect of other terrain.",
         "",
-        "Silently wrong is a frame whose normalised error squared is above 60 and that is not said to be lost.",
+        "A frame is silently wrong if its normalised error squared is above 60 and its status is not `lost`.",
         "",
         *table(["Descent", *_COLUMNS.values()], cells),
     ]
@@ -100,7 +100,7 @@ def _cell(key: str, value: float) -> str:
 
 
 def draw_bands(path: Path, rows: pd.DataFrame) -> None:
-    """Draw quantiles of the error of position over the draws of each descent, and the stated error."""
+    """Draw quantiles of the position error over the draws of each descent, and the stated error."""
     groups = list(rows.groupby(["scene_id", "trajectory_id"]))
     figure, axes = _panels(len(groups))
     for axis, (ids, descent) in zip(axes, groups, strict=True):
@@ -110,8 +110,8 @@ def draw_bands(path: Path, rows: pd.DataFrame) -> None:
             axis.plot(
                 by_time["error_m"].quantile(quantile), color="tab:blue", alpha=shade, label=f"{100 * quantile:g} %"
             )
-        axis.plot(by_time["stated"].median(), color="black", linestyle="--", label="3 sigma, stated")
-        axis.set(yscale="log", title="/".join(map(str, ids)), xlabel="time (s)", ylabel="error of position (m)")
+        axis.plot(by_time["stated"].median(), color="black", linestyle="--", label="stated 3 sigma")
+        axis.set(yscale="log", title="/".join(map(str, ids)), xlabel="time (s)", ylabel="position error (m)")
         axis.grid(alpha=0.3)
     axes[0].legend()
     save_figure(path, figure)

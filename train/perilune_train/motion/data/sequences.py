@@ -39,7 +39,7 @@ class Sequence:
     altitude_m: Array
     """Nominal altitudes (n,), metres, at the earlier frames."""
     down_c: Array
-    """Unit vector (3,) towards the ground in O_C of a level body, mirrored with the frames."""
+    """Unit vector (3,), O_C, towards the ground if the body is level; mirrored with the frames."""
     flow_px: Array | None = None
     """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), pixels, from first to second."""
 
@@ -61,9 +61,9 @@ def pair_sequence(
     altitude and attitude.
 
     The result is exact for a pure rotation, or if the ground is flat and the true altitude and attitude are nominal.
-    For true poses off nominal by 8 m and 0.3 degrees and a jitter of 0.3 times that, the jitter moves points by 1.2 px
-    and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of 128 px over 50 degrees at 200 to
-    1500 m; see tests/train/motion/test_data.py.
+    For true poses that differ from nominal by 8 m and 0.3 degrees, and 0.3 times as much jitter, the jitter moves
+    points by 1.2 px and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of 128 px over 50
+    degrees at 200 to 1500 m; see tests/train/motion/test_data.py.
     """
     span = slice(start, start + n_pairs)
     translation, rotation_c2_from_c1 = (values[span] for values in trajectory.motion)
@@ -80,7 +80,7 @@ def pair_sequence(
                 trajectory.camera, trajectory.down_c, translation[i], rotation_c2_from_c1[i], altitude[i]
             )
             translation[i], rotation_c2_from_c1[i] = translation[i] + shift, turn @ rotation_c2_from_c1[i]
-            # Image 2 of the moved camera, over the plane, to image 1, then to the original image 2.
+            # Map image 2 of the moved camera to image 1 over the plane, then to the original image 2.
             moved = _homography(
                 trajectory.camera, trajectory.down_c, translation[i], rotation_c2_from_c1[i], altitude[i]
             )
@@ -108,7 +108,7 @@ def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Se
     """Mirror a sequence at random: left-right, up-down and, for square images, x with y.
 
     A mirroring D of the image about its centre maps t to D t, the ground normal n to D n and R to D R D, with D
-    extended by 1 along z. Applied only if the principal point is the image's centre.
+    extended by 1 along z. A sequence is mirrored only if its principal point is the image's centre.
     """
     flip_x, flip_y, swap = rng.random(3) < 0.5
     if (camera.cx_px, camera.cy_px) != (camera.width_px / 2, camera.height_px / 2):

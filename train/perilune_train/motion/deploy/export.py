@@ -28,14 +28,14 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 ONNX, METADATA, README = "navigator.onnx", "navigator.json", "README.md"
 LARGEST_DIFFERENCE = 1e-5
-"""Largest difference from torch, divided by the larger of 1 and the largest value of that output."""
+"""Largest accepted difference from torch, divided by the larger of 1 and the largest value of that output."""
 _OPSET = 17
 _PAIRS = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Consecutive pairs of one descent as network input, for the comparison."""
+    """Consecutive pairs of one descent as network input, for the comparison with torch."""
 
     first: Tensor
     """Earlier frames, normalised (n, height, width)."""
@@ -57,8 +57,8 @@ def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> f
     """Export a run's navigator to the new folder `out`; returns its largest relative difference from torch.
 
     Writes navigator.onnx, navigator.json (metadata) and README.md. ONNX Runtime runs pair by pair and carries the
-    state; torch runs over the whole sequence at once. Both are compared on the first validation descent of the dataset,
-    or on noise. With a dataset, the graph is for its camera. Raises UserError, and writes nothing, if they differ.
+    state; torch runs over the whole sequence at once. The outputs are compared on the first validation descent of the
+    dataset, whose camera the graph then has, or on noise. Raises UserError, and writes nothing, if they differ.
     """
     for name in ("onnx", "onnxruntime"):
         package(name)
@@ -77,7 +77,8 @@ def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> f
         "width_px": camera.width_px,
         "camera_matrix": camera.matrix.tolist(),
         "hidden": hidden,
-        "normalisation": "grey levels minus their mean over the image, divided by the larger of 1 and their deviation",
+        "normalisation": "grey levels minus their mean over the image, divided by the larger of 1 and their "
+        "standard deviation",
         "inputs": list(INPUTS[fusion]),
         "outputs": list(OUTPUTS),
         "scales": architecture["scales"],
@@ -129,7 +130,7 @@ def _write_onnx(
     state = torch.zeros(2, 1, hidden)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
-        # The tracing exporter, as for the detector.
+        # Use the tracing exporter, as for the detector.
         torch.onnx.export(
             flight,
             (*inputs, state, state),
@@ -148,7 +149,7 @@ def _write_onnx(
 def _largest_difference(
     path: Path, network: nn.Module, architecture: dict[str, Any], pairs: Pairs, fusion: Fusion, focal: float
 ) -> float:
-    """Largest relative difference of the streamed file from torch over the whole sequence at once."""
+    """Largest relative difference between the file, run pair by pair, and torch, run over the whole sequence."""
     session = package("onnxruntime").InferenceSession(str(path), providers=["CPUExecutionProvider"])
     names, state = INPUTS[fusion], [np.zeros((2, 1, architecture["hidden"]), np.float32)] * 2
     streamed = []

@@ -79,7 +79,7 @@ def pose_errors(trajectories: list[Trajectory], poses: list[Pose]) -> pd.DataFra
 
 
 def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
-    """`summary` for poses, with the medians of the lengths of both errors, and the errors of position by altitude."""
+    """`summary` for poses, with the medians of the lengths of both errors, and the position errors by altitude."""
     figures = summary(errors)
     figures["position_error_median_m"] = float(errors["position_error_m"].median())
     figures["orientation_error_median_deg"] = float(errors["orientation_error_deg"].median())

@@ -61,7 +61,7 @@ class Known:
 def ridge_poses(training: Known, validation: Known, features: list[Array]) -> list[Pose]:
     """Poses by ridge regression, fitted to the training pairs, from features (pairs, inputs) of each test trajectory.
 
-    Features are standardised. The penalty is the one with the lowest squared error of position on validation.
+    Features are standardised. The penalty is the one with the lowest squared position error on validation.
     """
     position_m, rotation_camera_from_site = (
         np.concatenate([trajectory.pose[i] for trajectory in training.trajectories]) for i in range(2)

@@ -54,13 +54,14 @@ def navigate_run(
     detector: Path | None,
     allow_overlap: bool = False,
 ) -> list[RunFolder]:
-    """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
+    """Train the networks `settings.fusion`; write runs/navigate/<name> (warp) and <name>-stack (stack).
 
     Resumes interrupted runs with equal settings, dataset and detector, and leaves finished ones unchanged.
 
     `detector` is the default checkpoint for the stack network's backbone: it is used if it exists and has the same
-    architecture; `settings.detector` must have it. Raises UserError on bad data, a checkpoint of another architecture,
-    or a detector that was fitted to terrain of the test split (unless `allow_overlap`).
+    architecture; a checkpoint in `settings.detector` must have that architecture. Raises UserError on bad data, a
+    checkpoint of another architecture, or a detector that was fitted to terrain of the test split (unless
+    `allow_overlap`).
 
     Under torchrun all processes train, and the first one evaluates and writes.
     """
@@ -92,11 +93,11 @@ def _run(
     if "stack" in fusions and settings.stack.target == "pose":
         check_one_area(opened)
     provenance = training_provenance(opened)
-    start = _start_of_warp(settings) if "warp" in fusions else None
-    of_start = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
-    terrain = {"warp": provenance.joined(of_start), "stack": provenance.joined(inherited)}
+    start = _initial_checkpoint(settings) if "warp" in fusions else None
+    start_terrain = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
+    terrain = {"warp": provenance.joined(start_terrain), "stack": provenance.joined(inherited)}
     # Both runs share one check, because the table of the warp run includes the metrics of stack.
-    terrain_check = check_terrain(terrain["stack"].joined(of_start), opened, "test", allow_overlap)
+    terrain_check = check_terrain(terrain["stack"].joined(start_terrain), opened, "test", allow_overlap)
     share = own_share(1, 1)
     stream = Stream(settings.stream, opened) if settings.stream is not None else None
     trajectories = load_trajectories(opened, share)
@@ -139,14 +140,14 @@ def _run(
 def _evaluate_motions(
     folders: dict[Fusion, RunFolder], trajectories: list[Trajectory], common: dict[Fusion, Metrics]
 ) -> None:
-    """Evaluate networks for motion together with the methods without training; write tables for the trained networks.
+    """Evaluate motion networks and methods that need no training; write tables for the networks trained in this run.
 
-    `common` has the metrics of each trained run that need no evaluation.
+    For each trained run, `common` has the metrics that need no evaluation.
     """
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     motions, covariances = classical.motions, classical.covariances
-    # The network stack comes first, so that the table of the warp run, which finishes last, has both.
+    # `stack` comes first, so that the table of the warp run, written last, has both networks.
     for fusion, run in folders.items():
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
@@ -170,7 +171,7 @@ def _evaluate_motions(
         write_evaluation(run.root, fusion, "test", test, MethodMotions(motions, covariances), details)
 
 
-def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
+def _initial_checkpoint(settings: NavigateConfig) -> dict[str, Any] | None:
     """Content of the checkpoint `navigate.init_from`. Raises UserError if its network has another architecture."""
     if settings.init_from is None:
         return None

@@ -20,7 +20,7 @@ from perilune_train.motion.pose import normalised_frames, warped_frames
 from perilune_train.motion.train.views import view_homographies
 
 _LARGEST_SHARE = 0.25
-"""Share of a GPU's free memory that frames may take; larger sets stay in the memory of the machine."""
+"""Share of a GPU's free memory that frames may take; larger sets stay in main memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ def collated(places: list[tuple[int, int]]) -> Tensor:
 class Windows:
     """Sequences of `n_pairs` consecutive pairs of the trajectories `numbers`, and of their views.
 
-    `views` are further versions of all trajectories, from `other_views`. `places` (batch, 2), on the device, are number
-    of the trajectory and first pair.
+    `views` are further versions of all trajectories, from `other_views`. `places` (batch, 2), on the device, hold the
+    number of the trajectory and of the first pair.
     """
 
     def __init__(
@@ -91,10 +91,10 @@ class Windows:
             if views
             else None
         )
-        """From the frames of all versions (frames, 3, 3) to those of the trajectories; None without views."""
+        """Homographies (frames, 3, 3) from all versions' frames to the trajectories' frames; None without views."""
 
     def pairs(self, places: Tensor) -> Tensor:
-        """Indices (batch, pairs) of the pairs of sequences among those of all trajectories."""
+        """Indices (batch, pairs) of the sequences' pairs among the pairs of all trajectories."""
         return (self.first_pair[places[:, 0]] + places[:, 1])[:, None] + self.steps[:-1]
 
     def pictures(self, places: Tensor) -> tuple[Tensor, Tensor]:

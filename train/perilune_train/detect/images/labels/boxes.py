@@ -24,12 +24,13 @@ def box_of(values: Any, path: Path, field: str, may_be_empty: bool = True) -> Bo
     if not all(math.isfinite(v) and abs(v) <= LARGEST_PX for v in (x, y, w, h)) or not (
         shorter > 0 or (may_be_empty and shorter == 0)
     ):
-        raise UserError(path, field, values, f"a width and height above 0, and no number beyond {LARGEST_PX:.0f} px")
+        least = "of at least 0" if may_be_empty else "above 0"
+        raise UserError(path, field, values, f"a width and height {least}, and no number beyond {LARGEST_PX:.0f} px")
     return x, y, x + w, y + h
 
 
 def around(points: Iterable[Any], path: Path, field: str) -> Box:
-    """The box around points, each x and y."""
+    """The box around points (x, y)."""
     try:
         pairs = [(float(x), float(y)) for x, y in points]
         xs, ys = zip(*pairs, strict=True)

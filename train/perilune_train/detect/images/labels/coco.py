@@ -12,12 +12,12 @@ _EXPECTED = "a COCO file"
 
 
 def is_coco(content: Any) -> bool:
-    """Whether a JSON file holds COCO."""
+    """Whether the content of a JSON file has COCO's format."""
     return isinstance(content, dict) and "images" in content and "annotations" in content
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """The content of a COCO file, without polygons that have a box."""
+    """The content of a COCO file, without the polygons of objects that have a box."""
     content = read_json(path, _EXPECTED, _without_polygon)
     if not isinstance(content, dict):
         raise UserError(path, "JSON", type(content).__name__, "an object with images and annotations")
@@ -27,20 +27,20 @@ def read_content(path: Path) -> dict[str, Any]:
 def read_coco(path: Path, content: dict[str, Any], image_folder: Path | None = None) -> LabelFile:
     """Read a COCO file. Raises UserError, naming file and field, on invalid content."""
     categories = {
-        _identity(category_record, "id", "categories", path): str(category_record.get("name", ""))
+        _id_of(category_record, "id", "categories", path): str(category_record.get("name", ""))
         for category_record in _records(content, "categories", path)
     }
     images = _records(content, "images", path)
-    row_of = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
+    row_of = {_id_of(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
     if not images or len(row_of) < len(images):
-        raise UserError(path, "images", "none" if not images else "duplicate ids", "images with an id each")
+        raise UserError(path, "images", "none" if not images else "duplicate ids", "images with distinct ids")
     objects: list[list[LabelledObject]] = [[] for _ in images]
     for n, annotation in enumerate(_records(content, "annotations", path)):
         field = f"annotations[{n}]"
-        row = row_of.get(_identity(annotation, "image_id", field, path))
+        row = row_of.get(_id_of(annotation, "image_id", field, path))
         if row is None:
             raise UserError(path, f"{field}.image_id", annotation["image_id"], "the id of one of the images")
-        category = _as_identity(annotation.get("category_id")) or ""
+        category = _id_text(annotation.get("category_id")) or ""
         ignored, crowd = _flag(annotation.get("ignore")), _flag(annotation.get("iscrowd"))
         objects[row].append(LabelledObject(_box(annotation, path, field), category, ignored, crowd))
     entries = []
@@ -53,7 +53,7 @@ def read_coco(path: Path, content: dict[str, Any], image_folder: Path | None = N
 
 
 def _without_polygon(record: dict) -> dict:
-    """Polygons take most of the memory, and are needed only without a box."""
+    """The object without polygons if it has a box: polygons take most of the memory."""
     if record.get("bbox"):
         record.pop("segmentation", None)
     return record
@@ -65,13 +65,13 @@ def _box(annotation: dict[str, Any], path: Path, field: str) -> Box:
         return box_of(annotation["bbox"], path, f"{field}.bbox")
     polygons = annotation.get("segmentation")
     if isinstance(polygons, dict):
-        raise UserError(path, f"{field}.bbox", "none, and a mask of runs (RLE)", "a bbox or polygons")
+        raise UserError(path, f"{field}.bbox", "none, only a run-length mask (RLE)", "a bbox or polygons")
     if not polygons:
         raise UserError(path, f"{field}.bbox", annotation.get("bbox"), "a bbox or polygons (segmentation)")
     points = []
     for polygon in polygons if isinstance(polygons, list) else []:
         if not isinstance(polygon, list) or len(polygon) % 2 or not polygon:
-            raise UserError(path, f"{field}.segmentation", polygon, "lists of x and y in turn")
+            raise UserError(path, f"{field}.segmentation", polygon, "lists of alternating x and y")
         points += list(zip(polygon[::2], polygon[1::2], strict=True))
     return around(points, path, f"{field}.segmentation")
 
@@ -88,14 +88,14 @@ def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, A
     return records
 
 
-def _identity(record: dict[str, Any], name: str, field: str, path: Path) -> str:
-    identity = _as_identity(record.get(name))
+def _id_of(record: dict[str, Any], name: str, field: str, path: Path) -> str:
+    identity = _id_text(record.get(name))
     if identity is None:
         raise UserError(path, f"{field}.{name}", record.get(name), "a number or a name")
     return identity
 
 
-def _as_identity(value: Any) -> str | None:
+def _id_text(value: Any) -> str | None:
     """An id as text: some tools write 1, others "1" or 1.0."""
     if isinstance(value, float) and value % 1 == 0:
         value = int(value)
