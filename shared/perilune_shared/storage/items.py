@@ -26,8 +26,8 @@ def local_items(folder: Path, prefix: str) -> Iterator[Item]:
     """
     try:
         with os.scandir(folder) as scanned:
-            # "a-b" comes before "a/b", as in the listing of an object store. Entries of millions of files would fill
-            # memory, so only their names are kept.
+            # The slash sorts "a-b" before "a/b", as in the listing of an object store. Directory entries of millions
+            # of files would fill memory, so only names are kept.
             names = sorted(entry.name + ("/" if entry.is_dir(follow_symlinks=False) else "") for entry in scanned)
     except FileNotFoundError:
         return
