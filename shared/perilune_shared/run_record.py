@@ -1,4 +1,4 @@
-"""Record how a run or a benchmark was made: commit, hardware, command, date."""
+"""Record the conditions of a run or a benchmark: commit, hardware, command and date."""
 
 import functools
 import os

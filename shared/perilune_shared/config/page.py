@@ -35,7 +35,7 @@ class Key:
 def keys(section: str, config: Section) -> Iterator[Key]:
     """Yield every key of a resolved section, in the order of the configuration file.
 
-    If an optional section is not given, its keys follow it all the same; a key without a default shows `required`.
+    The keys of an optional section are yielded even if it is not given; a key without a default then shows `required`.
     """
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():

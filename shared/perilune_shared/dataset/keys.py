@@ -58,7 +58,7 @@ class KeyCheck:
     """
 
     def __init__(self, dataset: Dataset, frames: pa.Table):
-        """Check all keys but those of labels. `frames` is the table frames with at least FRAME_COLUMNS.
+        """Check the keys of all tables except labels. `frames` is the table frames with at least FRAME_COLUMNS.
 
         Raises UserError if a key is broken.
         """

@@ -153,8 +153,7 @@ class Dataset:
         return Frame(row, labels.to_pandas(), png)
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[str]:
-        """Return the paths of a table's parts, sorted by name; given ids, only of parts that may contain matching
-        rows."""
+        """Return the paths of a table's parts, sorted; ids limit them to parts that may contain matching rows."""
         paths = self._listed.get(table)
         if paths is None:
             paths = parquet_files(self.store, f"manifest/{table}")

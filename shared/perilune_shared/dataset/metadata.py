@@ -186,7 +186,7 @@ class DatasetInfo(_Info):
     camera: CameraRecord
     """Camera of all frames (PNG)."""
     exr_camera: CameraRecord | None = None
-    """Camera of the EXRs, without distortion; its view covers that of `camera`. null if there are no EXRs."""
+    """Camera of the EXRs, without distortion; its view covers the view of `camera`. null if there are no EXRs."""
     cameras: dict[_CameraName, CameraRecord] | None = None
     """Cameras by name, if there are several. The column `camera` of the table frames contains the name; the field
     `camera` above is then the first camera."""

@@ -25,8 +25,7 @@ def complete(table: str, rows: pa.Table) -> pa.Table:
 
 
 def stored(table: str, rows: pa.Table) -> pa.Table:
-    """Return `rows` as they are written: `complete`, but without columns of `ONLY_IF_USED` that are null in all
-    rows."""
+    """Return `rows` as written to files: `complete`, without columns of `ONLY_IF_USED` in which all rows are null."""
     rows = complete(table, rows)
     unused = [name for name in ONLY_IF_USED.get(table, ()) if rows[name].null_count == len(rows)]
     return rows.drop_columns(unused) if unused else rows

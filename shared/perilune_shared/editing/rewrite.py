@@ -60,8 +60,8 @@ def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progr
 def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
-    It must not if it is incomplete, if its files do not match its index (a new index would hide the damage), if its
-    keys are broken, or if `out` is inside its folder.
+    A dataset is refused if it is incomplete, if the files do not match the index (a new index would hide the damage),
+    if keys are broken, or if `out` is inside the dataset.
     """
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")

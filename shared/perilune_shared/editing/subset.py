@@ -108,7 +108,7 @@ def _first_frames(source: Dataset, on_frames: Sequence[Condition], limit: Limit)
 
 
 def _all_hold(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
-    """Return for each row of a scene's frames or labels whether all conditions hold (N,)."""
+    """Return for each row of a scene's frames or labels whether it fulfils all conditions (N,)."""
     mask = np.ones(len(rows), bool)
     if not conditions or not len(rows):
         return mask

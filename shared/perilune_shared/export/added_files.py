@@ -52,8 +52,7 @@ class Target:
         return Target(self.store, name)
 
     def content(self) -> bytes | None:
-        """Return the current content; None if there is no file. Raises UserError if it is too large or not a regular
-        file."""
+        """Return the current content; None if there is no file. Raises UserError on a large or non-regular file."""
         if self.store.folder is not None and not (self.store.folder / self.name).exists():
             return None
         if self.store.folder is None and not self.store.exists(self.name):

@@ -52,8 +52,9 @@ def _licence(licence: str) -> dict[str, str]:
 
 
 def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
-    """Return the configurations: the default one for packed frames, with the dataset's splits, and one per table with
-    rows.
+    """Return the configurations of the dataset: one for packed frames, if there are any, and one per table with rows.
+
+    If there are packed frames, their configuration is the default and has the splits of the dataset.
 
     Without configurations `datasets` treats every image in the folder as training data. A part of a table may contain
     rows of all splits, so each table has the single split `mixed`; the column `split` of frames states the split of

@@ -228,8 +228,7 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
 
 
 def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:
-    """Return finite numbers from a list, a list of lists, or a mapping with `data`. Raises UserError on other
-    values."""
+    """Return finite numbers from a list, a list of lists or a mapping with `data`; raise UserError on others."""
     if isinstance(value, dict):
         value = value.get("data")
     flat: list[object] = []

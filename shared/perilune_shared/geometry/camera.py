@@ -157,8 +157,7 @@ class Camera:
         )
 
     def _undistorted(self, target_x: Array, target_y: Array) -> tuple[Array, Array]:
-        """Invert the distortion by Newton's method, starting at a tabulated inverse of the radial part inside the
-        fold."""
+        """Invert the distortion by Newton's method, starting from a table of the radial part inside the fold."""
         target_r = np.hypot(target_x, target_y)
         radial = self._radial_table(float(np.nanmax(target_r, initial=0.0)))
         start = np.interp(target_r, radial[1], radial[0]) / np.maximum(target_r, 1e-300)

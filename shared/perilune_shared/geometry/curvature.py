@@ -7,8 +7,10 @@ from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
 
 
 def drop_m(x_m: ArrayLike, y_m: ArrayLike) -> Array:
-    """Return the depth (...) of the sphere below the plane z = 0 at (x, y) in O_L, metres: R - sqrt(R^2 - x^2 -
-    y^2)."""
+    """Return the depth (...) of the sphere below the plane z = 0 at points of O_L, metres.
+
+    It is R - sqrt(R^2 - x^2 - y^2).
+    """
     square = np.square(np.asarray(x_m, np.float64)) + np.square(np.asarray(y_m, np.float64))
     # This form keeps full precision for a small drop.
     return square / (MOON_RADIUS_M + np.sqrt(np.square(MOON_RADIUS_M) - square))

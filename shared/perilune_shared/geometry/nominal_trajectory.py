@@ -69,6 +69,8 @@ class NominalTrajectory:
 
 
 def approach_deg(start_m: Sequence[float]) -> int:
-    """Return the direction from the site to a start (3,) in O_L, whole degrees clockwise from north; 0 above the
-    site."""
+    """Return the direction from the site to a start (3,) in O_L, whole degrees clockwise from north.
+
+    It is 0 if the start is above the site.
+    """
     return round(float(np.degrees(np.arctan2(-start_m[0], -start_m[1])))) % 360 if any(start_m[:2]) else 0

@@ -120,7 +120,7 @@ def _rotation(tilt_rad: float, azimuth_rad: float) -> Array:
 
 
 def _check(where: str, field: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless a value is a number between two bounds."""
+    """Raise UserError unless a value is a number from `least` to `most`."""
     is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not is_number or not least <= value <= most:
         raise UserError(where, field, value, f"a number from {least:g} to {most:g}")

@@ -1,4 +1,4 @@
-"""Rolling shutter: each row of a frame is exposed at its own time, while the camera moves and turns.
+"""Rolling shutter: the rows of a frame are exposed one after the other while the camera moves and turns.
 
 The camera keeps its velocity in O_L and its angular velocity in O_C. Times are seconds from the middle of the exposure
 of the middle row, to which the pose of a frame refers: row r of h rows is exposed at (r + 0.5 - h / 2) row_time_s.

@@ -170,8 +170,8 @@ def _projected(
 ) -> dict[str, Array]:
     """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames.
 
-    With a rolling shutter (`row_s` seconds from row to row), the camera pose is taken when the row of the crater's
-    centre is exposed.
+    With a rolling shutter (`row_s` seconds from row to row), each crater is projected from the camera pose at which the
+    row of its centre is exposed.
     """
     rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
     centre = np.stack([craters[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1)[crater_of]

@@ -78,7 +78,7 @@ class ParquetTable:
         """Return None; `TextTable.peek` returns the next row."""
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read those of the given columns that the table has. Raises UserError on a column of another type."""
+        """Read the given columns; columns that the table lacks are omitted. Raises UserError on another type."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)

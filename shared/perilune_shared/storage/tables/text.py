@@ -89,7 +89,8 @@ class TextTable:
             yield line, words
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read those of the given columns that the table has. Raises UserError on a value of another kind."""
+        """Read the given columns; columns that the table lacks are omitted. Raises UserError on another kind of
+        value."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
