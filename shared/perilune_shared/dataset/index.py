@@ -96,7 +96,8 @@ def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
 def seal(store: Store, info: DatasetInfo, rows: pa.Table) -> DatasetInfo:
     """Write the index, then dataset.json with it, then delete other indexes; return the content of dataset.json.
 
-    A dataset that already has an index matches an index at every moment, if the files in the old index are unchanged.
+    If the dataset has an index already and the files in it are unchanged, the dataset matches its index at every
+    moment.
     """
     info = info.model_copy(update={"index": write_index(store, rows)})
     write_info(store, info)

@@ -85,7 +85,7 @@ class KeyCheck:
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
         """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
 
-        Raises UserError if a frame or crater is missing, or if a label's scene_id differs from its frame's.
+        Raises UserError if a frame or crater is missing, or if a label and its frame have different scene_ids.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         if "scene_id" in rows.column_names:

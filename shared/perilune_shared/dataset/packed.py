@@ -106,7 +106,7 @@ def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> 
 
 
 def packed_rows(frames: pa.Table, labels: pa.Table, pngs: list[bytes | None]) -> pa.Table:
-    """Combine rows of `frames` (N), rows of `labels` and PNG bytes (N) to rows of a shard.
+    """Combine rows of `frames` (N), rows of `labels` and PNG bytes (N) into rows of a shard (N).
 
     Labels of other frames are omitted; the labels of a frame keep their order.
     """

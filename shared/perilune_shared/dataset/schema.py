@@ -1,7 +1,7 @@
 """The tables of a dataset: every column with its type, unit and frame of reference (schema version 4).
 
-Real columns of labels are float32. In an image of 1024 pixels float32 resolves 0.0001 px; no rim can be located so
-finely. Poses, craters and times are float64, since ellipses are computed from them to 0.000001 px.
+Real columns of labels are float32. In an image of 1024 pixels float32 resolves 0.0001 px; no rim can be located that
+precisely. Poses, craters and times are float64, since ellipses are computed from them to 0.000001 px.
 
 Every Parquet file contains these units and meanings as metadata, so a single file documents itself.
 """

@@ -115,7 +115,7 @@ def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Ta
 
 
 def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield frames and labels of each trajectory of a split; frames are in order, with PNGs as their only files."""
+    """Yield frames and labels of each trajectory of a split; frames are in order and refer to no files but PNGs."""
     columns = ["scene_id", "trajectory_id", "split"]
     for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
         if row["split"] in (split, None):

@@ -96,5 +96,5 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
 
 
 def without_derived_rows(tables: SceneTables) -> SceneTables:
-    """Return a scene without craters, boulders, labels and measurements, which seed and poses reproduce."""
+    """Return a scene without craters, boulders, labels and measurements; seed and poses reproduce them."""
     return tables | {name: tables[name].slice(0, 0) for name in _DERIVED_TABLES}

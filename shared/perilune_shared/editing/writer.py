@@ -112,7 +112,7 @@ class DatasetWriter:
         self._index.append(index_rows([WrittenFile.of(path, content)]))
 
     def finish(self, out: Address) -> None:
-        """Write buffered rows, the index, then dataset.json. Raises UserError, which names `out`, without frames."""
+        """Write buffered rows, the index, then dataset.json. Raises UserError about `out` if there are no frames."""
         counts = self._tables.counts
         if not counts.frames:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
@@ -150,7 +150,7 @@ def new_dataset(
 
 
 def check_scene(where: object, tables: SceneTables) -> None:
-    """Raise UserError unless there is exactly one scene and each frame's trajectory exists; it names `where`."""
+    """Raise UserError about `where` unless there is exactly one scene and the trajectory of each frame exists."""
     scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"

@@ -49,7 +49,8 @@ def for_csv(value: str) -> str:
 
 
 def write_csv(table: "pd.DataFrame", path: str | os.PathLike[str], **options: Any) -> None:
-    """Write a table as CSV without the index; text and column names pass through `for_csv`. `options` go to pandas."""
+    """Write a table as CSV without the index, with text and column names made safe by `for_csv`; `options` go to
+    pandas."""
     safe = table.rename(columns=for_csv)
     for index, kind in enumerate(safe.dtypes):
         if str(kind) in ("object", "str", "string"):

@@ -2,8 +2,8 @@
 
 A point X in O_L has the camera coordinates x_C = rotation_camera_from_site (X - position_m) and the image coordinates
 u = fx x' + cx, v = fy y' + cy. Without distortion x' = a = x/z and y' = b = y/z. With distortion, after Brown (1966)
-and Conrady (1919) in OpenCV's form, with r^2 = a^2 + b^2 and s = 1 + k1 r^2 + k2 r^4 + k3 r^6, x' = a s + 2 p1 a b + p2
-(r^2 + 2 a^2) and y' = b s + p1 (r^2 + 2 b^2) + 2 p2 a b.
+and Conrady (1919) in OpenCV's form, with r^2 = a^2 + b^2 and s = 1 + k1 r^2 + k2 r^4 + k3 r^6,
+x' = a s + 2 p1 a b + p2 (r^2 + 2 a^2) and y' = b s + p1 (r^2 + 2 b^2) + 2 p2 a b.
 
 Image coordinates have their origin at the outer corner of the top-left pixel, so pixel (column i, row j) covers
 [i, i+1) x [j, j+1) and its centre lies at (i + 0.5, j + 0.5); cx = width / 2 is the middle of the image.
@@ -22,7 +22,7 @@ from perilune_shared.geometry.frames import Array
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
-"""Default mounting: the camera looks along -Z_B, and its x axis is parallel to X_B. If the body is level in O_L, this
+"""Default mounting: the camera looks along -Z_B, and its x axis points along X_B. If the body is level in O_L, this
 is the paper's "along the negative axis of Z_L"."""
 _MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""

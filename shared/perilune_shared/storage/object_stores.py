@@ -12,7 +12,7 @@ OBJECT_STORES = {"s3": "s3", "gs": "gcs", "memory": ""}
 """The extra of perilune-shared that each kind of object store needs."""
 _TIMEOUTS_S = {"connect_timeout": 10, "read_timeout": 60}
 _LIBRARIES = ("aiohttp", "aiobotocore", "botocore", "fsspec", "gcsfs", "google", "requests", "s3fs", "urllib3")
-"""Libraries that fsspec calls and whose exceptions it does not convert."""
+"""Packages whose exceptions `store_faults` converts, besides OSError."""
 _ACCESS = re.compile(r"credential|token|accessdenied|forbidden|signature|access key|\b40[13]\b", re.I)
 """Messages about missing access. 401 and 403 match only as whole words, since a port number may contain them."""
 _CREDENTIALS = {

@@ -89,8 +89,7 @@ class TextTable:
             yield line, words
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read the given columns; columns that the table lacks are omitted. Raises UserError on another kind of
-        value."""
+        """Read the given columns; columns that the table lacks are omitted. Raises UserError on an invalid value."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
