@@ -28,7 +28,7 @@ class Rewriting:
     change: Callable[[SceneTables], SceneTables]
     """Returns the new tables of a scene from the old ones."""
     images: ImageMode
-    """Whether the images are copied, linked or omitted."""
+    """How the frames are written: copied, hard-linked, omitted or planned."""
     scene_ids: Sequence[str] | None = None
     """Scenes to write; None for all."""
 
