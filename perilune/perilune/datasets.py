@@ -1,4 +1,4 @@
-"""Datasets of perilune_shared, with the frames of a split for PyTorch."""
+"""Open datasets, and load the frames of a split for PyTorch."""
 
 from typing import TYPE_CHECKING
 
@@ -11,17 +11,17 @@ if TYPE_CHECKING:
 
 
 class Dataset(manifest.Dataset):
-    """A dataset, open for reading: tables as pandas and Arrow, frames by number, id or slice, and for PyTorch.
+    """An open dataset: tables as pandas or Arrow; frames by number, id or slice, or as a PyTorch dataset.
 
     dataset = perilune.open_dataset("data/small/detect")
     dataset[0].image, dataset[:10], dataset.labels["radius_px"]
     """
 
     def torch(self, split: str = "train", selection: str = "visible") -> "LabelledFrames":
-        """Return the frames of a split with their labels, in memory, as a Dataset of PyTorch with `collate`.
+        """Load the frames and labels of a split into memory; return a PyTorch Dataset that has the method `collate`.
 
-        `split` is train, val or test; `selection` is all, paper or visible. Raises UserError on other names, and if the
-        frames do not fit into memory; MissingPart without the extra `train`.
+        `split` is train, val or test; `selection` is all, paper or visible. Raises UserError on other names and if the
+        frames do not fit into memory. Raises MissingPart if the extra `train` is not installed.
 
             frames = dataset.torch(split="train")
             DataLoader(frames, batch_size=8, collate_fn=frames.collate)
@@ -32,7 +32,7 @@ class Dataset(manifest.Dataset):
 def open_dataset(address: Address) -> Dataset:
     """Open a dataset in a local folder or at an address such as s3://bucket/moon.
 
-    Raises UserError if it is missing, damaged or of another schema version.
+    Raises UserError if the dataset is missing or damaged, or if it has another schema version.
 
         dataset = perilune.open_dataset("data/small/detect")
     """

@@ -1,4 +1,4 @@
-"""Import the parts of perilune, each of which may be missing."""
+"""Import the optional parts of perilune, or say how to install them."""
 
 from importlib import import_module
 from typing import Any
@@ -7,11 +7,14 @@ from perilune_shared.errors import UserError
 
 
 class MissingPart(UserError, ImportError):
-    """A part of perilune that is needed is not installed; the message says what to install."""
+    """A required part of perilune is not installed; the message says what to install."""
 
 
 def part(module: str, what: str) -> Any:
-    """Import a module of a part, for `what`. Raises MissingPart if the part, or a library that it needs, is missing."""
+    """Import a module of an optional part; `what` names the feature that needs it.
+
+    Raises MissingPart if the part, or a library that it needs, is missing.
+    """
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

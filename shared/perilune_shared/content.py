@@ -28,9 +28,9 @@ def content_sha256(craters: pa.Table, boulders: pa.Table) -> str:
 
 
 def terrain_of(dem_source: str, content_sha256: str) -> str:
-    """Return a key of the terrain, equal for scenes with the same terrain.
+    """Return a key that is equal for scenes with the same terrain.
 
-    It is the elevation model if there is one, otherwise the hash of craters and boulders. Scenes on one elevation model
-    count as the same terrain, although the small craters added to them differ.
+    The key is the elevation model if there is one, otherwise the hash of craters and boulders. Scenes on one elevation
+    model count as the same terrain, although different small craters are added to them.
     """
     return content_sha256 if dem_source == PROCEDURAL else dem_source.rpartition("sha256:")[2]

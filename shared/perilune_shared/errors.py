@@ -1,11 +1,11 @@
-"""Errors that a user can cause, in one line, and their exit codes."""
+"""Errors that a user can correct, each reported in one line, and their exit codes."""
 
 import errno
 
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
 STOPPED = "stopped; finished files stay valid; run the same command again to resume"
-"""What a command prints last after Ctrl-C."""
+"""Last line that a command prints after Ctrl-C."""
 DISK_FAULTS = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -23,26 +23,26 @@ DISK_FAULTS = (
     errno.EMFILE,
     errno.ENFILE,
 )
-"""Errors of disk and files that a user can correct: no space, no permission, no such folder, too few descriptors."""
+"""Disk and file errors that a user can correct: no space, no permission, no such folder, too few descriptors."""
 
 
 class UserError(Exception):
     """An error in the user's input: file or place, field, value found, and value expected."""
 
     def __init__(self, where: object, field: str, found: object, expected: str):
-        # These texts may come from untrusted files and may be of any length.
+        # These texts may come from untrusted files and have any length.
         self.where = shortened(where, 4200)
         self.field, self.found, self.expected = shortened(field), shortened(found), shortened(expected, 500)
         super().__init__(one_line(f"{self.where}: {self.field}: got {self.found}, expected {self.expected}"))
 
     def __reduce__(self) -> tuple:
-        """Pickle by the constructor's arguments, so that another process can send it."""
+        """Pickle the constructor's arguments, so that a worker process can send the error."""
         return UserError, (self.where, self.field, self.found, self.expected)
 
 
 def ends_run(error: BaseException) -> bool:
-    """Whether an error would repeat with everything that is left to do: one of the user's, or a full or closed disk."""
-    # A file that is missing may have been removed by another process.
+    """Whether the rest of the work would fail with this error too: a user error, or a full or inaccessible disk."""
+    # A missing file does not end the run: another process may have removed it.
     return isinstance(error, UserError) or (
         isinstance(error, OSError) and error.errno in DISK_FAULTS and error.errno != errno.ENOENT
     )

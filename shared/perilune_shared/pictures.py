@@ -1,4 +1,4 @@
-"""Pictures of images with ellipses, for people: Pillow images, which notebooks display.
+"""Draw ellipses onto images; the results are Pillow images, which notebooks display.
 
 with_ellipses(frame.image, ellipses).save("frame.png")
 """
@@ -20,7 +20,7 @@ _ANGLES = np.linspace(0, 2 * np.pi, 65)
 
 
 def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, int, int]] | None = None) -> "Image":
-    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits; `colours` has one for each, by default cyan.
+    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits; `colours` has N colours, by default all cyan.
 
     An ellipse has the columns of labels: centre x and y, semi-axes a and b, pixels, and the direction of a,
     radians. A 16-bit image is scaled so that its largest value is white.
@@ -46,7 +46,7 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
             ],
             axis=1,
         )
-        # Pillow's origin is the centre of the first pixel, the one of labels its outer corner.
+        # Pillow's origin is the centre of the first pixel; the origin of labels is the outer corner of that pixel.
         drawn = points * factor - 0.5
         draw.line([(float(u), float(v)) for u, v in drawn], fill=CYAN if colours is None else colours[index], width=1)
     return picture

@@ -1,4 +1,4 @@
-"""Record how a run or a benchmark was made: commit, hardware, command, date."""
+"""Record the conditions of a run or a benchmark: commit, hardware, command and date."""
 
 import functools
 import os
@@ -26,7 +26,7 @@ class RunRecord:
     hardware: str
     """Number of cores, processor, memory."""
     load: float
-    """Load average of the minute before the program started; shows other work on the machine."""
+    """Load average over the minute before the program started; a high value means other work on the machine."""
     command: str
     """The command line."""
     date: str
@@ -35,7 +35,7 @@ class RunRecord:
 
 @functools.cache
 def run_record() -> RunRecord:
-    """Return the record of this process. The first call makes it, so call it when the program starts."""
+    """Return the record of this process. The first call creates it, so call this function when the program starts."""
     return RunRecord(_commit(), _hardware(), round(_load(), 1), _command(), f"{datetime.now(UTC):%Y-%m-%d}")
 
 

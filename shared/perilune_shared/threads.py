@@ -1,12 +1,12 @@
-"""Threads of the numerical libraries: usable cores, settings of a program, work of other processes.
+"""Set the threads of the numerical libraries, and measure usable cores and the load of other processes.
 
-A thread of OpenMP, the runtime of torch's operations, spins while it waits for others. Where threads share cores with
-other work, a spinning thread keeps a core from the one that it waits for. Programs of perilune therefore call
+An OpenMP thread, as used by torch's operations, spins while it waits for other threads. If threads share cores with
+other work, a spinning thread may occupy the core that the other thread needs. Programs of perilune therefore call
 `set_up_program`, which limits spinning.
 
-The libraries read environment variables when they are loaded, so a program calls it before importing torch, NumPy,
-OpenCV or numba. Importing perilune changes no environment: a program of your own sets `GOMP_SPINCOUNT` itself, or calls
-`set_up_program`. `warn_if_crowded` tells it so.
+The libraries read environment variables when they are loaded, so a program must call `set_up_program` before it imports
+torch, NumPy, OpenCV or numba. Importing perilune changes no environment variable: your program must set
+`GOMP_SPINCOUNT` or call `set_up_program`; otherwise `warn_if_crowded` may warn.
 
 Example:
 
@@ -26,13 +26,13 @@ from perilune_shared.cgroups import processor_quota
 from perilune_shared.errors import UserError
 
 SPIN_COUNT, CROWDED_SPIN_COUNT = 30_000, 1000
-"""Rounds for which a waiting thread of libgomp spins before it sleeps, and on a machine with more work than cores.
+"""Rounds for which a waiting libgomp thread spins before it sleeps: usually, and if there is more work than cores.
 
-libgomp's default is about 300,000. Chosen by measurement (docs/notebook/2026-11-27-speed.md): with less than 30,000
-training is slower on idle cores, and beside a busy process it is fastest with 1000 or less.
+libgomp's default is about 300,000. The values were chosen by measurement (docs/notebook/2026-11-27-speed.md): below
+30,000 training is slower on idle cores; beside a busy process training is fastest with 1000 or less.
 """
 NUMBERS_OF_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""Variables for the number of threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL and OpenCV."""
+"""Environment variables for the number of threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL and OpenCV."""
 _MOST_THREADS = 1024
 _PATTERNS = {
     **dict.fromkeys(
@@ -42,11 +42,11 @@ _PATTERNS = {
     "GOMP_SPINCOUNT": (r"\d+\s*[kKmMgGtT]?|INFINITE|INFINITY", "a number of rounds, or INFINITY"),
     "OMP_WAIT_POLICY": (r"ACTIVE|PASSIVE", "ACTIVE or PASSIVE"),
 }
-"""For each variable a pattern of its values and their description."""
+"""Pattern and description of the valid values of each variable."""
 _SPINNING = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 _STATISTICS = Path("/proc/stat")
 _set_here: set[str] = set()
-"""Variables that `set_up_program` has set, in this process."""
+"""Variables that `set_up_program` has set in this process."""
 _warned = False
 
 
@@ -58,7 +58,7 @@ def cores_in_affinity() -> int:
 def usable_cores() -> int:
     """Number of cores that this process may use, at least 1.
 
-    It is limited by the process's affinity and by the processor quota of its container or batch job (Linux cgroups,
+    The affinity of the process limits it, and so does the processor quota of the container or batch job (Linux cgroups,
     versions 1 and 2); a quota of 1.5 cores counts as 2. A cgroup that cannot be read sets no limit.
     """
     quota = processor_quota()
@@ -68,9 +68,9 @@ def usable_cores() -> int:
 def set_up_program() -> None:
     """Set the threads of the numerical libraries for this program and for the processes that it starts.
 
-    Limits how long idle threads of OpenMP spin, and the number of threads to the quota of a container, which the
-    libraries do not read. Values that the user has set stay. Call it before these libraries are imported.
-    Raises UserError if the user has set a variable to a value that the libraries do not understand.
+    Limits how long idle OpenMP threads spin. Limits the number of threads to the quota of the container, which the
+    libraries do not read. Values set by the user are kept. Call it before these libraries are imported. Raises
+    UserError if the user has set a variable to a value that the libraries do not understand.
     """
     _check()
     if not any(name in os.environ for name in _SPINNING):
@@ -96,17 +96,17 @@ def _check() -> None:
 
 
 def _load() -> float:
-    """Mean number of processes that have run or waited for a core in the last minute."""
+    """Return the mean number of processes that ran or waited for a core in the last minute."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
 
 
 def chosen_by_user(name: str) -> bool:
-    """Whether an environment variable has a value that `set_up_program` has not set."""
+    """Whether an environment variable is set, but not by `set_up_program`."""
     return name in os.environ and name not in _set_here
 
 
 def described_settings() -> str:
-    """One line on the usable cores and on the variables of threads, which says what the user has set."""
+    """Return one line that states the usable cores and the thread variables, and which of them the user has set."""
     names = [name for name in dict.fromkeys((*_SPINNING, *_PATTERNS)) if name in os.environ]
     values = [f"{name}={os.environ[name]}{' (from the environment)' if chosen_by_user(name) else ''}" for name in names]
     quota = processor_quota()
@@ -117,7 +117,7 @@ def described_settings() -> str:
 def warn_if_crowded() -> None:
     """Warn once in this process if the machine has more work than cores and idle OpenMP threads spin for long.
 
-    For functions that a program of the user calls; commands have limited the spinning.
+    For functions that users call from their own programs; perilune's commands limit the spinning themselves.
     """
     global _warned
     if _warned or any(name in os.environ for name in _SPINNING):
@@ -144,7 +144,7 @@ class OtherWork:
         self._seconds, self._process_s, self._children_s = self._read()
 
     def cores(self) -> float:
-        """Mean number of cores that other processes have used since the last call, or since the start."""
+        """Return the mean number of cores that other processes used since the last call, or since creation."""
         before, process_before, children_before = self._seconds, self._process_s, self._children_s
         self._seconds, self._process_s, self._children_s = self._read()
         elapsed_s, busy_s = (now - then for now, then in zip(self._seconds, before, strict=True))
@@ -152,13 +152,13 @@ class OtherWork:
         return max(0.0, (busy_s - own_s) / (elapsed_s / cores_in_affinity())) if elapsed_s > 0 else 0.0
 
     def _read(self) -> tuple[tuple[float, float], float, float]:
-        """Seconds of all usable cores (elapsed and busy), of this process, and of its ended children."""
+        """Return core seconds: of all usable cores (elapsed, busy), of this process, and of its ended children."""
         times = os.times()
         return _core_seconds(), times.user + times.system, times.children_user + times.children_system
 
 
 def _core_seconds() -> tuple[float, float]:
-    """Seconds that have passed on the cores of this process's affinity, and seconds in which they were busy."""
+    """Return elapsed and busy seconds, summed over the cores of this process's affinity."""
     try:
         lines = _STATISTICS.read_text(encoding="ascii", errors="replace").splitlines()
         cores = os.sched_getaffinity(0)

@@ -20,7 +20,7 @@ _KNOWN_BY = {
     "kitti": ("*/*.times.txt",),
     "huggingface": ("README.md", "data/*/*.parquet"),
 }
-"""Files by which a folder of a format is known."""
+"""Files that identify a folder as an export in each format."""
 
 
 def add_to(app: typer.Typer) -> None:

@@ -25,7 +25,7 @@ app = new_program(
 def validate(
     dataset: DatasetArgument, most: Annotated[int, typer.Option(min=1, help="Maximum number of faults to show.")] = 50
 ) -> None:
-    """Check schema, ranges, keys, splits, labels and file hashes. Exit code 2 if there is a fault."""
+    """Check schema, ranges, keys, splits, labels and file hashes. The exit code is 2 if there is a fault."""
     from perilune_shared.validation.validate import validate as find_faults
 
     with progress_bar() as progress:

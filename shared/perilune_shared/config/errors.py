@@ -1,4 +1,4 @@
-"""Format validation errors of settings in one line: source, key, value found and value expected."""
+"""Format a validation error of a setting in one line: source, key, value found and value expected."""
 
 import difflib
 import json
@@ -14,9 +14,9 @@ from pydantic_core import ErrorDetails
 from perilune_shared.errors import UserError
 
 _MIN_SIMILARITY = 0.75
-"""Minimum similarity (ratio of difflib) of a name that is suggested."""
+"""Minimum similarity of a suggested name (ratio of difflib's SequenceMatcher)."""
 
-# Expected value by pydantic's error type; fields in braces come from the error's context.
+# What was expected, by pydantic's error type. Pydantic's error context fills the fields in braces.
 _EXPECTED = {
     "missing": "a value",
     "none_required": "null",
@@ -52,18 +52,18 @@ _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "ma
 
 
 _KEY = "[key]"
-"""Pydantic's name of the place of a mapping's key."""
+"""The name by which pydantic locates an error in a mapping's key, not in its value."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a suggestion for an unknown name: the most similar known name, or all known names without one."""
+    """Return a suggestion for an unknown name: the most similar known name, or all known names if none is similar."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=_MIN_SIMILARITY)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
 
 
 def expected_of(fault: ErrorDetails) -> str:
-    """Return what pydantic expected, as a noun phrase or bound that completes "expected ..."."""
+    """Return what pydantic expected, worded to follow "expected"."""
     kind, context = fault["type"], fault.get("ctx", {})
     if kind in _COUNTED:
         bound, key = _COUNTED[kind]
@@ -74,7 +74,7 @@ def expected_of(fault: ErrorDetails) -> str:
         # `{low:5}` and `low:5` are text in YAML, since a colon needs a space after it.
         spaced = expected == "a mapping" and isinstance(fault["input"], str) and re.search(r":\S", fault["input"])
         return f"{expected}, with a space after each colon" if spaced else expected
-    return "another value"  # never pydantic's own sentence
+    return "another value"  # not pydantic's message, which is worded differently
 
 
 def formatted(value: Any) -> str:
@@ -89,7 +89,7 @@ def user_error_of(
 ) -> UserError:
     """Return the first error as a UserError.
 
-    The section was merged from `sources` (name, content); later sources override.
+    The section was merged from `sources`, pairs of name and content; later sources override earlier ones.
     """
     fault = error.errors(include_url=False)[0]
     location = [str(part) for part in fault["loc"]]
@@ -104,7 +104,7 @@ def user_error_of(
 
 
 def got_of(fault: ErrorDetails) -> str:
-    """The value that is wrong; of settings that do not fit together only those that the message names."""
+    """Return the wrong value; if several settings contradict each other, only those that the message names."""
     if fault["type"] == "missing":
         return "nothing"
     value = fault["input"]
@@ -126,7 +126,7 @@ def _contains(content: Any, location: list[str]) -> bool:
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
-    """Names of the settings at a place below `model`; none if there is no section."""
+    """Return the names of the settings at a location below `model`; empty if there is no section at the location."""
     annotation: Any = model
     for key in location:
         section = next(iter(_sections_in(annotation)), None)
@@ -140,7 +140,7 @@ def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
 
 
 def _parts(annotation: Any) -> list[Any]:
-    """The types of a union, and the type itself of anything else; without Annotated."""
+    """Return the members of a union, or any other type alone, without Annotated."""
     if typing.get_origin(annotation) is typing.Annotated:
         return _parts(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
@@ -153,7 +153,7 @@ def _sections_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _container_in(annotation: Any) -> Any:
-    """The mapping, list or tuple of a type; a tuple of any length as a list."""
+    """Return the mapping, list or tuple in a type; a tuple of any length is returned as a list."""
     for part in _parts(annotation):
         if typing.get_origin(part) in (dict, list):
             return part

@@ -19,11 +19,11 @@ class Key:
     """Description of one key of a configuration."""
 
     name: str
-    """Full name, as dataset.camera.width_px."""
+    """Full name, for example dataset.camera.width_px."""
     field: FieldInfo
-    """Field of pydantic: type and limits."""
+    """Pydantic's field, with type and limits."""
     meaning: str
-    """Its docstring, on one line."""
+    """Docstring of the field, on one line."""
     choices: tuple[str, ...]
     """Values of a Literal; empty for any other type."""
     default: str | None
@@ -35,7 +35,7 @@ class Key:
 def keys(section: str, config: Section) -> Iterator[Key]:
     """Yield every key of a resolved section, in the order of the configuration file.
 
-    The keys of an optional section that is not given follow it; `required` stands for a default that they lack.
+    The keys of an optional section are yielded even if it is not given; a key without a default then shows `required`.
     """
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
@@ -81,7 +81,7 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _choices(field: FieldInfo) -> tuple[str, ...]:
-    """List the values of a Literal, also inside a union with other types."""
+    """Return the values of a Literal, even one inside a union with other types."""
     kinds = [field.annotation, *typing.get_args(field.annotation)]
     return tuple(
         str(value) for kind in kinds if typing.get_origin(kind) is typing.Literal for value in typing.get_args(kind)
@@ -89,7 +89,7 @@ def _choices(field: FieldInfo) -> tuple[str, ...]:
 
 
 def _section_of(field: FieldInfo) -> type[Section] | None:
-    """The section of an optional one; None for any other field."""
+    """Return the type of an optional section; None for any other field."""
     kinds = typing.get_args(field.annotation)
     return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)), None)
 

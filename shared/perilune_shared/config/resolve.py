@@ -22,7 +22,7 @@ _LARGEST_FILE_BYTES = 100_000
 
 
 class Section(BaseModel):
-    """Base class of all parts of a configuration: frozen, strictly typed, without unknown keys."""
+    """Base class of all parts of a configuration: frozen and strictly typed; unknown keys are errors."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -91,7 +91,7 @@ def resolve_over(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """Resolve like `resolve`, with plain data `base` instead of a preset; `base_name` names it in error messages."""
+    """Do the work of `resolve`, with plain data `base` instead of a preset; messages call it `base_name`."""
     sources: list[tuple[str, dict]] = [(base_name, base)]
     if config_file is not None:
         sources.append((str(config_file), read_config_file(config_file).get(section, {})))

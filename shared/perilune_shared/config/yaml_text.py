@@ -50,7 +50,7 @@ _PLAIN_TEXT = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null)$)[A-Za-z][\w
 
 
 class _Refused(ValueError):
-    """Valid YAML that this parser does not accept, with what was found and what is expected."""
+    """Error for valid YAML that this parser does not accept; states what was found and what is expected."""
 
     def __init__(self, event: Event, got: str, expected: str = _EXPECTED):
         self.got, self.expected = f"{got} at line {event.start_mark.line + 1}", expected
@@ -59,7 +59,7 @@ class _Refused(ValueError):
 def parse_yaml(text: str, where: object) -> Any:
     """Parse YAML text to plain data (dict, list, str, int, float, bool, None); empty text gives None.
 
-    Raises UserError about `where` if the text is not YAML or if this parser does not accept it.
+    Raises UserError, which names `where`, if the text is not YAML or if this parser does not accept it.
     """
     if len(text) > _MAX_CHARACTERS:
         raise UserError(where, "size", f"{len(text)} characters", f"at most {_MAX_CHARACTERS}")
@@ -74,7 +74,7 @@ def parse_yaml(text: str, where: object) -> Any:
 
 
 def to_yaml_text(data: dict[str, Any]) -> str:
-    """Format plain data as block YAML, keys in order; text that YAML 1.1 could read as another type is quoted."""
+    """Format plain data as block YAML; keys keep their order. Quotes text that YAML 1.1 could read as another type."""
     yaml = YAML(typ="safe", pure=True)
     yaml.Representer = _Representer
     yaml.default_flow_style = False
@@ -98,7 +98,7 @@ _Representer.add_representer(str, _quoted)
 
 
 def _document(events: Iterator[Event]) -> Any:
-    next(events)  # the stream's start
+    next(events)  # skip the start of the stream
     event = next(events)
     if isinstance(event, StreamEndEvent):
         return None

@@ -1,4 +1,4 @@
-"""Make and run a command line: threads, errors in one line, exit codes, and the options that all programs have."""
+"""Create and run a command line: threads, one-line errors, exit codes and the options of all programs."""
 
 import atexit
 import contextlib
@@ -30,16 +30,16 @@ Verbose = Annotated[
         "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the variables of threads."
     ),
 ]
-"""The option of a program, before the name of the command: `perilune-train -v detect train`."""
+"""Option of every program; it precedes the command: `perilune-train -v detect train`."""
 
 OverwriteFolder = Annotated[
     bool, typer.Option("--overwrite", help="Replace the folder of --out, if an earlier run of this command wrote it.")
 ]
-"""The option of commands that write a new folder, for `storage.replacement.replaceable`."""
+"""Option of commands that write a new folder; they pass it to `storage.replacement.replaceable`."""
 
 
 def new_program(name: str, version: str, summary: str) -> typer.Typer:
-    """A program without commands: options -h, --verbose and --version, and completion for the user's shell."""
+    """Create a program without commands, with the options -h, --verbose and --version and with shell completion."""
     app = typer.Typer(
         name=name,
         help=summary,
@@ -66,7 +66,7 @@ def new_program(name: str, version: str, summary: str) -> typer.Typer:
 
 
 def add_renamed(app: typer.Typer, old: str, new: str, command: Callable[..., None]) -> None:
-    """Let a command that is now called `new` be called by its former name: hidden, with a line on standard error."""
+    """Keep the old name of a renamed command: hidden in the help; its use prints a line on standard error."""
 
     @wraps(command)
     def renamed(*arguments: Any, **options: Any) -> None:
@@ -82,11 +82,11 @@ _UNTRACKED = {
     "ORT_DISABLE_TELEMETRY": "1",
     "RAY_USAGE_STATS_ENABLED": "0",
 }
-"""Environment variables that switch off telemetry of libraries; a value that the user has set stays."""
+"""Environment variables that switch off the telemetry of libraries; values set by the user are kept."""
 
 
 def _check_arguments() -> None:
-    """Raise UserError on a path that is not UTF-8, which no table, page or library of ours can hold."""
+    """Raise UserError on a path that is not UTF-8: tables, pages and some libraries cannot store it."""
     for argument in sys.argv[1:]:
         if any("\ud800" <= sign <= "\udfff" for sign in argument):
             raise UserError("command line", "argument", argument, "text or a path in UTF-8")
@@ -95,11 +95,11 @@ def _check_arguments() -> None:
 def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -> None:
     """Run a command line; print user errors and disk errors in one line and exit with code 2.
 
-    First sets the threads of the numerical libraries (`threads.set_up_program`), which are not imported yet, and
-    switches off the telemetry of libraries.
+    Before it runs, set the threads of the numerical libraries (`threads.set_up_program`), which must not be imported
+    yet, and switch off the telemetry of libraries.
 
-    Ctrl-C ends the command with one line and exit code 130, after `ended_after_s` at the latest, when its child
-    processes are ended too. Ctrl-C at the end of the process, when all work is done, is ignored.
+    Ctrl-C ends the command with one line and exit code 130. If the command is still running `ended_after_s` seconds
+    later, the process is ended together with its child processes. Ctrl-C is ignored once all work is done.
     """
     with _interrupts() as interrupted, ended_by_interrupt(after_s=ended_after_s, at_end=_end_children):
         message = _error_of(app, interrupted)
@@ -111,7 +111,7 @@ def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -
 
 
 def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
-    """Run a command line; return the line to print if the user caused its end, else None."""
+    """Run a command line; return the line to print if it ended with a user error or Ctrl-C, otherwise None."""
     try:
         _check_arguments()
         set_up_program()
@@ -127,7 +127,7 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         raise
     except BaseException as error:
-        # An interrupt in the middle of an import, or in C code, comes out as another error.
+        # An interrupt during an import, or in C code, may surface as another error.
         if interrupted or isinstance(error, KeyboardInterrupt):
             return STOPPED
         if isinstance(error, OSError) and error.errno in DISK_FAULTS:
@@ -139,7 +139,7 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
 
 
 def _folders() -> dict[str, str]:
-    """The variable that puts Matplotlib's list of fonts into perilune's cache folder, if there is a home folder."""
+    """Return the variable that puts Matplotlib's font list into perilune's cache; empty without a home folder."""
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
     home = Path(os.environ.get("HOME", ""))
     if not given.is_absolute() and not (home.is_absolute() and home.is_dir()):
@@ -150,7 +150,7 @@ def _folders() -> dict[str, str]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[bool]]:
-    """Raise KeyboardInterrupt at Ctrl-C, and note that it was pressed; without effect if it is ignored."""
+    """Raise KeyboardInterrupt on Ctrl-C and record it in the yielded list; no effect if Ctrl-C is ignored."""
     pressed: list[bool] = []
     before = signal.getsignal(signal.SIGINT)
     is_main = threading.current_thread() is threading.main_thread()
@@ -163,7 +163,7 @@ def _interrupts() -> Iterator[list[bool]]:
         raise KeyboardInterrupt
 
     def ignored(unraisable: Any) -> None:
-        # Python discards an interrupt in a destructor or a callback; `ended_by_interrupt` then ends the process.
+        # Python discards an interrupt raised in a destructor or a callback; `ended_by_interrupt` then ends the process.
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             hook(unraisable)
 
@@ -178,7 +178,7 @@ def _interrupts() -> Iterator[list[bool]]:
 
 
 def _end_children() -> None:
-    """Ask all child processes to end (Linux)."""
+    """Send SIGTERM to all child processes (Linux)."""
     for path in Path("/proc/self/task").glob("*/children"):
         for child in path.read_text(encoding="ascii").split():
             with contextlib.suppress(ProcessLookupError):

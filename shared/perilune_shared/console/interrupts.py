@@ -1,4 +1,4 @@
-"""Ctrl-C: end a program with one line from its first import on; delay it until a step is finished, but not for long.
+"""Handle Ctrl-C: end a program with one line, even during its imports; or delay the interrupt until a step ends.
 
 Imports as little as possible: until `end_at_interrupt` is called, Python prints a traceback at Ctrl-C.
 """
@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from perilune_shared.errors import EXIT_INTERRUPTED, STOPPED
 
 _BELOW_BAR = "\n\x1b[?25h"
-"""New line, and the control sequence that shows the cursor."""
+"""Line feed, and the control sequence that shows the cursor again."""
 _UNFINISHED: dict[str, None] = {}
 """Paths to remove if Ctrl-C ends the process before its own code can."""
 _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
@@ -28,23 +28,23 @@ def start(module: str) -> None:
 
 
 def end_at_interrupt() -> None:
-    """From now on Ctrl-C ends the process at once with one line and exit code 130, unless it is ignored.
+    """Make Ctrl-C end the process at once with one line and exit code 130, unless it is ignored.
 
-    Scripts call it before they import large modules, and must have written nothing. `run_command_line` ends it.
+    Call it in a script before large imports and before anything is written. `run_command_line` replaces it.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
-        # At the end all work is done.
+        # When Python exits, all work is done.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
 
 def ends_at_interrupt() -> bool:
-    """Whether `end_at_interrupt` is in force."""
+    """Whether `end_at_interrupt` is in effect."""
     return signal.getsignal(signal.SIGINT) is _end
 
 
 def _end(*_: object) -> None:
-    # Not an exception: modules that are half imported, and C code, would turn it into other errors.
+    # No exception is raised: partly imported modules and C code would turn it into other errors.
     os.write(2, f"{STOPPED}\n".encode())
     os._exit(EXIT_INTERRUPTED)
 
@@ -65,7 +65,7 @@ def interrupts_held() -> Iterator[None]:
 
     def delay(*_: object) -> None:
         asked.append(True)
-        # The operating system handles the second one, even while no Python code runs.
+        # The operating system handles the second Ctrl-C, even while no Python code runs.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         with contextlib.suppress(OSError):
             os.write(2, _NOTICE)
@@ -92,7 +92,7 @@ def unfinished(*paths: os.PathLike[str]) -> Iterator[None]:
 
 
 def _remove_unfinished() -> None:
-    # Large to import, and not needed before.
+    # Imported here because the import is slow.
     import shutil
     from pathlib import Path
 
@@ -104,19 +104,20 @@ def _remove_unfinished() -> None:
 
 @contextlib.contextmanager
 def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """End the process `after_s` seconds after Ctrl-C, if the block has not ended by then: with one line and code 130.
+    """End the process with one line and exit code 130 if the block still runs `after_s` seconds after Ctrl-C.
 
-    `at_end` may end the processes that the block has started. It is called before that, in another thread; or in this
-    one if the block itself ends with KeyboardInterrupt, which may have interrupted the code that ends them.
+    Python raises KeyboardInterrupt only between two of its own instructions, and one call of Blender or NumPy may take
+    longer than `after_s`. Use it only in commands whose output survives SIGKILL.
 
-    Files and folders of `unfinished` are removed. For commands whose output survives SIGKILL. Python raises
-    KeyboardInterrupt only between two steps of its own, and one call of Blender or NumPy may take longer. Without
-    effect if Ctrl-C is ignored, and outside the main thread.
+    Before the process ends, `at_end` is called in another thread; it may end the processes that the block started. If
+    the block itself ends with KeyboardInterrupt, `at_end` is called in this thread, since the interrupt may have
+    stopped the code that ends those processes. Files and folders passed to `unfinished` are removed. No effect if
+    Ctrl-C is ignored or outside the main thread.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
         yield
         return
-    # Python's signal handler in C writes the signal's number here at once, also during native code.
+    # Python's C signal handler writes the signal number into this pipe at once, even while native code runs.
     (asked, signalled), (ended, end) = os.pipe(), os.pipe()
     os.set_blocking(signalled, False)
     before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)

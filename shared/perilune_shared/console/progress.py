@@ -1,4 +1,4 @@
-"""Progress of long tasks, reported to any progress bar or to none.
+"""Report the progress of long tasks to a progress bar, or to nothing.
 
 Use: `task = progress.add_task("merging", total=n, unit="scenes")`, then `progress.advance(task)` after each step.
 Command lines pass `terminal.progress_bar()`. Other callers pass nothing, and Rich is not imported.
@@ -11,17 +11,17 @@ class Progress(Protocol):
     """The methods of a progress bar that long tasks call; rich.progress.Progress has them."""
 
     def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
-        """Start a task of `total` steps and return its id. `unit` is the plural name of a step."""
+        """Start a task of `total` steps and return its id. `unit` names the steps, in the plural."""
 
     def advance(self, task_id: Any, advance: float = 1) -> None:
-        """Add completed steps to a task."""
+        """Count further steps of a task as completed."""
 
     def update(self, task_id: Any, **fields: Any) -> None:
         """Set fields of a task: `completed`, or a `note` on the current step."""
 
 
 class _NoProgress:
-    """Ignores all reports."""
+    """Progress that is not shown."""
 
     def add_task(self, description: str, *, total: float | None, **fields: Any) -> None:
         pass
@@ -39,7 +39,7 @@ NO_PROGRESS: Progress = _NoProgress()
 
 def say(line: str, style: str | None = None) -> None:
     """Print a line on standard error, above the progress bar if one is shown; `style` is a style of Rich."""
-    # Rich is not imported before.
+    # Imported here so that Rich is loaded only if something is printed.
     from perilune_shared.console import terminal
 
     terminal.say(line, style)

@@ -1,7 +1,7 @@
-"""Output of the command lines: lines, pages, tables and the progress bar.
+"""Print lines, pages, tables and the progress bar of the command lines.
 
-Most lines contain names from files. These functions replace control characters and do not interpret markup.
-`tests/test_house.py` finds prints elsewhere.
+Most lines contain names from files, so these functions replace control characters and do not interpret markup.
+`tests/test_house.py` fails if other modules print.
 """
 
 import sys
@@ -22,12 +22,12 @@ from rich.text import Text
 
 from perilune_shared.errors import one_line
 
-# In Jupyter, Rich would draw widgets, which need another package, and warn without it.
+# In Jupyter, Rich would draw widgets; they need another package, and Rich warns if it is missing.
 console = Console(stderr=True, force_jupyter=False)
-"""Console on standard error of the progress bar; text that it prints appears above the bar."""
+"""Console for standard error and the progress bar; text printed on it appears above the bar."""
 _LOG_INTERVAL_S = 60.0
 _LOG_WIDTH = 120
-"""Characters of a line of progress in a file."""
+"""Width of a progress line in a log file, characters."""
 
 
 def say(line: object, style: str | None = None) -> None:
@@ -47,7 +47,7 @@ def answer(line: object) -> None:
 
 def answer_page(text: str) -> None:
     """Print several lines on standard output."""
-    # A terminal of another encoding shows a question mark for what it lacks.
+    # Characters that the terminal's encoding lacks become question marks.
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     sys.stdout.write(_lines(text).rstrip("\n").encode(encoding, "replace").decode(encoding) + "\n")
     sys.stdout.flush()
@@ -61,7 +61,7 @@ def answer_table(
     *,
     numbers: bool = False,
 ) -> None:
-    """Print a table on standard output; long cells are folded. With `numbers` all columns but the first are aligned."""
+    """Print a table on standard output; long cells are folded. `numbers` right-aligns all columns but the first."""
     table = Table(title=Text(one_line(title)) if title else None, caption=Text(one_line(caption)) if caption else None)
     for index, name in enumerate(head):
         table.add_column(Text(one_line(name)), justify="right" if numbers and index else "left", overflow="fold")
@@ -99,7 +99,7 @@ class _Note(ProgressColumn):
 
 
 class _LoggedProgress(Progress):
-    """Progress that prints a line once a minute if the console is not a terminal, where Rich shows only the end."""
+    """Progress that prints a line once a minute if the console is not a terminal; Rich alone prints only the end."""
 
     def __init__(self, *columns: ProgressColumn, clock: Callable[[], float], **fields: Any) -> None:
         super().__init__(*columns, get_time=clock, **fields)
@@ -123,9 +123,10 @@ class _LoggedProgress(Progress):
 
 
 def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
-    """Create a progress bar on standard error: name, steps, rate, remaining time, and a note on the current step.
+    """Create a progress bar on standard error: name, steps, rate, remaining time and a note on the current step.
 
-    In a file or pipe it is a line per task, at most once a minute and at the end. `clock` returns the time, s.
+    In a file or pipe, print one line per task instead, at most once a minute and at the end. `clock` returns the time
+    in seconds.
     """
     return _LoggedProgress(
         _Name(),

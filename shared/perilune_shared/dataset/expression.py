@@ -1,7 +1,7 @@
-"""Conditions on columns, for `--where`: arithmetic and comparisons in Python syntax.
+"""Conditions on columns for the option `--where`: arithmetic and comparisons in Python syntax.
 
 A condition is parsed with `ast`, type-checked against the schema, and compiled to an expression of pyarrow.compute. It
-is never executed as Python code. A column is given by its name, or by `table.column` if several tables have it;
+is never executed as Python code. A column is given by its name, or as `table.column` if several tables have it;
 `position_m[2]` is an element of a vector. As in SQL, a comparison with null is neither true nor false.
 """
 
@@ -43,7 +43,7 @@ class _Value:
     """A subexpression of a condition."""
 
     kind: _Kind
-    """Type of its values."""
+    """Type of the values."""
     expression: Any
     """The pyarrow expression."""
     length: int = 0
@@ -67,11 +67,11 @@ class Condition:
 
     @property
     def on_labels(self) -> bool:
-        """Whether the condition selects labels, not frames."""
+        """Whether the condition selects labels; otherwise it selects frames."""
         return any(table in ("labels", "craters") for table, _ in self.columns)
 
     def columns_of_only(self, table: str) -> list[str] | None:
-        """Return the columns used if all belong to `table`, otherwise None."""
+        """Return the columns that the condition uses if all belong to `table`, otherwise None."""
         return (
             sorted(name for _, name in self.columns) if {table} == {of_table for of_table, _ in self.columns} else None
         )
@@ -163,7 +163,7 @@ class Condition:
         if isinstance(node.op, ast.Div):
             return _Value("real", pc.divide(real_a, real_b))
         if isinstance(node.op, ast.Mod) and integers:
-            # Arrow's division truncates towards zero; give the remainder the divisor's sign, as in Python.
+            # Arrow's division truncates towards zero. In Python the remainder has the divisor's sign.
             remainder = a - b * pc.divide(a, b)
             return _Value(kind, pc.if_else((remainder != 0) & pc.xor(remainder < 0, b < 0), remainder + b, remainder))
         if isinstance(node.op, ast.Mod):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
 ELLIPSE_COLUMNS = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
-"""Columns of an ellipse in the table labels."""
+"""Columns of the table labels that describe an ellipse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,9 @@ class Frame:
     """A frame, as returned by `dataset[i]`."""
 
     row: dict[str, Any]
-    """The frame's row of the table frames: pose, time, split, ... with units in the column names."""
+    """The frame's row in the table frames: pose, time, split, ...; column names contain the units."""
     labels: pd.DataFrame
-    """The frame's rows of the table labels, one row per crater."""
+    """The frame's rows in the table labels, one per crater."""
     png: bytes
     """Content of the PNG file."""
 
@@ -40,11 +40,11 @@ class Frame:
     def image(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """Grey levels (height, width), 8 or 16 bits.
 
-        Raises UserError if the file is not such a PNG, or has not as many bytes as the manifest records.
+        Raises UserError if the file is not such a PNG or its size differs from the manifest.
         """
         from PIL import Image
 
-        # Decoders accept a PNG whose last bytes are missing.
+        # Check the size, since decoders accept a PNG whose last bytes are missing.
         size_bytes = self.row["png_bytes"]
         if pd.notna(size_bytes) and len(self.png) != size_bytes:
             expected = f"{int(size_bytes)} bytes; see `perilune-manifest validate`, and render the damaged frame again"
@@ -63,7 +63,7 @@ class Frame:
             ) from None
 
     def plot(self) -> "Picture":
-        """Return a picture of the frame with the ellipses of all labels. Raises UserError as `image`."""
+        """Return a picture of the frame with the ellipses of all labels. Raises UserError as `image` does."""
         return with_ellipses(self.image, self.labels[ELLIPSE_COLUMNS].to_numpy(), [GREEN] * len(self.labels))
 
     def show(self) -> None:

@@ -1,7 +1,7 @@
 """The index of a dataset: path, size and SHA-256 of every file except dataset.json and the index itself.
 
-dataset.json names the parts of the index with their hashes. The name of a part follows from its content, so a new index
-never overwrites the old one: writing dataset.json switches between them.
+dataset.json names the parts of the index with their hashes. The name of a part is derived from its content, so a new
+index never overwrites the old one; dataset.json states which one is valid.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ INDEX = pa.schema(
 MOST_ROWS = 2_000_000
 """Maximum number of rows of a part."""
 MOST_ROWS_IN_ALL = 4_000_000
-"""Maximum number of rows of all parts: each takes about 0.4 kB of memory while the files are checked."""
+"""Maximum number of rows of all parts; each row takes about 0.4 kB of memory while the files are checked."""
 LARGEST_FILE_BYTES = 2**36
 _ROWS_PER_GROUP = 2**16
 _LONGEST_PATH = 500
@@ -43,14 +43,14 @@ _SHA256 = r"^[0-9a-f]{64}$"
 
 
 def index_rows(written: Iterable[WrittenFile]) -> pa.Table:
-    """Return the rows of files, sorted by path."""
+    """Return the index rows of written files, sorted by path."""
     files = sorted(written, key=lambda file: file.path)
     columns = [[file.path for file in files], [file.size_bytes for file in files], [file.sha256 for file in files]]
     return pa.table(columns, schema=INDEX)
 
 
 def frame_rows(frames: pa.Table) -> pa.Table:
-    """Return the rows of the files that rows of the table frames name, by kind, in the order of the frames.
+    """Return the index rows of all files named in the table frames, by kind, then in the order of the frames.
 
     Raises UserError if a frame has a path without size or hash.
     """
@@ -58,7 +58,7 @@ def frame_rows(frames: pa.Table) -> pa.Table:
 
 
 def scene_file_rows(scenes: pa.Table) -> pa.Table:
-    """Return the rows of the files that rows of the table scenes name. Raises UserError as `frame_rows`."""
+    """Return the index rows of all files named in the table scenes. Raises UserError as `frame_rows` does."""
     return _named_files(scenes, "scenes", SCENE_FILE_KINDS)
 
 
@@ -76,7 +76,7 @@ def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
 
 
 def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
-    """Write the parts of an index, in any order of the rows, and return their records for dataset.json."""
+    """Write the parts of an index and return their records for dataset.json; the rows may be in any order."""
     if len(rows) > MOST_ROWS_IN_ALL:
         expected = f"at most {MOST_ROWS_IN_ALL}; pack the frames, or split the dataset"
         raise UserError(store, "files", len(rows), expected)
@@ -96,7 +96,8 @@ def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
 def seal(store: Store, info: DatasetInfo, rows: pa.Table) -> DatasetInfo:
     """Write the index, then dataset.json with it, then delete other indexes; return the content of dataset.json.
 
-    A dataset that was sealed before stays so at any moment, if the files that its old index names are unchanged.
+    If the dataset has an index already and the files in it are unchanged, the dataset matches its index at every
+    moment.
     """
     info = info.model_copy(update={"index": write_index(store, rows)})
     write_info(store, info)
@@ -108,9 +109,9 @@ def seal(store: Store, info: DatasetInfo, rows: pa.Table) -> DatasetInfo:
 
 
 def read_index(store: Store, info: DatasetInfo) -> pa.Table:
-    """Read the index, sorted by path. Its paths are plain and inside the dataset; each occurs once.
+    """Read the index, sorted by path. All paths are plain, unique and inside the dataset.
 
-    Raises UserError if a part is missing, too large, not as dataset.json records it, or has an invalid row.
+    Raises UserError if a part is missing or too large, differs from its record in dataset.json, or has an invalid row.
     """
     if not info.index:
         raise UserError(store.at(INFO_NAME), "index", "none", "the index of a finished dataset")
@@ -143,7 +144,7 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
     part = Part(store, recorded.path, FOLDER, INDEX)
     stated = part.stated_groups()
     for group in range(part.n_groups):
-        # The paths of a small group are checked before the next one is decompressed.
+        # Check the paths of each small group before decompressing the next one.
         in_group = part.file.metadata.row_group(group).num_rows
         if part.n_rows > MOST_ROWS or in_group > _ROWS_PER_GROUP:
             expected = f"at most {MOST_ROWS}, at most {_ROWS_PER_GROUP} in a row group"

@@ -48,7 +48,7 @@ def read_object(address: Address) -> dict[str, Any]:
 
 
 def _with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a dict from members. Raises ValueError on a duplicate name, since readers differ in which one they use."""
+    """Build a dict from members. Raises ValueError on a duplicate name: JSON readers disagree on which one is valid."""
     members: dict[str, Any] = {}
     for name, value in pairs:
         if name in members:
@@ -64,7 +64,7 @@ def _finite(number: str) -> float:
 
 
 def read_info(address: Address) -> DatasetInfo:
-    """Read a dataset's dataset.json. Raises UserError if it is missing, damaged or of another schema version."""
+    """Read dataset.json. Raises UserError if it is missing or damaged, or has another schema version."""
     store = open_store(address)
     content = read_object(store)
     for name in ("manifest", "shards", *(f"manifest/{table}" for table in TABLES)):
@@ -81,7 +81,7 @@ def read_info(address: Address) -> DatasetInfo:
 
 
 def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
-    """Validate plain data as a DatasetInfo. Raises UserError about the first wrong field of `path`."""
+    """Validate plain data as a DatasetInfo. Raises UserError about the first wrong field; messages name `path`."""
     try:
         info = DatasetInfo.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -98,7 +98,7 @@ def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
 
 
 def _check_texts(info: DatasetInfo, path: object) -> None:
-    """Check the texts of recipes, since settings are untrusted and are shown on pages and terminals."""
+    """Check the texts of recipes: settings are untrusted input and are shown on pages and terminals."""
     for recipe in info.recipes.values():
         unsafe = _unsafe_text([recipe.config, recipe.developed_from.camera_config if recipe.developed_from else None])
         if unsafe is not None:
@@ -123,7 +123,7 @@ def write_info(address: Address, info: DatasetInfo) -> None:
 
 
 def info_bytes(info: DatasetInfo, where: object) -> bytes:
-    """Return the content of dataset.json. Raises UserError about `where` if texts of its recipes are unsafe."""
+    """Return the content of dataset.json. Raises UserError, which names `where`, if texts of recipes are unsafe."""
     _check_texts(info, where)
     return with_own_hash(info.model_dump_json(indent=2).encode())
 
@@ -135,7 +135,7 @@ def with_own_hash(content: bytes) -> bytes:
 
 
 def has_own_hash(store: Store) -> bool:
-    """Whether dataset.json is as it was written, by the hash that it contains."""
+    """Whether dataset.json still matches the hash that it contains."""
     content = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
     head, _, _ = content.rpartition(f',\n  "{_OWN_HASH}": '.encode())
     return with_own_hash(head + b"}") == content

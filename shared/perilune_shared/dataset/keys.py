@@ -25,8 +25,8 @@ _HINT = "see `perilune-manifest validate`"
 def check_keys(dataset: Dataset) -> None:
     """Raise UserError if a key is not unique, or if a row refers to a missing scene, trajectory, frame or crater.
 
-    Also if the statistics of a part would hide rows of a scene, trajectory or split from readers. Reads labels one row
-    group at a time and keeps 8 bytes of memory per label.
+    Also raises it if the statistics of a part would hide rows of a scene, trajectory or split from readers. Reads
+    labels one row group at a time and keeps 8 bytes of memory per label.
     """
     _check_statistics(dataset)
     check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
@@ -39,7 +39,7 @@ def check_keys(dataset: Dataset) -> None:
 
 
 def _check_statistics(dataset: Dataset) -> None:
-    """Raise UserError if the footer of a part is wrong about a column by which readers select row groups."""
+    """Raise UserError if a footer has wrong statistics for a column by which readers select row groups."""
     for table, schema in TABLES.items():
         names = [name for name in _SELECTED_BY if name in schema.names]
         for path in dataset.parts(table):
@@ -51,14 +51,17 @@ def _check_statistics(dataset: Dataset) -> None:
 
 
 class KeyCheck:
-    """Check the keys of scenes, trajectories, frames and craters on creation, and of labels while a caller reads them.
+    """Check the keys of scenes, trajectories, frames and craters on creation; check labels as the caller adds them.
 
     Pass all labels of the dataset to `add_labels`, in batches, then call `finish`. Keys of boulders are not checked,
     since no other row refers to them.
     """
 
     def __init__(self, dataset: Dataset, frames: pa.Table):
-        """`frames` is the table frames with at least FRAME_COLUMNS. Raises UserError if a key is broken."""
+        """Check the keys of all tables except labels. `frames` is the table frames with at least FRAME_COLUMNS.
+
+        Raises UserError if a key is broken.
+        """
         self._dataset = dataset
         scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
         _check_unique(dataset, "scenes", scenes)
@@ -82,7 +85,7 @@ class KeyCheck:
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
         """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
 
-        Raises UserError if a frame or crater is missing, or if `rows` has another scene_id than the frame.
+        Raises UserError if a frame or crater is missing, or if a label and its frame have different scene_ids.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         if "scene_id" in rows.column_names:
@@ -106,7 +109,7 @@ class KeyCheck:
         return frame
 
     def finish(self) -> None:
-        """Raise UserError if two labels have the same frame and crater."""
+        """Raise UserError if two labels refer to the same frame and crater."""
         keys = np.concatenate(self._seen) if self._seen else np.empty(0, np.int64)
         if not (np.diff(keys) > 0).all():
             keys.sort()
@@ -119,7 +122,7 @@ class KeyCheck:
 
 
 def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
-    """Look up each text of a column (N,) in `place_of`; -1 if it is missing. Each distinct text is looked up once."""
+    """Return the value in `place_of` for each text of a column (N,); -1 if it is missing. Looks up equal texts once."""
     looked_up = []
     for chunk in column.chunks:
         words = chunk.dictionary_encode()

@@ -36,11 +36,11 @@ LARGEST_FRAME_BYTES = 2**30
 """Maximum size of a PNG or EXR, bytes."""
 _MAX_KEPT_OPEN = 32
 _MAX_REQUESTS = 16
-"""Number of frames of an object store that are read at a time."""
+"""Number of frames that are read from an object store at a time."""
 
 
 class Dataset:
-    """A dataset, open for reading."""
+    """An open dataset."""
 
     _opened: dict[str, Part] | None = None
 
@@ -51,9 +51,9 @@ class Dataset:
 
     @contextlib.contextmanager
     def parts_kept_open(self) -> Iterator[None]:
-        """Open each part and check its footer only once within the block, for callers that read scene by scene.
+        """Open and check each part only once within the block, for callers that read scene by scene.
 
-        Use it only while no process writes to the dataset: changed parts are not reread.
+        Use it only while no process writes to the dataset: a changed part is not read again.
         """
         self._opened = {}
         try:
@@ -74,20 +74,20 @@ class Dataset:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the frames' PNGs; the first one if there are several (`camera_of`)."""
+        """Camera of the PNGs; the first one if there are several (see `camera_of`)."""
         return self.info.camera.intrinsics()
 
     def camera_of(self, row: Mapping[str, Any]) -> Camera:
-        """Camera of a frame, given its row of the table frames with the column `camera`."""
+        """Return the camera of a frame, given its row in the table frames with the column `camera`."""
         return self.info.camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     def exr_camera_of(self, row: Mapping[str, Any]) -> Camera:
-        """Camera of a frame's EXR, as `camera_of`."""
+        """Return the camera of a frame's EXR, given the same row as for `camera_of`."""
         return self.info.exr_camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     @property
     def exr_camera(self) -> Camera:
-        """Camera of the frames' EXRs, or of the PNGs if there are no EXRs; the first one if there are several."""
+        """Camera of the EXRs, or of the PNGs if there are no EXRs; the first one if there are several."""
         return (self.info.exr_camera or self.info.camera).intrinsics()
 
     @functools.cached_property
@@ -134,7 +134,7 @@ class Dataset:
     def __getitem__(self, key: int | str | slice) -> Frame | list[Frame]:
         """Return a frame by its row number in `frames` or by its frame_id, or the list of frames of a slice.
 
-        Raises IndexError or KeyError if there is no such frame, UserError if its image or labels cannot be read.
+        Raises IndexError or KeyError if the frame does not exist, UserError if its image or labels cannot be read.
         """
         if isinstance(key, slice):
             with self.parts_kept_open():
@@ -153,7 +153,7 @@ class Dataset:
         return Frame(row, labels.to_pandas(), png)
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[str]:
-        """Return the paths of a table's parts, sorted by name; with ids, those that may contain matching rows."""
+        """Return the paths of a table's parts, sorted; ids limit them to parts that may contain matching rows."""
         paths = self._listed.get(table)
         if paths is None:
             paths = parquet_files(self.store, f"manifest/{table}")
@@ -170,11 +170,11 @@ class Dataset:
         split: str | None = None,
         where: Condition | None = None,
     ) -> pa.Table:
-        """Read a table as Arrow: all or some columns; all rows, or the rows of a scene, a trajectory, a split.
+        """Read all or some columns of a table as Arrow: all rows, or those of a scene, trajectory or split.
 
-        A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table; row groups
-        whose statistics exclude it are skipped. Only the parts, row groups and columns needed are read. Craters and
-        boulders belong to no split. Raises UserError if a part is truncated or of another schema, or if the table or a
+        A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table. Only the
+        required parts, row groups and columns are read; statistics show which row groups cannot match. Craters and
+        boulders belong to no split. Raises UserError if a part is truncated or has another schema, or if the table or a
         column is unknown.
         """
         _check_names(table, columns)
@@ -209,8 +209,9 @@ class Dataset:
     def pngs(self, frames: pa.Table, split: str | None = None) -> Iterator[tuple[str, bytes]]:
         """Yield frame_id and PNG bytes of the frames in `frames`, which has frame_id and png_path.
 
-        If all are of one `split`, packed frames of other splits are not searched. Frames stored as files come in the
-        order of the rows, packed frames in the order in which they are stored. Raises UserError if a frame is missing.
+        If all belong to one split, pass it as `split`: shards of other splits are then not read. Frames stored as files
+        are yielded in the order of the rows, packed frames in the order in which they are stored. Raises UserError if a
+        frame is missing.
         """
         if self.info.images in ("absent", "planned"):
             command = "regenerate" if self.info.images == "absent" else "dataset --manifest"
@@ -234,28 +235,28 @@ class Dataset:
                 )
 
     def shards(self, split: str | None = None) -> list[str]:
-        """Return the paths of the Parquet files that contain packed frames, of all splits or of one, sorted by name."""
+        """Return the paths of the Parquet files with packed frames of one split or all, sorted by name."""
         return shards_of(self.store, split)
 
 
 def open_dataset(address: Address) -> Dataset:
     """Open a dataset in a local folder or at an address such as s3://bucket/moon.
 
-    Raises UserError if it is missing, damaged or of another schema version.
+    Raises UserError if the dataset is missing or damaged, or if it has another schema version.
     """
     store = open_store(address)
     return Dataset(store, read_info(store))
 
 
 def open_single(address: Address) -> Dataset:
-    """Open a dataset of one camera. Raises UserError as `open_dataset`, and if its frames are of several cameras."""
+    """Open a dataset of one camera. Raises UserError as `open_dataset` does, and if there are several cameras."""
     dataset = open_dataset(address)
     check_single(dataset)
     return dataset
 
 
 def check_single(dataset: Dataset) -> None:
-    """Raise UserError if the frames of a dataset are of several cameras."""
+    """Raise UserError if a dataset has several cameras."""
     names = list(dataset.info.cameras or ())
     if names:
         select = f"perilune-manifest subset {dataset.store} --where \"camera == '{names[0]}'\" --out ..."

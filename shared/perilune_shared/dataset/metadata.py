@@ -22,9 +22,9 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array
 
 NOT_STATED = "LicenseRef-not-stated"
-"""Licence of a dataset whose maker has stated none. Joined with others it stays in the expression."""
+"""Licence of a dataset whose author has not stated a licence. A merge keeps it in the joined expression."""
 LARGEST_IMAGE_PX = 2**27
-"""Largest image that is decompressed, pixels."""
+"""Largest image that readers decompress, pixels."""
 _LARGEST_INDEX_BYTES = 2**30
 _FAR = 1e9
 _ROTATION_TOLERANCE = 1e-6
@@ -50,7 +50,7 @@ class _Info(BaseModel):
 
 
 class CameraRecord(_Info):
-    """Camera in dataset.json: the fields of `Camera`, limited to possible values, and the mounting in O_B."""
+    """Camera in dataset.json: the fields of `Camera`, limited to plausible values, and the mounting in O_B."""
 
     width_px: Annotated[int, Field(gt=0, le=100_000)]
     """Image width, pixels."""
@@ -87,7 +87,7 @@ class CameraRecord(_Info):
         rotation_camera_from_body: Array = ROTATION_CAMERA_FROM_BODY,
         position_in_body_m: _Row = (0.0, 0.0, 0.0),
     ) -> "CameraRecord":
-        """Record a camera; by default at the body's origin, looking straight down while the body is level."""
+        """Record a camera. By default it is at the body's origin and looks straight down if the body is level."""
         x, y, z = rotation_camera_from_body.tolist()
         rows = tuple(x), tuple(y), tuple(z)
         return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=position_in_body_m)
@@ -115,7 +115,7 @@ class Counts(_Info):
     inertial: Annotated[int, Field(ge=0)] = 0
     """Number of inertial measurements."""
     ranges: Annotated[int, Field(ge=0)] = 0
-    """Number of measurements of the altimeter."""
+    """Number of altimeter measurements."""
 
 
 class Origin(_Info):
@@ -126,8 +126,8 @@ class Origin(_Info):
     sha256: _Sha256
     """SHA-256 of its dataset.json."""
     camera_config: dict[str, Any] | None
-    """Section `dataset.camera` of its configuration, or `dataset.cameras` if there are several, to which terrain and
-    EXRs are adapted; null if not known."""
+    """Section `dataset.camera` of that dataset's configuration, or `dataset.cameras` if it has several cameras; null if
+    unknown. Terrain and EXRs were made for these cameras."""
 
 
 class Recipe(_Info):
@@ -136,7 +136,7 @@ class Recipe(_Info):
     preset: Name
     """Preset on which the settings are based."""
     kind: Kind
-    """Which of the preset's datasets: detect or nav."""
+    """Which of the preset's datasets this is: detect or nav."""
     seed: Annotated[int, Field(ge=0)]
     """Random seed from which every random stream is derived."""
     config: dict[str, Any]
@@ -157,7 +157,7 @@ class IndexPart(_Info):
     """One part of the dataset's index (perilune_shared.dataset.index)."""
 
     path: Annotated[str, Field(pattern=r"^index/[0-9a-f]{16}\.parquet$")]
-    """Path relative to the dataset; its name is the first 16 digits of the hash."""
+    """Path relative to the dataset; the file name is the first 16 digits of the hash."""
     bytes: Annotated[int, Field(gt=0, le=_LARGEST_INDEX_BYTES)]
     """File size, bytes."""
     sha256: _Sha256
@@ -179,18 +179,19 @@ class DatasetInfo(_Info):
     complete: bool
     """False while rendering is in progress or was interrupted."""
     images: ImageState
-    """Where the frames are: files (under frames/), packed (shards/*.parquet), absent, or planned (no labels either)."""
+    """Where the frames are: files (in frames/), packed (in shards/*.parquet), absent, or planned (no labels yet
+    either)."""
     split_by: SplitUnit
     """Unit of the split; no unit is in two splits. If it is not scene, splits may share terrain."""
     camera: CameraRecord
     """Camera of all frames (PNG)."""
     exr_camera: CameraRecord | None = None
-    """Camera of the EXRs: without distortion, covering the whole view of `camera`; null if there are no EXRs."""
+    """Camera of the EXRs, without distortion; its view covers the view of `camera`. null if there are no EXRs."""
     cameras: dict[_CameraName, CameraRecord] | None = None
-    """Cameras by name, if frames are of several: the column `camera` of frames has the name. `camera` is then the first
-    of them."""
+    """Cameras by name, if there are several. The column `camera` of the table frames contains the name; the field
+    `camera` above is then the first camera."""
     exr_cameras: dict[_CameraName, CameraRecord] | None = None
-    """Cameras of the EXRs by name, if frames are of several cameras and there are EXRs."""
+    """Cameras of the EXRs by name, if there are several cameras and there are EXRs."""
     recipes: dict[str, Recipe]
     """Recipes by key; each scene refers to one."""
     history: tuple[_Line, ...] = ()
@@ -198,9 +199,9 @@ class DatasetInfo(_Info):
     counts: Counts
     """Number of rows of each table; set when the dataset is complete."""
     licence: Annotated[str, Field(pattern=r"^[A-Za-z0-9(][A-Za-z0-9 ._+:()-]{0,499}$")]
-    """Licence of the dataset, as an SPDX expression; `NOT_STATED` until its maker states one."""
+    """Licence of the dataset, as an SPDX expression; `NOT_STATED` until the author states a licence."""
     index: tuple[IndexPart, ...] = ()
-    """Parts of the index, which names all other files; none while the dataset is not complete."""
+    """Parts of the index, which lists all other files; empty while the dataset is incomplete."""
 
     @model_validator(mode="after")
     def _names_agree(self) -> "DatasetInfo":
@@ -213,27 +214,27 @@ class DatasetInfo(_Info):
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what only datasets of several cameras have, so that others keep their bytes."""
+        """Omit unused fields for several cameras, so that dataset.json of a single camera keeps its bytes."""
         values: dict[str, Any] = handler(self)
         return {key: value for key, value in values.items() if value is not None or key not in _OF_SEVERAL}
 
     @property
     def leak(self) -> str:
-        """Warning to append to the split unit if splits share terrain; otherwise empty."""
+        """Warning to append to the split unit if splits may share terrain; otherwise empty."""
         return "" if self.split_by == "scene" else ": splits share terrain, so test metrics are optimistic"
 
     def camera_of(self, name: str | None) -> CameraRecord:
-        """Return the camera of frames whose column `camera` is `name`. Raises KeyError if there is none."""
+        """Return the camera of frames whose column `camera` is `name`. Raises KeyError on an unknown name."""
         return self.camera if self.cameras is None or name is None else self.cameras[name]
 
     def exr_camera_of(self, name: str | None) -> CameraRecord:
-        """Return the camera of the EXRs of such frames; the camera of the PNGs if there are no EXRs."""
+        """Return the EXR camera of frames whose column `camera` is `name`; their PNG camera if there are no EXRs."""
         if self.cameras is None or name is None:
             return self.exr_camera or self.camera
         return (self.exr_cameras or self.cameras)[name]
 
     def with_cameras(self, names: Iterable[str]) -> "DatasetInfo":
-        """Return a copy for frames of some of the cameras; of one, it is an ordinary dataset of a single camera."""
+        """Return a copy with only the named cameras. With one name it describes an ordinary dataset of one camera."""
         used = set(names)
         if self.cameras is None or not used & self.cameras.keys() or used >= self.cameras.keys():
             return self
@@ -247,12 +248,12 @@ class DatasetInfo(_Info):
         return self.model_copy(update=fields)
 
     def recipe(self) -> Recipe:
-        """Return the recipe of a dataset with exactly one. Raises ValueError if there are more."""
+        """Return the only recipe of the dataset. Raises ValueError if there are several."""
         (recipe,) = self.recipes.values()
         return recipe
 
     def row_time_s(self, recipe: object) -> float:
-        """Return the row time of the rolling shutter in a recipe, given by its key, seconds; 0 if it has none."""
+        """Return the row time of the rolling shutter, seconds, for the key of a recipe; 0 without a rolling shutter."""
         known = self.recipes.get(str(recipe))
         sensor = known.config.get("sensor") if known is not None else None
         value = sensor.get("row_time_s", 0.0) if isinstance(sensor, dict) else 0.0

@@ -1,4 +1,4 @@
-"""Packed frames: shards/<split>-00000-of-00012.parquet, one row per frame with its pose, its image and its labels."""
+"""Packed frames: shards/<split>-00000-of-00012.parquet, one row per frame with pose, image and labels."""
 
 import json
 import re
@@ -34,13 +34,13 @@ LABEL = pa.struct([field for field in TABLES["labels"] if field.name not in TABL
 
 
 def features_of(columns: list[pa.Field]) -> bytes:
-    """Return the metadata `huggingface` of a Parquet file: it makes `datasets` decode the column `image`."""
+    """Return the value of the Parquet metadata `huggingface`, which makes `datasets` decode the column `image`."""
     features = {field.name: {"_type": "Image"} if field.name == "image" else _feature(field.type) for field in columns}
     return json.dumps({"info": {"features": features}}).encode()
 
 
 def _feature(kind: pa.DataType) -> dict[str, Any]:
-    """Describe a type in the notation of `datasets`."""
+    """Describe an Arrow type in the notation of the library `datasets`."""
     if pa.types.is_fixed_size_list(kind):
         return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
     if pa.types.is_list(kind):
@@ -58,7 +58,7 @@ def _shard_schema() -> pa.Schema:
 
 
 SHARDS = _shard_schema()
-"""Schema of a shard: the columns of `frames` but `camera`, the image and the labels."""
+"""Schema of a shard: all columns of `frames` except `camera`, then the image and the labels."""
 
 
 def shard_name(split: str, number: int, count: int) -> str:
@@ -67,12 +67,12 @@ def shard_name(split: str, number: int, count: int) -> str:
 
 
 def split_of(shard: str) -> str:
-    """Return the split that the name of a shard states."""
+    """Return the split in the name of a shard."""
     return shard.rpartition("/")[2].partition("-")[0]
 
 
 def shards_of(store: Store, split: str | None = None) -> list[str]:
-    """Return the paths of the shards of a dataset, or of one split, sorted by name. Other files are not shards."""
+    """Return the paths of a dataset's shards, or of one split's, sorted by name; other files are ignored."""
     paths = [path for path in parquet_files(store, FOLDER) if _NAME.fullmatch(path.rpartition("/")[2])]
     return [path for path in paths if split in (None, split_of(path))]
 
@@ -83,7 +83,7 @@ def open_shard(store: Store, path: str) -> Part:
 
 
 def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> Iterator[tuple[str, bytes]]:
-    """Yield frame_id and PNG bytes of packed frames, of all splits or of one, in the order in which they are stored.
+    """Yield frame_id and PNG bytes of packed frames of one split or all, in the order in which they are stored.
 
     Raises UserError if a frame is missing.
     """
@@ -106,7 +106,7 @@ def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> 
 
 
 def packed_rows(frames: pa.Table, labels: pa.Table, pngs: list[bytes | None]) -> pa.Table:
-    """Return rows of a shard from rows of `frames` (N), rows of `labels` and PNG bytes (N).
+    """Combine rows of `frames` (N), rows of `labels` and PNG bytes (N) into rows of a shard (N).
 
     Labels of other frames are omitted; the labels of a frame keep their order.
     """

@@ -1,8 +1,8 @@
 """One Parquet part of a table: written once and atomically, and read with limits, since parts are untrusted input.
 
-The name of a part states which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. A table in one file is
-the part `all`, whose row groups contain one scene or a few trajectories each. A table above the limits continues in
-`all.0001` and so on.
+The name of a part states which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. If a table is a single
+file, it is the part `all`, and each row group contains one scene or a few trajectories. A table above the limits
+continues in `all.0001` and so on.
 """
 
 import contextlib
@@ -39,9 +39,9 @@ _MAX_TEXT_BYTES = 1000
 _MAX_LIST = 10_000
 _MAX_FOOTER_TEXT_BYTES = 10_000_000
 _FOOTER_END_BYTES = 8
-"""Length of the footer, and the letters PAR1."""
+"""Size of the end of the footer: its length and the letters PAR1."""
 _ROW_GROUPS = 4
-"""Field number of the row groups in FileMetaData of parquet.thrift."""
+"""Field number of `row_groups` in FileMetaData (parquet.thrift)."""
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
 _PARQUET_FILE = re.compile(r"[A-Za-z0-9][^/]*\.parquet", re.DOTALL)
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
@@ -65,7 +65,7 @@ class WrittenFile:
 
 
 def parquet_files(store: Store, folder: str) -> list[str]:
-    """Return the paths of the Parquet files directly in a folder of a store, sorted by name; not hidden ones."""
+    """Return the paths of the Parquet files directly in a folder, sorted by name; hidden files are omitted."""
     if store.folder is not None:
         local = store.folder / folder
         names = [entry.name for entry in os.scandir(local)] if local.is_dir() else []
@@ -82,10 +82,10 @@ class Part:
     ):
         """Open the part at a path of a store.
 
-        Raises UserError if it is no Parquet file, of another table or schema version, or too large.
+        Raises UserError if the file is not Parquet, belongs to another table or schema version, or is too large.
 
         `schema` replaces the table's schema in TABLES, for older versions and for shards. Unknown columns are ignored.
-        Missing columns of `MAY_BE_ABSENT` are read as null.
+        Missing columns are read as null if `MAY_BE_ABSENT` lists them.
         """
         self.store, self.path, self.schema = store, path, schema or TABLES[table]
         self.address, self.stem = store.at(path), stem_of(path)
@@ -93,7 +93,7 @@ class Part:
         self._n_bytes = store.plain_size(path)
         self._checked: set[tuple[int, str]] = set()
         try:
-            # Read a small file at once; of a large file read only the requested columns.
+            # Read a small file whole; read only the requested columns of a large file.
             self._content = store.read(path, most_bytes=_SMALL_BYTES) if self._n_bytes <= _SMALL_BYTES else None
             self._ranges = None
             if self._content is None and not store.is_local:
@@ -102,7 +102,7 @@ class Part:
             texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
             self.file = self._parquet(texts)
             self.found = self.file.metadata.schema.to_arrow_schema()
-            # Asked for once: each access of pyarrow's metadata makes new objects.
+            # Stored, since each access to pyarrow's metadata creates new objects.
             columns = self.file.metadata.schema
             self._paths = [columns.column(index).path for index in range(len(columns))]
             check_footer(self.file.metadata, self.places_of(self.schema.names), self._n_bytes, self.address)
@@ -116,9 +116,9 @@ class Part:
                 raise UserError(self.address, f"perilune.{name}", got, expected + hint)
 
     def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
-        """Open the file; the columns `texts` are read as dictionaries.
+        """Open the file; read the columns `texts` as dictionaries.
 
-        Otherwise a short file could decompress to gigabytes of text before the text's length is checked.
+        Without dictionaries, a short file could decompress to gigabytes of text before its length is checked.
         """
         source = self._source()
         options = {
@@ -133,7 +133,7 @@ class Part:
         return pq.ParquetFile(source, read_dictionary=[name for name in texts if name in names], **options)
 
     def _source(self) -> Any:
-        """Return what pyarrow opens: a local path, the bytes of a small file, or the ranges of an object."""
+        """Return a source for pyarrow: a local path, the bytes of a small file, or an object read by range."""
         if self._content is not None:
             return pa.BufferReader(self._content)
         return self._ranges if self.store.folder is None else self.store.folder / self.path
@@ -149,7 +149,7 @@ class Part:
         return self.file.metadata.num_row_groups
 
     def stated_groups(self) -> Iterator[Fields]:
-        """Yield the RowGroup of each row group as the footer states it. Raises UserError if it is damaged."""
+        """Yield each row group's RowGroup struct from the footer. Raises UserError if the footer is damaged."""
         try:
             with self._bytes_of([], []) as stream:
                 stream.seek(self._n_bytes - _FOOTER_END_BYTES)
@@ -161,7 +161,7 @@ class Part:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
 
     def places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
-        """Places and paths of the columns of the file that belong to fields of these names."""
+        """Return positions and paths of the file's columns that belong to the named fields."""
         wanted = set(names)
         return [(index, path) for index, path in enumerate(self._paths) if path.split(".")[0] in wanted]
 
@@ -170,8 +170,8 @@ class Part:
     ) -> pa.Table:
         """Read the given columns of the given row groups; by default all.
 
-        Raises UserError if they cannot be read, or if ids of scenes, trajectories or frames are not safe file names
-        (unless `any_ids`).
+        Raises UserError if they cannot be read, or if ids of scenes, trajectories or frames are not safe file names.
+        `any_ids` skips the check of ids.
         """
         chosen = list(range(self.n_groups) if groups is None else groups)
         names = list(columns) if columns is not None else self.schema.names
@@ -206,7 +206,7 @@ class Part:
 
     @contextlib.contextmanager
     def _bytes_of(self, groups: list[int], names: list[str]) -> Iterator[BinaryIO]:
-        """Open the file to read columns of row groups; of an object, they are read at once within the block."""
+        """Open the file to read columns of row groups; from an object store, fetch all of them in advance."""
         if self._ranges is None:
             with self.store.open(self.path) if self._content is None else io.BytesIO(self._content) as stream:
                 yield stream
@@ -220,7 +220,7 @@ class Part:
             yield cast(BinaryIO, self._ranges)
 
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
-        """Check that the pages do not exceed the sizes in the footer, which have been checked."""
+        """Check that the pages do not exceed the sizes in the footer, which were checked earlier."""
         metadata = self.file.metadata.row_group(group)
         for index, name in self.places_of(names):
             if (group, name) in self._checked:
@@ -231,7 +231,7 @@ class Part:
                 found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
                 expected = f"at most {column.total_uncompressed_size} and {column.num_values}, as in the footer"
                 raise UserError(self.address, name, found, expected)
-            # With a dictionary, a small file could repeat one image and decompress to any size.
+            # With a dictionary, a small file could repeat one image and decompress to any size: refuse it.
             if name.startswith("image.") and pages.has_dictionary:
                 raise UserError(self.address, name, "a dictionary", "plain bytes for each frame")
             self._checked.add((group, name))
@@ -247,7 +247,7 @@ class Part:
                 raise UserError(self.address, name, repr(mismatch), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
-        """Return the row groups that may contain texts in [low, high), by their statistics."""
+        """Return the row groups whose statistics allow texts in [low, high)."""
         footer = self.file.metadata
         names = [footer.schema.column(i).path for i in range(footer.num_columns)]
         index = names.index(column) if column in names else -1
@@ -265,7 +265,7 @@ class Part:
         return chosen
 
     def groups_where(self, condition: pc.Expression) -> list[int]:
-        """Return the row groups that may contain rows that fulfil a condition, by their statistics."""
+        """Return the row groups whose statistics allow rows that fulfil a condition."""
         try:
             # The footer was checked when the part was opened.
             source, local = self._source(), None
@@ -279,7 +279,7 @@ class Part:
 
 def _first_mismatch(words: pa.Array, pattern: str) -> str | None:
     """Return the first text that does not match a pattern, or None if all match."""
-    if len(words) <= _FEW_WORDS:  # faster for few texts: Arrow compiles the pattern in every call
+    if len(words) <= _FEW_WORDS:  # faster for few texts, since Arrow compiles the pattern in every call
         fitting = re.compile(pattern)
         return next((word for word in words.to_pylist() if word is not None and not fitting.fullmatch(word)), None)
     fits = pc.match_substring_regex(words, pattern)  # in RE2, $ matches only at the end of the text
@@ -297,8 +297,8 @@ def write_part(
 ) -> WrittenFile:
     """Write the part `manifest/<table>/<name>.parquet` of a dataset.
 
-    Raises FileExistsError if it exists, unless `replace`. Raises UserError if the name, which may come from the rows of
-    an untrusted dataset, is not a valid part name.
+    Raises FileExistsError if the file exists, unless `replace` is true. Raises UserError if `name` is not a valid part
+    name; it may come from an untrusted dataset.
     """
     store = open_store(address)
     if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):

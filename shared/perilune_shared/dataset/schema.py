@@ -1,7 +1,7 @@
 """The tables of a dataset: every column with its type, unit and frame of reference (schema version 4).
 
-Real columns of labels are float32: in an image of 1024 pixels it resolves 0.0001 px, less than any rim can be located.
-Poses, craters and times stay float64, since ellipses are computed from them to 0.000001 px.
+Real columns of labels are float32. In an image of 1024 pixels float32 resolves 0.0001 px; no rim can be located that
+precisely. Poses, craters and times are float64, since ellipses are computed from them to 0.000001 px.
 
 Every Parquet file contains these units and meanings as metadata, so a single file documents itself.
 """
@@ -15,8 +15,8 @@ _TEXT, _REAL, _SHORT_REAL, _INTEGER = pa.string(), pa.float64(), pa.float32(), p
 def complete(table: str, rows: pa.Table) -> pa.Table:
     """Return `rows` with exactly the table's columns, in order and with their types.
 
-    Missing columns of `MAY_BE_ABSENT` become null. Raises pyarrow's error if another column is missing or a column
-    cannot be cast to its type.
+    Missing columns become null if `MAY_BE_ABSENT` lists them. Raises pyarrow's error if another column is missing or a
+    column cannot be cast to its type.
     """
     for name in MAY_BE_ABSENT.get(table, ()):
         if name not in rows.column_names:
@@ -25,7 +25,7 @@ def complete(table: str, rows: pa.Table) -> pa.Table:
 
 
 def stored(table: str, rows: pa.Table) -> pa.Table:
-    """Return `rows` as a file has them: `complete`, without columns of `ONLY_IF_USED` that are null in all rows."""
+    """Return `rows` as written to files: `complete`, without columns of `ONLY_IF_USED` in which all rows are null."""
     rows = complete(table, rows)
     unused = [name for name in ONLY_IF_USED.get(table, ()) if rows[name].null_count == len(rows)]
     return rows.drop_columns(unused) if unused else rows
@@ -48,7 +48,7 @@ _TRAJECTORY = _column("trajectory_id", _TEXT, "", "the descent within its scene"
 _FRAME = _column("frame_id", _TEXT, "", "scene_id/trajectory_id/frame_index with 6 digits")
 _SPLIT = "train, val or test"
 ANGULAR_VELOCITY = ("wx_radps", "wy_radps", "wz_radps")
-"""Columns of the camera's angular velocity in `frames`: lists that may be null cannot be read from Parquet."""
+"""Columns of the camera's angular velocity in `frames`; not one list, since Parquet readers fail on nullable lists."""
 
 TABLES: dict[str, pa.Schema] = {
     "scenes": _table(
@@ -242,7 +242,7 @@ TABLES: dict[str, pa.Schema] = {
     ),
 }
 OPTIONAL_TABLES = ("inertial", "ranges")
-"""Tables that a dataset has only if they have rows: they were added without a new schema version."""
+"""Tables that are written only if they have rows; they were added without a new schema version."""
 _HAZARD = ("hazard_path", "hazard_sha256", "hazard_bytes")
 _LIDAR = ("lidar_path", "lidar_sha256", "lidar_bytes")
 _ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius", *ANGULAR_VELOCITY, *_LIDAR)

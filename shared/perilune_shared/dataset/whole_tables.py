@@ -14,9 +14,9 @@ _FEWEST_ROWS_PER_GROUP, _MOST_GROUPS = 1000, 200
 
 
 class WholeTables:
-    """Writer of all tables of a dataset. Rows are in memory until a part is full.
+    """Writer of all tables of a dataset. Rows stay in memory until a part is full.
 
-    With `replace`, parts that exist are overwritten; otherwise they raise FileExistsError.
+    With `replace`, existing parts are overwritten; otherwise they cause a FileExistsError.
     """
 
     def __init__(self, store: Store, *, most_rows: int = MOST_ROWS_WRITTEN, replace: bool = False):

@@ -1,4 +1,4 @@
-"""Combine a manifest without frames and the frames rendered from it into a dataset."""
+"""Combine a manifest without frames with the frames rendered from it."""
 
 import pyarrow as pa
 
@@ -21,12 +21,12 @@ def attach(
     *,
     link: bool = False,
 ) -> None:
-    """Write a dataset from a manifest without frames and the frames under `frames_root`, at the manifest's paths.
+    """Write a dataset from a manifest without frames and the frames in `frames_root`, whose paths the manifest states.
 
     Frames are copied, or hard-linked with `link`. Every PNG must match the hash in the manifest. With `rehash` the
-    hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. EXRs
-    of a scene are included if all of them exist, and so are its flash lidar images and its hazard map. Raises UserError
-    if a frame is missing or different, and if the manifest is a plan, which has no labels.
+    hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. The
+    EXRs, the flash lidar images and the hazard map of a scene are each included if all their files exist. Raises
+    UserError if a frame is missing or does not match, and if the manifest is a plan, which has no labels.
     """
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":
@@ -89,7 +89,7 @@ def _checked_scene(source: Dataset, scenes: pa.Table, rehash: bool) -> pa.Table:
 
 
 def _file(source: Dataset, row: dict, kind: str, rehash: bool) -> dict[str, str | int | None]:
-    """Return path, bytes and sha256 of the file of a row; None if it does not exist. Raises UserError on another."""
+    """Return path, bytes and sha256 of a row's file; None for a missing file. Raises UserError on a mismatch."""
     path = row[f"{kind}_path"]
     size = source.store.size(path) if path is not None else None
     if size is None:

@@ -11,7 +11,7 @@ from perilune_shared.dataset.schema import KEYS, TABLES
 from perilune_shared.errors import one_line, shortened
 
 _COPY_NUMBER = "copy"
-"""Added key column: number of the row among rows with equal keys."""
+"""Name of the added key column that numbers rows with equal keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class Difference:
     """A column in which rows differ, or rows that exist in only one dataset."""
 
     place: str
-    """Table, or dataset.json."""
+    """Name of the table, or dataset.json."""
     column: str
     """Column or field; empty if whole rows are missing."""
     rows: int
@@ -33,7 +33,7 @@ class Difference:
 
 
 def differences(first: Dataset, second: Dataset) -> list[Difference]:
-    """Return all differences; the list is empty if the content is equal, however parts and frames are stored."""
+    """Return all differences in content; how parts and frames are stored does not matter."""
     result = list(_info(_plain(first), _plain(second), ""))
     first_ids, second_ids = set(first.scene_ids()), set(second.scene_ids())
     for here, other, only in ((first_ids, second_ids, True), (second_ids, first_ids, False)):
@@ -72,7 +72,7 @@ def _rows(table: str, old: pd.DataFrame, new: pd.DataFrame) -> Iterator[Differen
     """Yield the differences in one table of one scene."""
     keys = KEYS[table]
     if any(frame.duplicated(keys).any() for frame in (old, new)):
-        # Number rows with equal keys, in an order that does not depend on how they are stored.
+        # Number rows with equal keys in an order that does not depend on their order in the file.
         old, new = (_numbered(frame, keys) for frame in (old, new))
         keys = [*keys, _COPY_NUMBER]
     old, new = (frame.set_index(keys).sort_index() for frame in (old, new))

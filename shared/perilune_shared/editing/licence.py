@@ -23,7 +23,7 @@ def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
 
     Equal licences appear once; alternatives are in parentheses. A licence that SPDX does not list needs a name of the
     form LicenseRef-<name>.
-    Raises UserError about the place on an invalid SPDX expression or an unknown licence.
+    Raises UserError, which names the place, on an invalid SPDX expression or an unknown licence.
     """
     spdx = _spdx()
     terms: dict[str, str] = {}

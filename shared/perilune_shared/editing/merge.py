@@ -32,11 +32,11 @@ def merge(
 ) -> None:
     """Write the frames of all sources, each once, as one dataset.
 
-    Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. Trajectories
-    are treated in the same way. A frame in several sources is taken from the first, with its split and labels, and so
-    is the hazard map of a scene. Counts, splits and the split unit are recomputed from the rows. Raises UserError if
-    kinds, cameras or EXR cameras differ, a licence is not an SPDX expression, or two copies of a frame were rendered
-    differently.
+    Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. Equal
+    trajectories are merged, and different ones renamed, in the same way. A frame that occurs in several sources is
+    taken from the first one, with split and labels; so is the hazard map of a scene. Counts, splits and the split unit
+    are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, a licence is not an SPDX
+    expression, or two copies of a frame were rendered differently.
     """
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
@@ -99,7 +99,7 @@ def _has_exrs(source: Dataset) -> bool:
 
 
 def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
-    """Group equal scenes: by scene_id of the result, the index of each source that has it and the scene_id there.
+    """Group equal scenes: for each scene_id of the result, list (index of a source, scene_id in that source).
 
     Crater ids are not compared for plans, which have no labels.
     """
@@ -108,7 +108,7 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
     for i, source in enumerate(sources):
         for row in sorted(source.table("scenes").to_pylist(), key=lambda row: row["scene_id"]):
             own_id = row.pop("scene_id")
-            # A packed copy of a scene has no files.
+            # Ignore files, since a packed copy of a scene has none.
             row = {name: value for name, value in row.items() if not name.startswith(SCENE_FILE_KINDS)}
             # Labels refer to craters by id, so the ids must be equal too.
             craters = (
@@ -123,7 +123,7 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
 
 
 def free_name(name: str, taken: Container[str]) -> str:
-    """Return a free name: `name` itself, or `name` with -2, -3, ... appended."""
+    """Return a name that is not taken: `name`, or `name` with -2, -3, ... appended."""
     tried, number = name, 1
     while tried in taken:
         number += 1
@@ -134,7 +134,7 @@ def free_name(name: str, taken: Container[str]) -> str:
 def _join(
     scene_id: str, members: Sequence[tuple[Dataset, str]]
 ) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
-    """Return the tables of a merged scene and, for each member, the frames taken from it and their new frame_ids."""
+    """Return the tables of a merged scene and, for each source, the frames taken from it and their new frame_ids."""
     joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels", *OPTIONAL_TABLES)}
     used_frames: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
     known_trajectories: list[tuple[dict, str]] = []
@@ -208,6 +208,6 @@ def _renamed(frames: pa.Table, scene_id: str, new_ids: dict[str, str], names: di
 
 
 def _moved(rows: pa.Table, scene_id: str, new_ids: dict[str, str]) -> pa.Table:
-    """Return rows with the scene and the trajectories of the merged dataset."""
+    """Return rows with the ids that scene and trajectories have in the merged dataset."""
     rows = with_column(rows, "scene_id", [scene_id] * len(rows))
     return with_column(rows, "trajectory_id", [new_ids[name] for name in rows["trajectory_id"].to_pylist()])

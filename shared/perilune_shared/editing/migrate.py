@@ -48,8 +48,8 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2, "3": _TABLE
 def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Convert a dataset of an older schema version to the current one; frames are copied, or hard-linked with `link`.
 
-    Versions 1 and 2 did not record the contrast of labels; it becomes null. Raises UserError if the dataset already has
-    the current version, is damaged, is not complete or has packed frames.
+    Versions 1 and 2 did not record the contrast of labels, so it becomes null. Raises UserError if the dataset has the
+    current version already, is damaged or incomplete, or has packed frames.
     """
     store = open_store(address)
     content, path = read_object(store), store.at(INFO_NAME)
@@ -78,7 +78,7 @@ def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *,
 
 
 def _info(content: dict[str, Any], path: str) -> DatasetInfo:
-    """Convert dataset.json. In versions 1 and 2 settings, seed and versions were not grouped in recipes."""
+    """Convert dataset.json. Versions 1 and 2 had settings, seed and versions without recipes."""
     version = content["schema_version"]
     line = f"migrated from schema version {version}"
     if version == "3":
@@ -118,7 +118,7 @@ class _OldDataset(Dataset):
         self.version = version
 
     def rows(self, table: str, scene_id: str | None = None) -> pa.Table:
-        """Read a table, of one scene or all, with the columns of the current version."""
+        """Read a table for one scene or all, with the columns of the current version."""
         schema = OLD_TABLES[self.version][table]
         pieces = [Part(self.store, part, table, schema, self.version).read() for part in self.parts(table, scene_id)]
         rows = pa.concat_tables(pieces) if pieces else schema.empty_table()
@@ -149,7 +149,7 @@ class _OldDataset(Dataset):
         fill: dict[tuple[str, str], Callable[[], list]] = {
             ("labels", "scene_id"): lambda: [scene_id] * n,
             ("labels", "split"): lambda: self._splits(rows["frame_id"], scene_id),
-            # Before version 2 all craters were primary: there were no clusters and no catalogues.
+            # Before version 2 there were no clusters and no catalogues, so all craters were primary.
             ("craters", "origin"): lambda: ["primary"] * n,
             ("labels", "contrast"): lambda: [None] * n,
             ("scenes", "recipe"): lambda: [self.info.recipe().key] * n,

@@ -19,10 +19,10 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 
 MOST_FRAMES_WRITTEN = 100_000
-"""Maximum number of frames of a shard; it gives at most 1,563 row groups, and readers accept 10,000."""
+"""Maximum number of frames of a shard: at most 1,563 row groups, while readers accept 10,000."""
 _MAX_SHARD_MB = 2000
 _FRAMES_PER_GROUP, _BYTES_PER_GROUP = 64, 2**23
-"""Maximum of a row group, the unit that a stream reads and shuffles."""
+"""Maximum frames and bytes of a row group, the unit in which a stream is read and shuffled."""
 _NOT_PACKED = [f"{kind}_{name}" for kind in ("exr", "lidar") for name in ("path", "sha256", "bytes")]
 _NOT_PACKED_OF_SCENES = [f"{kind}_{name}" for kind in SCENE_FILE_KINDS for name in ("path", "sha256", "bytes")]
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
@@ -39,10 +39,10 @@ def pack(
 ) -> None:
     """Write a packed dataset: frames in shards of about `shard_mb` megabytes, readable by Hugging Face `datasets`.
 
-    Shards contain the frames of one split, in the order scene, trajectory, frame index. A table of more than
+    Each shard contains frames of one split, ordered by scene, trajectory and frame index. A table of more than
     `most_rows` rows becomes several parts, and a shard contains at most `most_frames` frames, to stay within the limits
-    of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs, images
-    of the flash lidar and hazard maps are not packed: their columns become null.
+    of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs, flash
+    lidar images and hazard maps are not packed; their columns become null.
     """
     check_source(source, out, progress)
     if not 0 < shard_mb <= _MAX_SHARD_MB:
@@ -67,7 +67,7 @@ def pack(
 
 
 def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: list[list[int]]) -> Iterator[int]:
-    """Write the shards of one split, with row groups of given sizes; yield the size of each when it is written."""
+    """Write the shards of one split with row groups of the given sizes; yield the size of each row group written."""
     groups = _groups(source, split, [size for shard in shards for size in shard])
     for number, shard in enumerate(shards):
         text = [field.name for field in SHARDS if pa.types.is_string(field.type)]
@@ -80,7 +80,7 @@ def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: li
 
 
 def _sizes(source: Dataset, split: str, shard_bytes: float, most_frames: int) -> list[list[int]]:
-    """Return the number of frames of each row group of each shard of a split."""
+    """Return, for each shard of a split, the number of frames of each row group."""
     frames = source.table("frames", ["scene_id", "trajectory_id", "frame_index", "png_bytes"], split=split)
     counts = source.info.counts
     label_bytes = sum(field.type.bit_width // 8 for field in LABEL) * counts.labels / max(counts.frames, 1)
@@ -101,7 +101,7 @@ def _sizes(source: Dataset, split: str, shard_bytes: float, most_frames: int) ->
 
 
 def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Table]:
-    """Yield the row groups of a split, of `sizes` frames each. The tables of a few trajectories are in memory."""
+    """Yield the row groups of a split, of `sizes` frames each. Holds only a few trajectories in memory."""
     trajectories = _trajectories(source, split)
     frames, labels = TABLES["frames"].empty_table(), TABLES["labels"].empty_table()
     for size in sizes:
@@ -115,7 +115,7 @@ def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Ta
 
 
 def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield the frames, in order and with their PNGs only, and the labels of each trajectory of a split."""
+    """Yield frames and labels of each trajectory of a split; frames are in order and refer to no files but PNGs."""
     columns = ["scene_id", "trajectory_id", "split"]
     for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
         if row["split"] in (split, None):
@@ -128,7 +128,7 @@ def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Ta
 def unpack(source: Dataset, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Write a dataset with frames as files.
 
-    Frames that already are files are copied, or hard-linked with `link`.
+    Frames that are files already are copied, or hard-linked with `link`.
     """
     check_source(source, out, progress)
     info: DatasetInfo = source.info.changed("unpacked")

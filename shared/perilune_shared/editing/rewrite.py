@@ -1,4 +1,4 @@
-"""Rewrite a dataset as a new one; used by all tools that change or select rows."""
+"""Write a changed copy of a dataset; used by all tools that change or select rows."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,13 +28,13 @@ class Rewriting:
     change: Callable[[SceneTables], SceneTables]
     """Returns the new tables of a scene from the old ones."""
     images: ImageMode
-    """What becomes of the images."""
+    """How the frames are written: copied, hard-linked, omitted or planned."""
     scene_ids: Sequence[str] | None = None
     """Scenes to write; None for all."""
 
 
 def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progress = NO_PROGRESS) -> None:
-    """Write the scenes of `source` into `out`, changed; scenes and labels without frames are omitted.
+    """Change the scenes of `source` and write them into `out`; scenes and labels without frames are omitted.
 
     The caller must have checked the source (`check_source`).
     """
@@ -60,8 +60,8 @@ def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progr
 def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
-    A dataset is refused if it is not complete, if its files do not match its index (a new index would hide the
-    damage), if its keys are broken, or if `out` is inside its folder.
+    A dataset is refused if it is incomplete, if the files do not match the index (a new index would hide the damage),
+    if keys are broken, or if `out` is inside the dataset.
     """
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
@@ -72,7 +72,7 @@ def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS
 
 
 def _within(store: Store, other: Store) -> bool:
-    """Whether a store is another one, or below it."""
+    """Whether a store is the other store or a folder inside it."""
     if store.folder is not None and other.folder is not None:
         return store.folder.resolve().is_relative_to(other.folder.resolve())
     return store == other or store.address.startswith(f"{other.address}/")
@@ -96,5 +96,5 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
 
 
 def without_derived_rows(tables: SceneTables) -> SceneTables:
-    """Return a scene without craters, boulders, labels and measurements: its seed and poses reproduce them."""
+    """Return a scene without craters, boulders, labels and measurements; seed and poses reproduce them."""
     return tables | {name: tables[name].slice(0, 0) for name in _DERIVED_TABLES}

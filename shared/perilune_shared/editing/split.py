@@ -22,7 +22,7 @@ class Split:
     """How a dataset is split."""
 
     by: SplitUnit = "scene"
-    """Unit that is assigned as a whole: scene, trajectory or frame."""
+    """Unit that is never divided between splits: scene, trajectory or frame."""
     val_share: float = 0.1
     """Share of the units in the validation split."""
     test_share: float = 0.1
@@ -41,11 +41,11 @@ def split_dataset(
     """Write a dataset whose scenes, trajectories or frames are randomly assigned to train, val and test.
 
     By default scenes are assigned, with shares of 0.1. Units are identified by content, not by name
-    (`terrains_and_flights`). Scenes with the same terrain are one unit, even if their names or Suns differ;
-    so are all scenes on one elevation model. Trajectories of one flight are one unit, also if the flight was rendered
-    or developed again. Frames with one pose are one unit. `frame` with shares of 0.1 is the paper's protocol: all three
-    splits contain the same terrain, so test metrics are optimistic; `split_by` in dataset.json records it. Each split
-    with a share above 0 gets at least one unit. Raises UserError if there are too few units.
+    (`terrains_and_flights`). Scenes with the same terrain are one unit, even if their names or Sun directions differ;
+    so are all scenes on one elevation model. Trajectories of one flight are one unit, even if the flight was rendered
+    or developed several times. Frames with equal poses are one unit. `frame` with shares of 0.1 is the paper's
+    protocol: all three splits contain the same terrain, so test metrics are optimistic; `split_by` in dataset.json
+    records it. Each split with a share above 0 gets at least one unit. Raises UserError if there are too few units.
     """
     split = split or Split()
     by, val_share, test_share, seed = split.by, split.val_share, split.test_share, split.seed
@@ -73,11 +73,12 @@ def split_dataset(
 
 
 def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
-    """Return the table of all frames, sorted by frame_id, with their `terrain`, `flight` and `pose`.
+    """Return a table of all frames, sorted by frame_id, with the columns `terrain`, `flight` and `pose`.
 
-    Terrain is the key from `terrain_of`; pose numbers each position and rotation over a terrain. Trajectories over one
-    terrain are the same flight if they have the same random seed or a common pose. So a flight that was developed again
-    or rendered with another Sun is the same flight. A split by one of these units puts each unit in one split.
+    `terrain` is the key from `terrain_of`. `pose` numbers the distinct pairs of position and rotation over a terrain.
+    Trajectories over one terrain are one flight if they have equal random seeds or a common pose, for example if a
+    flight was developed again or rendered with another Sun. A split by one of these columns puts equal values in one
+    split.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
     rows = dataset.table("frames", [*columns, "camera", "frame_index"]).sort_by("frame_id")
@@ -94,7 +95,7 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     # Adding 0.0 turns negative zero into zero.
     poses = pd.DataFrame(np.hstack(numbers) + 0.0).assign(terrain=frames["terrain"].to_numpy())
     frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
-    if dataset.info.cameras is not None:  # the poses of all cameras of one instant are one unit
+    if dataset.info.cameras is not None:  # the poses of all cameras at one instant are one unit
         rig = rows.select(["scene_id", "trajectory_id", "camera", "frame_index"]).to_pylist()
         names = [trajectory_of_body(str(row["camera"]), row["trajectory_id"]) for row in rig]
         instant = frames.assign(body=names, index=rows["frame_index"].to_numpy()).groupby(["scene_id", "body", "index"])
@@ -106,9 +107,10 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
 
 
 def _connected_groups(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Return the group of each row (N,). Rows with the same unit, or an equal value of any key, are in one group.
+    """Return the group number of each row (N,): rows with the same unit or an equal value of any key share a group.
 
-    So are rows that are connected through other rows. `unit` (N,) has numbers from 0; `keys` are arrays (N,).
+    Rows that are connected only through other rows share a group too. `unit` (N,) has numbers from 0; `keys` are arrays
+    (N,).
     """
     root = np.arange(unit.max(initial=-1) + 1)
 

@@ -1,4 +1,4 @@
-"""Take part of a dataset: by conditions on columns, by number of frames, or by size."""
+"""Select part of a dataset by conditions on columns, by number of frames or by size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ from perilune_shared.storage.store import Address
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """How much of a dataset is taken."""
+    """Maximum size of a subset."""
 
     n_frames: int | None = None
-    """Largest number of frames; None for any."""
+    """Maximum number of frames; None sets no limit."""
     megabytes: float | None = None
-    """Largest size of the PNGs, 10^6 bytes; None for any."""
+    """Maximum total size of the PNGs, 10^6 bytes; None sets no limit."""
 
 
 def subset(
@@ -36,12 +36,12 @@ def subset(
     images: ImageMode = "copy",
     progress: Progress = NO_PROGRESS,
 ) -> None:
-    """Write the frames and labels that fulfil all conditions, up to a number of frames or a size of the PNGs.
+    """Write the frames and labels that fulfil all conditions, up to a limit.
 
-    A condition on columns of frames, trajectories and scenes selects frames. One that uses labels or craters selects
-    labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. With a
-    `limit`, trajectories are taken from each scene in turn until the limit is reached,
-    so that the subset has many terrains; the last trajectory is truncated. Raises UserError if no frame is left.
+    A condition on columns of frames, trajectories and scenes selects frames. A condition that uses labels or craters
+    selects labels and keeps all frames. Scenes keep all craters and boulders, since these identify the terrain. With a
+    `limit`, trajectories are taken from each scene in turn until the limit is reached, so that the subset has many
+    terrains; the last trajectory is truncated. Raises UserError if no frame is left.
     """
     conditions = [Condition(text) for text in where]
     on_frames = [condition for condition in conditions if not condition.on_labels]
@@ -71,12 +71,12 @@ def subset(
 
 
 def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
-    """Return the scenes that may contain a selected frame, so that the tables of the others are not read."""
+    """Return the scenes that may contain a selected frame, so that other scenes need not be read."""
     scene_ids = set(source.scene_ids())
     for condition in on_frames:
         names = condition.columns_of_only("frames")
         if names is not None:
-            # Not `where` of Dataset.table: it skips row groups by statistics of columns that nobody has checked.
+            # Do not pass `where` to Dataset.table: it would skip row groups by statistics that were not checked.
             rows = source.table("frames", list(dict.fromkeys(["scene_id", *names])))
             chosen = condition.holds(rows.rename_columns([f"frames.{name}" for name in rows.column_names]))
             scene_ids &= set(rows["scene_id"].filter(pa.array(chosen)).unique().to_pylist())
@@ -84,7 +84,7 @@ def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
 
 
 def _first_frames(source: Dataset, on_frames: Sequence[Condition], limit: Limit) -> pa.Array:
-    """Return the frame_ids of trajectories, taken from each scene in turn, up to the limit."""
+    """Return frame_ids up to the limit, taking trajectories from each scene in turn."""
     n_frames, megabytes = limit.n_frames, limit.megabytes
     if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
         raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
@@ -108,7 +108,7 @@ def _first_frames(source: Dataset, on_frames: Sequence[Condition], limit: Limit)
 
 
 def _all_hold(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
-    """Return whether all conditions hold (N,) for each row of a scene's frames or labels."""
+    """Return for each row of a scene's frames or labels whether it fulfils all conditions (N,)."""
     mask = np.ones(len(rows), bool)
     if not conditions or not len(rows):
         return mask

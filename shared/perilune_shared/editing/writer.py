@@ -49,8 +49,8 @@ class DatasetWriter:
         """Append one scene that has frames.
 
         Recomputes the number of frames and the split of each trajectory, and sets the paths at which `add_images`
-        stores the frames. Raises UserError unless the table scenes has exactly one row and each frame has its
-        trajectory.
+        stores the frames. Raises UserError unless the table scenes has exactly one row and the trajectory of each frame
+        exists.
         """
         check_scene("new dataset", tables)
         frames = with_new_paths(tables["frames"])
@@ -77,7 +77,7 @@ class DatasetWriter:
             self._tables.add(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
 
     def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
-        """Copy frames stored as files from another dataset: `frames` are its rows, `names` maps old to new frame_ids.
+        """Copy frames that are files from another dataset: `frames` are its rows, `names` maps old to new frame_ids.
 
         With `link`, make hard links where the file system allows it.
         """
@@ -94,7 +94,7 @@ class DatasetWriter:
                     self._copy(source, row[f"{kind}_path"], frame_path(names[frame_id], kind), link=link)
 
     def add_scene_files(self, source: Dataset, scenes: pa.Table, scene_id: str, *, link: bool) -> None:
-        """Copy the files of a scene, such as its hazard map: `scenes` is its row in `source`, `scene_id` its new id."""
+        """Copy a scene's files, such as the hazard map: `scenes` is its row in `source`, `scene_id` the new id."""
         for kind in SCENE_FILE_KINDS:
             path = scenes[f"{kind}_path"][0].as_py()
             if path is not None:
@@ -107,7 +107,7 @@ class DatasetWriter:
             self.store.write(to, source.store.read(path, most_bytes=LARGEST_FRAME_BYTES), durable=False)
 
     def add_file(self, path: str, content: bytes) -> None:
-        """Write another file of the dataset."""
+        """Write a file that is neither a table nor an image."""
         self.store.write(path, content, durable=False)
         self._index.append(index_rows([WrittenFile.of(path, content)]))
 
@@ -150,7 +150,7 @@ def new_dataset(
 
 
 def check_scene(where: object, tables: SceneTables) -> None:
-    """Raise UserError about `where` unless the table scenes has exactly one row and each frame has its trajectory."""
+    """Raise UserError about `where` unless there is exactly one scene and the trajectory of each frame exists."""
     scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
@@ -190,7 +190,7 @@ def _with_new_scene_paths(scenes: pa.Table) -> pa.Table:
 
 
 def of_trajectories(rows: pa.Table, trajectories: pa.Table) -> pa.Table:
-    """Return the rows of one scene that belong to its given trajectories."""
+    """Return the rows of one scene that belong to the given trajectories of that scene."""
     return rows.filter(pc.is_in(rows["trajectory_id"], trajectories["trajectory_id"].combine_chunks()))
 
 

@@ -26,16 +26,16 @@ _LARGEST_BYTES = 2**26
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A file to be written, directly in a dataset or elsewhere."""
+    """A file to write, either directly in a dataset or elsewhere."""
 
     store: Store
-    """The folder or prefix that directly contains it; the dataset's own store if it is in the dataset."""
+    """Folder or prefix that directly contains the file; the dataset's store if the file is in the dataset."""
     name: str
     """File name."""
 
     @classmethod
     def of(cls, dataset: Dataset, out: str | os.PathLike[str] | None, name: str) -> "Target":
-        """The file at the path or address `out`; without it, the file `name` in the dataset."""
+        """Return the file at the path or address `out`; if `out` is None, the file `name` in the dataset."""
         if out is None:
             return cls(dataset.store, name)
         prefix, _, last = os.fspath(out).rpartition("/")
@@ -44,15 +44,15 @@ class Target:
 
     @property
     def address(self) -> str:
-        """Path or address."""
+        """Path or address of the file."""
         return self.store.at(self.name) if self.store.folder is None else str(self.store.folder / self.name)
 
     def sibling(self, name: str) -> "Target":
-        """Another file in the same place."""
+        """Return another file in the same folder."""
         return Target(self.store, name)
 
     def content(self) -> bytes | None:
-        """Its present content; None if there is no file. Raises UserError if it is too large or not a regular file."""
+        """Return the current content; None if there is no file. Raises UserError on a large or non-regular file."""
         if self.store.folder is not None and not (self.store.folder / self.name).exists():
             return None
         if self.store.folder is None and not self.store.exists(self.name):
@@ -60,7 +60,7 @@ class Target:
         return self.store.read(self.name, most_bytes=_LARGEST_BYTES)
 
     def write(self, content: bytes) -> None:
-        """Write it, or replace it."""
+        """Write the file, or replace it."""
         if self.store.folder is None or files.is_plain(self.name):
             self.store.replace(self.name, content)
         else:  # outside of datasets, names may have blanks and other letters
@@ -68,11 +68,11 @@ class Target:
 
 
 def check_index(dataset: Dataset, targets: Iterable[Target], progress: Progress = NO_PROGRESS) -> DatasetInfo | None:
-    """Check that files may be written; return dataset.json, or None if index and dataset.json stay the same.
+    """Check that files may be written; return dataset.json, or None if index and dataset.json need no change.
 
-    The index changes if one of the files is directly in a complete dataset; an incomplete dataset has none yet. Raises
-    UserError if another file differs from the index, since a new index would hide it, or if a name is not allowed in a
-    dataset (perilune_shared.validation.files).
+    The index changes if one of the files is directly in a complete dataset; an incomplete dataset has no index yet.
+    Raises UserError if another file differs from the index, since a new index would hide the difference, or if a name
+    is not allowed in a dataset (perilune_shared.validation.files).
     """
     for target in targets:
         if _is_below(target.store, dataset.store):
@@ -93,10 +93,10 @@ def add_files(
 ) -> None:
     """Write files atomically, and the index unless `info`, the result of `check_index`, is None.
 
-    With the index, `licence` becomes that of the dataset.
+    If the index is written, `licence` replaces the licence of the dataset.
 
     If the process is killed, `validate` finds the old dataset, the new one, or files that are not in the index; the
-    next call adds or removes these. Two calls at the same time exclude each other in a local folder only. Raises
+    next call adds or removes such files. Only in a local folder do simultaneous calls exclude each other. Raises
     UserError if the dataset changed since it was checked.
     """
     store = dataset.store
@@ -110,7 +110,7 @@ def add_files(
         own_names = _own_names(dataset, contents)
         rows = read_index(store, info)
         others = rows.filter(pc.invert(pc.is_in(rows["path"], pa.array(sorted(own_names), pa.string()))))
-        # No file that an index names is overwritten: take the old ones out first.
+        # Never overwrite a file that the index lists: remove the old files from the index first.
         info = info if len(others) == len(rows) else seal(store, info, others)
         for target, content in contents.items():
             target.write(content)
@@ -129,7 +129,7 @@ def _own_names(dataset: Dataset, targets: Iterable[Target]) -> set[str]:
 
 
 def _is_same(store: Store, other: Store) -> bool:
-    """Whether two stores are the same place."""
+    """Whether two stores are the same folder or prefix."""
     if store.folder is None or other.folder is None:
         return store == other
     return store.folder.resolve() == other.folder.resolve()

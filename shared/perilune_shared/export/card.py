@@ -45,9 +45,10 @@ def write_card(
 ) -> tuple[str, str]:
     """Write the page and the picture beside it, and update the dataset's index; return their paths or addresses.
 
-    `out` is by default README.md in the dataset. `licence`, an SPDX expression, replaces the dataset's: on the page,
-    and in dataset.json if the page is in the dataset. Raises UserError if a file that is not a card would be
-    overwritten, the dataset has no frames or differs from its index, or the licence is not an SPDX expression.
+    `out` is by default README.md in the dataset. `licence`, an SPDX expression, replaces the licence of the dataset on
+    the page, and also in dataset.json if the page is in the dataset. Raises UserError if a file that is not a card
+    would be overwritten, if the dataset has no frames or differs from its index, or if the licence is not an SPDX
+    expression.
     """
     if licence is not None:
         licence = joined_licence([("--licence", licence)])
@@ -64,9 +65,9 @@ def write_card(
                 raise UserError(target.address, "--out", "a file that is not a card", expected)
     info = check_index(dataset, (page, picture), progress)
     gathered = gather(dataset, progress)
-    # Build the page first: this checks the keys and is much faster than drawing.
+    # Create the page before the picture: it checks the keys and takes much less time.
     text = card_of(dataset, gathered, picture.name).encode()
-    # The page first: it marks the picture as one that may be overwritten.
+    # Write the page first: its mark shows a later run that it may overwrite the picture.
     add_files(dataset, {page: text, picture: draw(dataset, gathered)}, info, licence)
     return page.address, picture.address
 
@@ -109,7 +110,7 @@ def _history(info: DatasetInfo) -> str:
 
 
 def _purpose(info: DatasetInfo) -> str:
-    """Describe the dataset's purpose and its numbers of trajectories and terrains."""
+    """Describe the purpose of the dataset, and state the numbers of trajectories and terrains."""
     n_scenes, n_trajectories = info.counts.scenes, info.counts.trajectories
     terrains = f"{n_scenes:,} terrains" if n_scenes != 1 else "one terrain"
     trajectories = f"{n_trajectories:,} trajectories" if n_trajectories != 1 else "one trajectory"
@@ -194,7 +195,7 @@ def _camera(camera: CameraRecord) -> str:
 
 
 def _remake(key: str, recipe: Recipe) -> str:
-    """Return the commands that reproduce a recipe's data; names are quoted for the shell."""
+    """Return the commands that reproduce the data of a recipe; names are quoted for the shell."""
     settings = f"json.load(open('{INFO_NAME}'))['recipes']['{key}']['config']"
     unpack = f"python -c \"import json; json.dump({{'dataset': {settings}}}, open('recipe.yaml', 'w'))\""
     if recipe.developed_from is None:

@@ -1,8 +1,8 @@
 """The YAML head of a dataset card, in Hugging Face's format.
 
 Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration. huggingface_hub's
-`DatasetCardData` would write the same mapping, but it would add 13 packages (30 MB, with an HTTP client) to every
-installation; the tests read the head with it.
+`DatasetCardData` would write the same mapping, but would add 13 packages (30 MB, including an HTTP client) to every
+installation. The tests read the head with it.
 """
 
 from typing import Any
@@ -43,7 +43,7 @@ def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
 
 
 def _licence(licence: str) -> dict[str, str]:
-    """Return the entries of a licence: by the hub's own name if it has one."""
+    """Return the entries for a licence, under the hub's name for it if there is one."""
     if licence == NOT_STATED:
         return {"license": "unknown"}
     if licence in _HUB_LICENCES:
@@ -52,11 +52,13 @@ def _licence(licence: str) -> dict[str, str]:
 
 
 def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
-    """Return the configurations: of packed frames, the default with the dataset's splits, and of tables that have rows.
+    """Return the configurations of the dataset: one for packed frames, if there are any, and one per table with rows.
+
+    If there are packed frames, their configuration is the default and has the splits of the dataset.
 
     Without configurations `datasets` treats every image in the folder as training data. A part of a table may contain
-    rows of all splits, so each table has the single split `mixed`; see the column `split` of frames. The Hugging Face
-    export writes frames that are not packed in separate files per split.
+    rows of all splits, so each table has the single split `mixed`; the column `split` of frames states the split of
+    each frame. The Hugging Face export writes frames that are not packed to separate files for each split.
     """
     counts = dataset.info.counts.model_dump()
     names = ["frames", *(name for name in TABLES if name != "frames")]

@@ -53,7 +53,7 @@ class Gathered:
     measures: dict[str, dict[str, NDArray[np.float32]]]
     """Values by measure and split; see `TITLES` for names and units."""
     samples: list[tuple[dict, pd.DataFrame]] = field(default_factory=list)
-    """Rows of the frames to show, each with its labels; column `visible`: in the selection of that name or not."""
+    """Rows of the frames to show, each with labels whose column `visible` states whether they are in that selection."""
 
 
 def gather(dataset: Dataset, progress: Progress) -> Gathered:
@@ -64,7 +64,7 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
     task = progress.add_task("reading", total=len(ids), unit="scenes")
     collected: dict[str, dict[str, list[np.ndarray]]] = {}
     samples: list[tuple[dict, pd.DataFrame]] = []
-    # Spread the frames over the scenes and over the length of trajectories.
+    # Spread the frames over the scenes and along the trajectories.
     places = np.linspace(0, len(ids) - 1e-9, _N_FRAMES, endpoint=False).astype(int)
     shown_of_scene = {ids[place]: np.flatnonzero(places == place) for place in places}
     for scene in scenes_of(dataset, choose=by_selection(SELECTIONS["visible"])):
@@ -91,7 +91,7 @@ def draw(dataset: Dataset, gathered: Gathered) -> bytes:
     except ImportError:
         raise UserError("card", "matplotlib", "not installed", 'pip install "perilune-shared[pictures]"') from None
     samples = gathered.samples if dataset.info.images in ("files", "packed") else []
-    # Show at most two rows of histograms; omit the last measures.
+    # Show at most two rows of histograms; omit the measures that do not fit.
     measures = dict(list(gathered.measures.items())[: 2 * _COLUMNS])
     n_sample_rows = -(-len(samples) // _COLUMNS)
     heights = [1.0] * n_sample_rows + [0.72] * -(-len(measures) // _COLUMNS)
@@ -180,7 +180,7 @@ def _draw_histogram(axis: "Axes", name: str, by_split: Mapping[str, np.ndarray])
         axis.text(0.5, 0.5, "no values", ha="center", va="center", transform=axis.transAxes, fontsize=8)
     else:
         low, high = float(all_values.min()), float(all_values.max())
-        # Equal values would give bins without a width.
+        # Equal values would give bins of zero width.
         edges = (
             np.linspace(low, high, 31) if high - low > 1e-6 * max(1.0, abs(high)) else np.linspace(low - 1, low + 1, 4)
         )

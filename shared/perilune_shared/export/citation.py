@@ -11,11 +11,10 @@ from perilune_shared.dataset.schema import TABLES
 
 
 def citation_of(dataset: Dataset) -> str:
-    """Return a BibTeX entry that identifies this dataset by the hash of its tables, which contain the hashes of the
-    frames.
+    """Return a BibTeX entry that identifies this dataset by the hash of its tables.
 
-    Cards and other added files do not change the hash; the shell prints it:
-    `sha256sum manifest/*/*.parquet | sha256sum`.
+    The tables contain the hashes of the frames. Cards and other added files do not change the hash. To print it in a
+    shell: `sha256sum manifest/*/*.parquet | sha256sum`.
     """
     lines = "".join(f"{sha256}  {path}\n" for path, sha256 in sorted(table_hashes(dataset).items()))
     sha256 = hashlib.sha256(lines.encode()).hexdigest()
@@ -26,7 +25,7 @@ def citation_of(dataset: Dataset) -> str:
 
 
 def table_hashes(dataset: Dataset) -> dict[str, str]:
-    """Return the SHA-256 of each part of all tables: from the index, or computed if there is none yet."""
+    """Return the SHA-256 of each part of all tables, from the index or, if there is none yet, computed."""
     if not dataset.info.complete:
         return {path: dataset.store.sha256(path) for table in TABLES for path in dataset.parts(table)}
     rows = read_index(dataset.store, read_info(dataset.store))

@@ -2,7 +2,7 @@
 
 Format: https://cocodataset.org/#format-data. COCO's coordinates have their origin at the outer corner of the top-left
 pixel, as in perilune. Boxes and polygons are clipped to the image, as usual in COCO; ellipses are not clipped.
-Labels that are not selected are marked `iscrowd`: evaluators ignore detections that match them.
+Labels that are not selected are marked `iscrowd`, so that evaluators ignore detections that match them.
 """
 
 import json
@@ -32,20 +32,20 @@ from perilune_shared.storage.store import Address
 CATEGORY = {"id": 1, "name": "crater", "supercategory": "crater"}
 _N_CORNERS = 32
 _DECIMALS = 3
-"""Decimals of pixel coordinates in the file, finer than the accuracy of any label."""
+"""Decimals of pixel coordinates in the file; no label is accurate to 0.001 px."""
 _ANGLES = 2 * np.pi * np.arange(_N_CORNERS) / _N_CORNERS
 _POLYGON = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-# A polygon with corners on the ellipse has a smaller area; scaling it by 0.3 % makes the areas equal.
+# A polygon with corners on the ellipse has a smaller area than the ellipse; enlarging it by 0.3 % makes them equal.
 _POLYGON *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 
 
 def export_coco(
     dataset: Dataset, out: Address, progress: Progress, split: str | None = None, choose: Choice | None = None
 ) -> int:
-    """Write `out`/instances_<split>.json for each split, or for one; return the number that are not crowds.
+    """Write `out`/instances_<split>.json for one split or each; return the number of annotations that are not crowds.
 
-    `file_name` is the frame's png_path, so use the dataset's folder as the image folder. Raises UserError if `out` is
-    not empty, the dataset is a plan, a png_path is outside the dataset or the split has no frames.
+    `file_name` is the frame's png_path, so give COCO tools the dataset's folder as the image folder. Raises UserError
+    if `out` is not empty, the dataset is a plan, a png_path is outside the dataset or the split has no frames.
     """
     if dataset.info.images == "planned":
         raise UserError(dataset.store, "images", "planned", "a rendered dataset: a plan has no labels")
@@ -67,7 +67,7 @@ def export_coco(
 
 
 def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
-    """Return polygons (N, 32, 2), pixels, with the area of the labels' ellipses, not clipped to the image."""
+    """Return polygons (N, 32, 2), pixels, with the same areas as the labels' ellipses; not clipped to the image."""
     cos, sin = np.cos(labels["ellipse_theta_rad"].to_numpy()), np.sin(labels["ellipse_theta_rad"].to_numpy())
     along = labels["ellipse_a_px"].to_numpy()[:, None] * _POLYGON[:, 0]
     across = labels["ellipse_b_px"].to_numpy()[:, None] * _POLYGON[:, 1]
@@ -140,7 +140,7 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
 
 
 def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_]:
-    """Whether box and outline of each label, clipped to its image, have an area; others are not exported."""
+    """Whether box and outline of each label, clipped to its image, have an area; other labels are not exported."""
     boxes, size = clipped_boxes(labels, frames), frame_sizes(labels, frames)
     inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
     polygons = polygons_of(labels)
@@ -152,13 +152,13 @@ def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_
 
 
 class _SplitFile:
-    """Writer of one JSON file: writes annotations when they are added, and the images on closing."""
+    """Writer of one JSON file: writes annotations as they are added, and the images when it is closed."""
 
     def __init__(self, path: Path, dataset: Dataset):
         info = dataset.info
         self.n_annotations = self.n_chosen = 0
         self._dataset = dataset
-        # Which licence of the list an image has; no entry if none is stated.
+        # Number of the image's licence in the list; no entry if no licence is stated.
         self._licence = {"license": 1} if info.licence != NOT_STATED else {}
         self._images: list[dict[str, Any]] = []
         head = {

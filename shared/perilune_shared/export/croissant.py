@@ -84,7 +84,7 @@ def export_croissant(
 ) -> str:
     """Write croissant.json, or `out`, into the dataset and update the index; return its path or address.
 
-    Raises UserError if `out` is elsewhere, the dataset is not complete or differs from its index.
+    Raises UserError if `out` is outside the dataset, or if the dataset is incomplete or differs from its index.
     """
     target = Target.of(dataset, out, CROISSANT_NAME)
     if target.store is not dataset.store or not target.name.endswith(".json"):
@@ -107,8 +107,9 @@ def export_croissant(
 def metadata_of(dataset: Dataset) -> dict[str, Any]:
     """Return the JSON-LD object.
 
-    A table with one part is a FileObject with its hash. A table with several parts is a FileSet; their hashes are in
-    the index. dataset.json is a FileSet too: it contains the hash of the index, which contains the hash of this file.
+    A table with one part is a FileObject with a hash. A table with several parts is a FileSet; the index has the hashes
+    of the parts. dataset.json is a FileSet too, since its hash depends on this file: dataset.json contains the hash of
+    the index, and the index contains the hash of this file.
     """
     info, hashes = dataset.info, table_hashes(dataset)
     distribution: list[dict[str, Any]] = [
@@ -171,7 +172,7 @@ def _description(dataset: Dataset) -> str:
 
 
 def _licence(expression: str) -> dict[str, str]:
-    """Return the entry of a licence: SPDX's page of a single one, otherwise the expression; none if not stated."""
+    """Return the licence entry: SPDX's page for a single licence, otherwise the expression; empty if not stated."""
     if expression == NOT_STATED:
         return {}
     listed = " " not in expression and not expression.startswith("LicenseRef-")

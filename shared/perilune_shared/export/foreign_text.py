@@ -1,7 +1,7 @@
-"""Make text of other people safe where it is written: one function each for Markdown, its code spans and CSV.
+"""Make untrusted text safe to write to Markdown, Markdown code spans and CSV.
 
-Names of files, runs and datasets, licences, classes and messages of other libraries are such text. For terminals,
-`terminal` passes all text through `errors.one_line`, which the functions here call too. Jinja2 escapes HTML.
+Untrusted text includes names of files, runs, datasets and classes, licences and messages of other libraries. For
+terminals, `terminal` passes all text through `errors.one_line`, which the functions here call too. Jinja2 escapes HTML.
 """
 
 import os
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 _MARKUP = str.maketrans({character: f"\\{character}" for character in "\\`*_[]<>#~&$!@"})
 _LINK = re.compile(r"(:(?=//)|(?<=www)\.)", re.IGNORECASE)
-"""Where GitHub finds the start of an address."""
+"""Text that GitHub recognises as the start of a web address."""
 _IN_CODE = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "|", "%")
-"""First characters with which a cell is a formula, or a command, for a spreadsheet program."""
+"""First characters by which spreadsheet programs recognise a formula or a command in a cell."""
 
 
 def for_markdown(value: object) -> str:
-    """Return text as one line that Markdown shows as it is: no markup, HTML, link or picture.
+    """Return text as one line that Markdown shows literally: no markup, HTML, link or picture.
 
-    Bars are kept, since tables of pages escape the bars of all cells.
+    Vertical bars are kept, since callers that write tables escape them in all cells.
     """
     return _LINK.sub(r"\\\1", one_line(value).translate(_MARKUP))
 
@@ -41,15 +41,16 @@ def code_span(value: object) -> str:
 
 
 def for_csv(value: str) -> str:
-    """Return text as the cell of a CSV table that no spreadsheet program takes for a formula: after an apostrophe."""
+    """Return text as a CSV cell; an apostrophe prevents spreadsheet programs from reading it as a formula."""
     text = one_line(value)
-    # Spreadsheet programs also take full-width signs, and skip blanks before them.
+    # Spreadsheet programs also accept full-width signs, and skip blanks before them.
     first = unicodedata.normalize("NFKC", text.lstrip("'\" "))[:1]
     return f"'{text}" if first in _FORMULA and first else text
 
 
 def write_csv(table: "pd.DataFrame", path: str | os.PathLike[str], **options: Any) -> None:
-    """Write a table as CSV without its index; text, and the names of columns, by `for_csv`. `options` are pandas'."""
+    """Write a table as CSV without the index, with text and column names made safe by `for_csv`; `options` go to
+    pandas."""
     safe = table.rename(columns=for_csv)
     for index, kind in enumerate(safe.dtypes):
         if str(kind) in ("object", "str", "string"):

@@ -1,6 +1,6 @@
 """Export to Hugging Face: one row per frame with its image, pose and labels, in Parquet files for each split.
 
-A dataset's own tables mix frames of all splits and keep labels separate from frames; the library `datasets` would read
+The tables of a dataset mix frames of all splits and keep labels separate from frames; the library `datasets` would read
 all of them as training data. With this export, `datasets.load_dataset(folder)` loads all splits and
 `load_dataset(folder, split="test")` loads one. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
 """
@@ -77,7 +77,7 @@ test = load_dataset("FOLDER", split="test")
 
 
 def schema_of() -> pa.Schema:
-    """Return the schema of the files: columns of frames, the image, and the labels as a list of structs."""
+    """Return the schema of the files: the columns of frames, the image, and the labels as a list of structs."""
     columns = [TABLES["frames"].field("frame_id"), IMAGE]
     columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_OMITTED)]
     columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))
@@ -85,7 +85,7 @@ def schema_of() -> pa.Schema:
 
 
 def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]]:
-    """Yield split and rows of a scene's frames, in batches."""
+    """Yield split and rows of the frames of a scene, in batches."""
     schema = schema_of()
     for split, frames in scene.frames.groupby("split"):
         for start in range(0, len(frames), _FRAMES_PER_GROUP):

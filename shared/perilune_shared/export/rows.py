@@ -22,9 +22,10 @@ from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import Selection
 
 Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]
-"""Select labels: takes the dataset, a scene_id and its labels (N rows, all columns); returns bool (N,)."""
+"""Function that selects labels: takes the dataset, a scene_id and the scene's labels (N rows, all columns); returns
+bool (N,)."""
 LABEL_MEASURES = ("visible_fraction", "sunlit_fraction", "contrast")
-"""Columns of labels by which users select; exports include those that the dataset has."""
+"""Columns by which users select labels; exports include those that the dataset has."""
 
 
 def by_selection(selection: Selection) -> Choice:
@@ -40,14 +41,14 @@ def by_selection(selection: Selection) -> Choice:
 
 @dataclass(frozen=True, slots=True)
 class SceneRows:
-    """Frames and labels of one scene, of the requested splits."""
+    """Frames and labels of one scene, limited to the requested splits."""
 
     scene_id: str
     """Id of the scene."""
     frames: pd.DataFrame
-    """Rows of the table frames, sorted by frame_id, with `image_id`."""
+    """Rows of the table frames, sorted by frame_id, with the added column `image_id`."""
     labels: pd.DataFrame
-    """Rows of the table labels, sorted by frame_id and crater_id, with `label_id` and `chosen` (selected)."""
+    """Rows of the table labels, sorted by frame_id and crater_id, with the added columns `label_id` and `chosen`."""
 
 
 def scenes_of(
@@ -88,12 +89,12 @@ def scenes_of(
 
 
 def count_scenes(dataset: Dataset, split: str | None = None) -> int:
-    """Number of scenes that `scenes_of` yields: the total of a progress bar."""
+    """Return the number of scenes that `scenes_of` yields, as the total of a progress bar."""
     return len(dataset.scene_ids()) if split is None else len(set(_scene_of_each_frame(dataset, split)))
 
 
 def count_frames(dataset: Dataset, split: str | None = None) -> int:
-    """Number of frames in the scenes of `scenes_of`: the total of a progress bar."""
+    """Return the number of frames in the scenes that `scenes_of` yields, as the total of a progress bar."""
     return dataset.info.counts.frames if split is None else len(_scene_of_each_frame(dataset, split))
 
 

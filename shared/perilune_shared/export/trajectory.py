@@ -1,11 +1,11 @@
-"""Export trajectories to TUM and KITTI, one file per trajectory; read by evo and by the tools of both benchmarks.
+"""Export trajectories to TUM and KITTI, one file per trajectory, for evo and the tools of both benchmarks.
 
 Poses are camera poses: the position of the centre of projection, and the rotation from O_C (x right, y down, z along
 the viewing direction) to the reference frame, e.g. rotation_site_from_camera for O_L.
 
 - TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): `timestamp tx ty tz qx qy qz qw`, reference O_L.
 - KITTI (https://www.cvlibs.net/datasets/kitti/eval_odometry.php): the upper 3x4 of the pose, row by row; the reference
-  is the first camera of the file, so the first line is the identity. Times are in a second file.
+is the first camera pose of the file, so the first line is the identity. Times are in a second file.
 """
 
 from collections.abc import Iterator
@@ -84,5 +84,5 @@ def _trajectories(
 
 
 def _lines(rows: Array) -> str:
-    # repr gives the shortest text that parses to the same number; adding 0.0 avoids "-0.0".
+    # repr returns the shortest text that parses to the same number; adding 0.0 avoids "-0.0".
     return "".join(" ".join(repr(float(value) + 0.0) for value in row) + "\n" for row in rows)

@@ -1,6 +1,6 @@
 """Read a camera from a YAML file: perilune's own settings, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
 
-These programs put the centre of the top-left pixel at (0, 0), perilune puts it at (0.5, 0.5): half a pixel is added to
+These programs put the centre of the top-left pixel at (0, 0) and perilune at (0.5, 0.5), so half a pixel is added to
 the principal point. Distortion is Brown-Conrady's (`plumb_bob`, `radtan`). The equidistant model (Kannala and Brandt
 2006, doi 10.1109/TPAMI.2006.153) is replaced by the Brown-Conrady distortion that fits best, if it fits within 0.05 px.
 """
@@ -27,7 +27,7 @@ _BROWN = ("plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "br
 _EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
 _LARGEST_SIDE_PX = 100_000
 _LARGEST_FIT_PX = 0.05
-"""Largest error of a Brown-Conrady distortion that replaces an equidistant one."""
+"""Maximum error of a Brown-Conrady distortion that replaces an equidistant one, pixels."""
 _WIDEST_RAD = np.radians(80)
 _HALF_PX = 0.5
 
@@ -45,7 +45,10 @@ class Calibration:
 
 
 def read_camera_file(path: Path) -> Calibration | dict[str, Any]:
-    """The calibration in a file, or the mapping of a file with perilune's own settings. Raises UserError."""
+    """Return the calibration in a file, or the plain mapping if the file has perilune's own settings.
+
+    Raises UserError if the file cannot be read as either.
+    """
     content = _mapping(path)
     keys = {key.lower(): key for key in content}
     cameras = [key for key in content if re.fullmatch(r"cam\d+", key)]
@@ -86,7 +89,7 @@ def _mapping(path: Path) -> dict[str, Any]:
 
 
 def _plain(text: str) -> str:
-    """The text of a YAML file without OpenCV's directive and tags, and without marks of its start and end."""
+    """Return YAML text without OpenCV's directive and tags and without document markers."""
     lines = text.replace("!!opencv-matrix", "").splitlines()
     while lines and (not lines[0].strip() or re.match(r"%YAML|---\s*$", lines[0])):
         del lines[0]
@@ -96,7 +99,7 @@ def _plain(text: str) -> str:
 
 
 def _kalibr(path: Path, content: dict[str, Any]) -> Calibration:
-    """A camera of Kalibr's camchain, or of EuRoC's sensor.yaml."""
+    """Return the camera in a camchain file of Kalibr or a sensor.yaml of EuRoC."""
     model = str(content.get("camera_model", "pinhole"))
     if model != "pinhole":
         raise UserError(path, "camera_model", model, "pinhole")
@@ -118,7 +121,10 @@ def _kalibr(path: Path, content: dict[str, Any]) -> Calibration:
 
 
 def _opencv(path: Path, content: dict[str, Any]) -> Calibration:
-    """A camera of OpenCV's FileStorage, of ROS's camera_calibration, or a message camera_info; keys in lower case."""
+    """Return the camera in a file of OpenCV's FileStorage or ROS's camera_calibration, or in a camera_info message.
+
+    Keys are in lower case.
+    """
     name = next(name for name in _MATRIX if name in content)
     fx, skew, cx, zero, fy, cy, *last = _numbers(path, name, content[name], (9,))
     if skew or zero or last != [0, 0, 1]:
@@ -151,7 +157,7 @@ def _coefficients(path: Path, content: dict[str, Any]) -> list[float]:
 def _camera(
     path: Path, size: Sequence[float], intrinsics: Sequence[float], model: str, coefficients: list[float]
 ) -> Camera:
-    """The camera of a pinhole with a distortion model by name; without one by the number of coefficients."""
+    """Return a pinhole camera with distortion; an unnamed distortion model follows from the number of coefficients."""
     width, height = (int(value) for value in size)
     if [width, height] != list(size) or not 1 <= min(size) <= max(size) <= _LARGEST_SIDE_PX:
         raise UserError(path, "image size", list(size), f"two whole numbers from 1 to {_LARGEST_SIDE_PX}")
@@ -183,7 +189,10 @@ def _fields(camera: Camera) -> tuple[int, int, float, float, float, float]:
 
 
 def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camera:
-    """The camera with the Brown-Conrady distortion nearest to an equidistant one. Raises UserError if none is near."""
+    """Return the camera with the best-fitting Brown-Conrady distortion for an equidistant one.
+
+    Raises UserError if the fit error is too large.
+    """
     field = "distortion_model equidistant"
     if len(coefficients) != 4:
         raise UserError(path, field, f"{len(coefficients)} coefficients", "4")
@@ -202,7 +211,7 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
     radius, target = np.tan(angle[1 : inside + 1]), distorted[1 : inside + 1]
     powers = np.stack([radius**3, radius**5, radius**7], axis=1)
     weight = np.ones_like(radius)
-    # Raise the weights of large errors until the largest is least (Lawson's algorithm).
+    # Increase the weights of large errors until the largest error is minimal (Lawson's algorithm).
     for _ in range(60):
         fit = np.linalg.lstsq(powers * weight[:, None], (target - radius) * weight, rcond=None)[0]
         error = np.abs(powers @ fit - (target - radius))
@@ -219,7 +228,7 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
 
 
 def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:
-    """Finite numbers from a list, a list of lists, or a mapping with `data`. Raises UserError."""
+    """Return finite numbers from a list, a list of lists or a mapping with `data`; raise UserError on others."""
     if isinstance(value, dict):
         value = value.get("data")
     flat: list[object] = []

@@ -1,8 +1,8 @@
 """Pinhole camera model with optional lens distortion.
 
 A point X in O_L has the camera coordinates x_C = rotation_camera_from_site (X - position_m) and the image coordinates
-u = fx x' + cx, v = fy y' + cy. Without distortion x' = a = x/z and y' = b = y/z. With it, after Brown (1966) and
-Conrady (1919) in OpenCV's form, with r^2 = a^2 + b^2 and s = 1 + k1 r^2 + k2 r^4 + k3 r^6,
+u = fx x' + cx, v = fy y' + cy. Without distortion x' = a = x/z and y' = b = y/z. With distortion, after Brown (1966)
+and Conrady (1919) in OpenCV's form, with r^2 = a^2 + b^2 and s = 1 + k1 r^2 + k2 r^4 + k3 r^6,
 x' = a s + 2 p1 a b + p2 (r^2 + 2 a^2) and y' = b s + p1 (r^2 + 2 b^2) + 2 p2 a b.
 
 Image coordinates have their origin at the outer corner of the top-left pixel, so pixel (column i, row j) covers
@@ -22,8 +22,8 @@ from perilune_shared.geometry.frames import Array
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
-"""Default mounting: the camera looks along -Z_B, its x axis along X_B. With the body level in O_L this is the paper's
-"along the negative axis of Z_L"."""
+"""Default mounting: the camera looks along -Z_B, and its x axis points along X_B. If the body is level in O_L, this
+is the paper's "along the negative axis of Z_L"."""
 _MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""
 
@@ -61,7 +61,7 @@ class Camera:
     def project(self, points_camera_m: ArrayLike) -> Array:
         """Project points (..., 3) in O_C, metres, to pixels (..., 2).
 
-        NaN if the point is not in front of the camera, or so far off the axis that the distortion folds back.
+        NaN if the point is not in front of the camera, or is so far off the axis that the distortion folds back.
         """
         p = np.asarray(points_camera_m, np.float64)
         z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
@@ -106,8 +106,8 @@ class Camera:
     def covering_pinhole(self) -> "Camera":
         """Return a camera without distortion, with the same focal lengths, that covers the whole view of this camera.
 
-        Its image is larger by whole pixels on each side as needed; without distortion it is this camera. Raises
-        ValueError if the distortion folds back inside the image.
+        Its image extends this camera's image by whole pixels on each side where needed. Returns this camera if it has
+        no distortion. Raises ValueError if the distortion folds back inside the image.
         """
         if not any(self.distortion):
             return self
@@ -157,7 +157,7 @@ class Camera:
         )
 
     def _undistorted(self, target_x: Array, target_y: Array) -> tuple[Array, Array]:
-        """Invert the distortion by Newton's method, from a tabulated inverse of the radial part inside the fold."""
+        """Invert the distortion by Newton's method, starting from a table of the radial part inside the fold."""
         target_r = np.hypot(target_x, target_y)
         radial = self._radial_table(float(np.nanmax(target_r, initial=0.0)))
         start = np.interp(target_r, radial[1], radial[0]) / np.maximum(target_r, 1e-300)

@@ -1,4 +1,4 @@
-"""Curvature of the ground: heights of a sphere of the Moon's radius that touches the plane z = 0 of O_L at the site."""
+"""Curvature of the ground: a sphere with the Moon's radius touches the plane z = 0 of O_L at the site."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -7,20 +7,23 @@ from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
 
 
 def drop_m(x_m: ArrayLike, y_m: ArrayLike) -> Array:
-    """Depth (...) of the sphere below the plane z = 0 at places of O_L, metres: R - sqrt(R^2 - x^2 - y^2)."""
+    """Return the depth (...) of the sphere below the plane z = 0 at points of O_L, metres.
+
+    It is R - sqrt(R^2 - x^2 - y^2).
+    """
     square = np.square(np.asarray(x_m, np.float64)) + np.square(np.asarray(y_m, np.float64))
-    # This form does not lose the digits of a small drop.
+    # This form keeps full precision for a small drop.
     return square / (MOON_RADIUS_M + np.sqrt(np.square(MOON_RADIUS_M) - square))
 
 
 def horizon_m(height_m: ArrayLike) -> Array:
-    """Distance (...) along the ray to the horizon of a camera at a height above the sphere, metres: sqrt(2Rh + h^2)."""
+    """Return the distance (...) from a camera at a height above the sphere to its horizon, metres: sqrt(2Rh + h^2)."""
     height = np.asarray(height_m, np.float64)
     return np.sqrt(2 * MOON_RADIUS_M * height + np.square(height))
 
 
 def hits_sphere(position_m: Array, rays: Array) -> np.ndarray:
-    """Whether rays (N, S, 3) from positions (N, 3), both in O_L, hit the sphere; those from inside it always do."""
+    """Whether rays (N, S, 3) from positions (N, 3), both in O_L, hit the sphere; true for positions inside it."""
     from_centre = (position_m + np.array([0, 0, MOON_RADIUS_M]))[:, None]
     along = np.einsum("nsi,nsi->ns", np.broadcast_to(from_centre, rays.shape), rays)
     above = np.square(from_centre).sum(axis=-1) - MOON_RADIUS_M**2

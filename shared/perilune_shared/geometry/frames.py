@@ -9,11 +9,11 @@ Names follow the paper (section "Coordinates"):
 - O_B body: fixed to the lander.
 - O_C camera: OpenCV axes, x right, y down, z along the viewing direction.
 
-A rotation is named `rotation_<to>_from_<from>` and acts on column vectors: v_to = R v_from. A quaternion is
-(w, x, y, z), of length 1, and represents such a matrix.
+A rotation is named `rotation_<to>_from_<from>` and acts on column vectors: v_to = R v_from. A quaternion (w, x, y, z)
+has length 1 and represents such a matrix.
 
-The rotations do not use SciPy's `Rotation`. Its last bits differ (up to 1.2e-15, in 92 to 99.9 % of random rotations),
-which would change poses and labels of datasets. The tests compare both.
+The functions do not use SciPy's `Rotation`: its results differ in the last bits (by up to 1.2e-15, for 92 to 99.9 % of
+random rotations), which would change poses and labels of datasets. The tests compare both.
 """
 
 import numpy as np
@@ -40,8 +40,8 @@ def matrix_from_quaternion(rotation_wxyz: ArrayLike) -> Array:
 def quaternion_from_matrix(rotation: ArrayLike) -> Array:
     """Return the quaternion (4,) with w >= 0 of a rotation matrix (3, 3).
 
-    It is the eigenvector of the largest eigenvalue (Bar-Itzhack 2000, doi 10.2514/2.4654), which is accurate also for
-    rotations by 180 degrees.
+    Computed as the eigenvector of the largest eigenvalue (Bar-Itzhack 2000, doi 10.2514/2.4654), which is also accurate
+    for rotations by 180 degrees.
     """
     r = np.asarray(rotation, dtype=np.float64)
     k = np.array(

@@ -12,8 +12,9 @@ MOON_GM_M3_PER_S2 = 4.902800118e12
 def gravity_mps2(height_m: ArrayLike) -> Array:
     """Return the acceleration by gravity (..., 3), O_L, metres per second squared, at heights (...) above the site.
 
-    That of a sphere, along -Z_L everywhere, since the ground of a site is a plane: 2 km beside the site its true
-    direction differs by 0.07 degrees. The Moon's rotation (0.55 degrees per hour) is neglected.
+    The magnitude is computed for a spherical Moon. The direction is -Z_L everywhere, since the ground of a site is a
+    plane; at 2 km from the site the true direction differs by 0.07 degrees. The Moon's rotation (0.55 degrees per hour)
+    is neglected.
     """
     height = np.asarray(height_m, np.float64)
     down = MOON_GM_M3_PER_S2 / (MOON_RADIUS_M + height) ** 2

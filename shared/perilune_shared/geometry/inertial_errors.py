@@ -7,7 +7,7 @@ from perilune_shared.geometry.inertial_grades import HOUR_S, STANDARD_GRAVITY_MP
 
 
 def drawn_errors(errors: InertialErrors, interval_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Random errors of mean angular rates, rad/s, and of mean specific forces, m/s^2, over N intervals: (N, 3) each."""
+    """Draw errors of mean angular rates, rad/s, and of mean specific forces, m/s^2, over N intervals: (N, 3) each."""
     per_s, per_root_s = np.radians(1) / HOUR_S, 1 / np.sqrt(HOUR_S)
     mg = STANDARD_GRAVITY_MPS2 / 1000
     gyro = _drawn(
@@ -28,7 +28,10 @@ def drawn_errors(errors: InertialErrors, interval_s: Array, rng: np.random.Gener
 
 
 def _drawn(rng: np.random.Generator, interval_s: Array, bias: float, walk: float, noise: float) -> Array:
-    """Errors (N, 3): bias, its random walk (per square root of a second), white noise (integrated, likewise)."""
+    """Draw errors (N, 3) for the standard deviations of the bias, its random walk and white noise.
+
+    `walk` and `noise` (of the integrated quantity) are per square root of a second.
+    """
     size = len(interval_s), 3
     root = np.sqrt(interval_s)[:, None]
     start = bias * rng.normal(size=3)

@@ -1,7 +1,7 @@
-"""Errors of inertial measurement units, by grade: what `inertial` is simulated with and what a filter assumes.
+"""Errors of inertial measurement units by grade, for the simulation of the table `inertial` and for filters.
 
-Each axis has a bias, drawn once and then walking, and white noise. Scale factors, misalignment and quantisation are not
-simulated.
+Each axis has white noise and a bias that starts at a random value and follows a random walk. Scale factors,
+misalignment and quantisation are not simulated.
 """
 
 from dataclasses import dataclass
@@ -37,4 +37,4 @@ GRADES: dict[InertialGrade, InertialErrors] = {
 }
 """Errors of each grade: biases and noise within the ranges that Groves (Principles of GNSS, Inertial, and Multisensor
 Integrated Navigation Systems, 2nd edition, 2013, section 4.4) gives for tactical and aviation grade. The random walks
-are ours: in one minute a bias changes by an eighth of its size."""
+are our own choice: in one minute a bias changes by an eighth of its size."""

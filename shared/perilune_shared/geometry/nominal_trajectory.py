@@ -1,4 +1,4 @@
-"""The nominal trajectory: the planned path, known to the guidance before the flight.
+"""The nominal trajectory: the planned path, which the guidance knows before the flight.
 
 The paper uses "a parabola" from 1500 m to 200 m without details. Here the vertical speed is constant and the
 horizontal speed decreases linearly to zero at the end point. The path is a parabola with a vertical axis that ends
@@ -38,7 +38,8 @@ class NominalTrajectory:
     ) -> "NominalTrajectory":
         """Create a trajectory to a point above the site.
 
-        It starts `downrange_m` from the site, in the direction `azimuth_deg` (clockwise from north) seen from the site.
+        It starts `downrange_m` from the site; seen from the site, the start is in the direction `azimuth_deg`,
+        clockwise from north.
         """
         azimuth = np.radians(azimuth_deg)
         x, y = -np.sin(azimuth) * downrange_m, -np.cos(azimuth) * downrange_m
@@ -52,7 +53,7 @@ class NominalTrajectory:
 
     @property
     def approach_deg(self) -> int:
-        """Direction from the site to the start (see `approach_deg`)."""
+        """Direction from the site to the start, as the function `approach_deg` returns it."""
         return approach_deg(self.position_m)
 
     def position_at(self, time_s: ArrayLike) -> Array:
@@ -68,5 +69,8 @@ class NominalTrajectory:
 
 
 def approach_deg(start_m: Sequence[float]) -> int:
-    """Direction from the site to a start (3,), O_L, clockwise from north, in whole degrees; 0 above the site."""
+    """Return the direction from the site to a start (3,) in O_L, whole degrees clockwise from north.
+
+    It is 0 if the start is above the site.
+    """
     return round(float(np.degrees(np.arctan2(-start_m[0], -start_m[1])))) % 360 if any(start_m[:2]) else 0

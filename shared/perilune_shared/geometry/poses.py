@@ -1,4 +1,4 @@
-"""Poses of a camera from quantities that people state: altitude, tilt, a place to look at, a descent.
+"""Create camera poses from altitude and tilt, from a target to look at, or along a descent.
 
     look_down(altitude_m=800, tilt_deg=10)
     look_at(position_m=(300, 0, 500), target_m=(0, 0, 0))
@@ -22,7 +22,7 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Position, attitude and velocity of a camera."""
+    """Position, rotation and velocity of a camera."""
 
     position_m: Array
     """Position, O_L, metres (3,)."""
@@ -66,8 +66,8 @@ def look_down(altitude_m: float, tilt_deg: float = 0.0, azimuth_deg: float = 0.0
 def look_at(position_m: ArrayLike, target_m: ArrayLike = (0.0, 0.0, 0.0)) -> Pose:
     """Return the pose of a camera at `position_m` that looks at `target_m`, both (3,), O_L, metres.
 
-    The image is upright: its top is away from the camera, and north if the camera looks straight down. Raises
-    UserError if the two places are one, or if one is not three finite numbers.
+    The image is upright: its top shows the ground farthest from the camera, or is north if the camera looks straight
+    down. Raises UserError if position and target are equal, or if one of them is not three finite numbers.
 
         pose = look_at(position_m=(300, 0, 500))
     """
@@ -91,9 +91,9 @@ def descent(
 ) -> list[Pose]:
     """Return poses along a parabola to a point above the site, with their velocities; the camera looks straight down.
 
-    The trajectory is the nominal one of datasets, without perturbations (`NominalTrajectory.parabola`), and so is the
-    attitude: south is up. It starts `downrange_m` from the site, in the direction `azimuth_deg`. Frames are evenly
-    spaced in time. Raises UserError on values out of range.
+    Trajectory and attitude are the nominal ones of datasets, without perturbations (`NominalTrajectory.parabola`), so
+    south is up in the images. The trajectory starts `downrange_m` from the site, in the direction `azimuth_deg`. Frames
+    are evenly spaced in time. Raises UserError on values out of range.
 
         poses = descent(n_frames=20, start_altitude_m=1000)
     """
@@ -112,7 +112,7 @@ def descent(
 
 
 def _rotation(tilt_rad: float, azimuth_rad: float) -> Array:
-    """rotation_camera_from_site (3, 3) of a line of sight that leans from straight down towards an azimuth."""
+    """Return rotation_camera_from_site (3, 3) for a line of sight that leans from straight down towards an azimuth."""
     sine, cosine = math.sin(azimuth_rad), math.cos(azimuth_rad)
     sight = np.array([-sine * math.sin(tilt_rad), -cosine * math.sin(tilt_rad), -math.cos(tilt_rad)])
     right = np.array([-cosine, sine, 0.0])
@@ -120,14 +120,14 @@ def _rotation(tilt_rad: float, azimuth_rad: float) -> Array:
 
 
 def _check(where: str, field: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless a value is a number between two bounds."""
+    """Raise UserError unless a value is a number from `least` to `most`."""
     is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not is_number or not least <= value <= most:
         raise UserError(where, field, value, f"a number from {least:g} to {most:g}")
 
 
 def _place(field: str, value: ArrayLike) -> Array:
-    """A place (3,). Raises UserError on anything but three finite numbers."""
+    """Return a position as an array (3,). Raises UserError on anything but three finite numbers."""
     try:
         values = np.asarray(value, np.float64)
     except (TypeError, ValueError):
@@ -138,7 +138,7 @@ def _place(field: str, value: ArrayLike) -> Array:
 
 
 def listed(poses: Pose | Sequence[Pose]) -> list[Pose]:
-    """One pose or several as a list. Raises UserError on anything else."""
+    """Return one pose or several as a list. Raises UserError on anything else."""
     listed_poses: list[Any] = list(poses) if isinstance(poses, Sequence) and not isinstance(poses, str) else [poses]
     for each in listed_poses:
         if not isinstance(each, Pose):

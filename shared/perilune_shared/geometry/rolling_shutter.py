@@ -1,4 +1,4 @@
-"""Rolling shutter: each row of a frame is exposed at its own time, while the camera moves and turns.
+"""Rolling shutter: the rows of a frame are exposed one after the other while the camera moves and turns.
 
 The camera keeps its velocity in O_L and its angular velocity in O_C. Times are seconds from the middle of the exposure
 of the middle row, to which the pose of a frame refers: row r of h rows is exposed at (r + 0.5 - h / 2) row_time_s.
@@ -12,12 +12,12 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 _STEPS = 8
-"""Steps that find the row of a point: each error is a small share of the one before."""
+"""Number of fixed-point iterations that find the row of a point; each one reduces the error to a small fraction."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Poses and velocities of N cameras, or of one camera for N points, if the first axis is 1."""
+    """Poses and velocities of N cameras, one for each of N points; N = 1 is one camera for all points."""
 
     position_m: Array
     """Positions at time 0, O_L, metres (N, 3)."""
@@ -29,19 +29,20 @@ class Moving:
     """Angular velocities, O_C, radians per second (N, 3)."""
 
     def rotations_at(self, time_s: Array) -> Array:
-        """rotation_camera_from_site (N, 3, 3) at times (N,)."""
-        # The camera turns by w t in its own axes, so what it sees turns by -w t.
+        """Return rotation_camera_from_site (N, 3, 3) at times (N,)."""
+        # The camera turns by w t in its own axes, so the scene turns by -w t in the camera's axes.
         return _matrices(-time_s[:, None] * self.angular_velocity_radps) @ self.rotation_camera_from_site
 
     def seen_at(self, points_m: Array, time_s: Array) -> Array:
-        """Points (N, 3) of O_L in the camera's axes at times (N,), metres."""
+        """Transform points (N, 3) from O_L to O_C at times (N,), metres."""
         offset = points_m - self.position_m - time_s[:, None] * self.velocity_mps
         return np.einsum("nij,nj->ni", self.rotations_at(time_s), offset)
 
     def row_times_s(self, points_m: Array, camera: Camera, row_time_s: float) -> Array:
-        """Time (N,) at which the row that shows each point (N, 3) of O_L is exposed, seconds.
+        """Return the exposure time (N,), seconds, of the row that shows each point (N, 3) of O_L.
 
-        Points above or below the image have the time of its first or last row, those behind the camera time 0.
+        For points above or below the image it is the time of the first or last row; for points behind the camera it is
+        0.
         """
         half = camera.height_px / 2
         time = np.zeros(len(points_m))
@@ -52,7 +53,7 @@ class Moving:
 
 
 def _matrices(rotation_vectors_rad: Array) -> Array:
-    """Matrices (N, 3, 3) that rotate by |v| radians about v (N, 3) (Rodrigues' formula)."""
+    """Return matrices (N, 3, 3) that rotate by |v| radians about v (N, 3) (Rodrigues' formula)."""
     angle = np.linalg.norm(rotation_vectors_rad, axis=-1)[:, None, None]
     x, y, z = rotation_vectors_rad.T
     zero = np.zeros_like(x)

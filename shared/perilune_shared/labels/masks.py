@@ -2,9 +2,9 @@
 
 A pixel belongs to a crater if the ray through the pixel's centre intersects the disc inside the rim circle. This is
 exact, with and without lens distortion. The pixel is visible unless the terrain in the frame's EXR (depth, channel Z)
-is nearer than the disc; the crater's own floor lies behind the disc. Since the terrain around the disc is rough, it
-hides a pixel only if it is nearer by more than a tenth of the radius and by more than two pixel widths, as for
-`visible_fraction`. Use:
+is nearer than the disc; the crater's floor lies behind the disc. Since the terrain around the disc is rough, terrain
+hides a pixel only if it is nearer than the disc by more than a tenth of the radius and by more than two pixel widths,
+as for `visible_fraction`. Use:
 
     depth_m = perilune_render.imaging.exr.read_exr(dataset.file(frame.exr_path))["Z"]
     for mask in frame_masks(dataset, frame_id, depth_m=depth_m):
@@ -27,7 +27,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.rolling_shutter import Moving
 
 SLACK_RADII, SLACK_PX = 0.1, 2.0
-"""Tolerance of the depth test: in crater radii and in pixel widths at the crater; the larger of both applies."""
+"""Tolerances of the depth test, in crater radii and in pixel widths at the crater; the larger one applies."""
 _CRATER = ["crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 
 
@@ -60,12 +60,12 @@ def frame_masks(
     depth_m: NDArray[np.floating] | None = None,
     image: Literal["png", "exr"] = "png",
 ) -> list[CraterMask]:
-    """Compute the masks of all labelled craters of a frame, in the order of the labels, or of `crater_ids`.
+    """Compute the masks of a frame's labelled craters, in the order of the labels, or of the given `crater_ids`.
 
-    With `image` "png" the masks are in pixels of `camera` of dataset.json, as the labels are; with "exr", in pixels of
-    `exr_camera`, which differ under lens distortion. depth_m (h, w) is always the EXR's channel Z, infinite where no
-    terrain is hit; for "png" it is sampled at the nearest pixel. Raises UserError on an unknown frame or crater and on
-    a depth of another size.
+    With `image` "png" the masks, like the labels, are in pixels of `camera` in dataset.json. With "exr" they are in
+    pixels of `exr_camera`, which differ if the lens has distortion. depth_m (h, w) is always the EXR's channel Z,
+    infinite where no terrain is hit; for "png" it is sampled at the nearest pixel. Raises UserError on an unknown frame
+    or crater and on a depth of another size.
     """
     scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
     columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz", "velocity_mps", "camera", *ANGULAR_VELOCITY]
@@ -147,7 +147,7 @@ def crater_masks(
 
 
 def _resampled(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
-    """Sample the depth image of `source` at the pixel nearest to each pixel centre of `camera`; both share one pose."""
+    """Resample a depth image from camera `source` to camera `camera` in the same pose, by nearest pixel."""
     pixel = np.floor(source.project(camera.rays(camera.pixel_centres())))
     column = np.clip(pixel[..., 0], 0, source.width_px - 1).astype(int)
     row = np.clip(pixel[..., 1], 0, source.height_px - 1).astype(int)

@@ -27,7 +27,8 @@ def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
     """Return whether each label (N,) is selected.
 
     Needs the columns radius_px, visible_fraction, sunlit_fraction, contrast, depth_m and diameter_m (see
-    `read_labels`). An unknown contrast (NaN, in migrated datasets) passes; any other unknown value fails its threshold.
+    `read_labels`). An unknown contrast (NaN, in migrated datasets) passes the threshold; any other unknown value fails
+    it.
     """
     radius_px = np.asarray(labels["radius_px"])
     chosen = np.ones(len(radius_px), np.bool_)
@@ -47,7 +48,7 @@ def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
 
 
 def limited_contrast(contrast: NDArray, radius_px: NDArray, pixels: float | None) -> NDArray:
-    """Contrast (N,) as if at most `pixels` pixels around each crater were independent; unchanged if None."""
+    """Return the contrast (N,) if at most `pixels` pixels per crater count as independent; None sets no limit."""
     if pixels is None:
         return contrast
     around = np.pi * (REACH_RADII * radius_px) ** 2
@@ -55,7 +56,7 @@ def limited_contrast(contrast: NDArray, radius_px: NDArray, pixels: float | None
 
 
 def label_bound_px(info: DatasetInfo) -> float:
-    """Return the maximum radius of a label in a dataset, pixels, from its recipes, or the default if they have none."""
+    """Return a dataset's maximum label radius, pixels: from the recipes, or the default if they do not state it."""
     stated = [recipe.config.get("labels") for recipe in info.recipes.values()]
     bounds = [labels.get("max_radius_px") for labels in stated if isinstance(labels, dict)]
     numbers = [float(bound) for bound in bounds if isinstance(bound, int | float) and bound > 0]
@@ -64,7 +65,7 @@ def label_bound_px(info: DatasetInfo) -> float:
 
 
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:
-    """Read the labels of a dataset or of one split, with the columns that `selected` needs and further `columns`.
+    """Read the labels of one split or all, with the columns that `selected` needs and the additional `columns`.
 
     Rows are in the order of the table labels. Depth and diameter (metres) come from the table craters, joined by
     scene_id and crater_id. Raises UserError if a part cannot be read or keys are broken.

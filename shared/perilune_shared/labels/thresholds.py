@@ -1,7 +1,7 @@
 """Named sets of label thresholds: from all craters in the frame to those visible in the image.
 
-Without pandas and pyarrow, so that configurations and `--help` load without them. `perilune_shared.labels.selection`
-applies the thresholds.
+This module does not import pandas and pyarrow, so that configurations and `--help` load quickly.
+`perilune_shared.labels.selection` applies the thresholds.
 """
 
 from typing import Annotated
@@ -26,10 +26,12 @@ class Selection(Section):
     min_depth_ratio: Share | None = None
     """Minimum ratio of depth to diameter on the finished terrain; lower ratios mean an eroded crater."""
     min_contrast: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
-    """Minimum contrast: the crater's own shading in the frame divided by its standard error, from noise and clutter."""
+    """Minimum contrast: the shading of the crater itself in the frame, divided by its standard error from noise and
+    clutter."""
     contrast_pixels: Positive | None = None
-    """Largest number of pixels that the contrast counts as independent; in a larger neighbourhood it is reduced by the
-    square root of the ratio, since neighbouring pixels of a blurred, cluttered frame are alike. null counts all."""
+    """Maximum number of pixels that count as independent in the contrast. In a larger neighbourhood the contrast is
+    divided by the square root of the ratio, since neighbouring pixels of a blurred, cluttered frame are alike. null
+    counts all."""
 
 
 SELECTIONS: dict[str, Selection] = {

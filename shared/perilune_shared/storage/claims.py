@@ -1,7 +1,7 @@
 """Claim an address of an object store, so that only one run writes a whole dataset there.
 
-An object store has no locks. A claim is an object that its holder renews; a claim that was not renewed for 60 seconds,
-or whose process has ended on this machine, does not count.
+An object store has no locks. A claim is an object that its holder renews. A claim is ignored if it was not renewed for
+60 seconds, or if its process ran on this machine and has ended.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _LARGEST_BYTES = 10_000
 
 @contextlib.contextmanager
 def claimed(store: Store, folder: str) -> Iterator[None]:
-    """Hold a claim below `folder` of a store. Raises UserError if another process holds one."""
+    """Hold a claim below `folder` of a store within the block. Raises UserError if another process holds a claim."""
     path = f"{folder}/{secrets.token_hex(8)}.json"
     claim = {"pid": os.getpid(), "host": platform.node(), "system": _system()}
     ended = threading.Event()
@@ -35,7 +35,7 @@ def claimed(store: Store, folder: str) -> Iterator[None]:
             with contextlib.suppress(UserError, OSError):
                 _write(store, path, claim)
 
-    # Written before the others are read: of two runs that start together, at least one sees the other.
+    # Write the claim before reading others: if two runs start together, at least one sees the other.
     _write(store, path, claim)
     renewal = threading.Thread(target=renew, daemon=True, name=f"claim {store}")
     try:
@@ -79,7 +79,7 @@ def _read(store: Store, path: str, size_bytes: int) -> dict[str, Any] | None:
 
 
 def _runs_elsewhere(pid: int) -> bool:
-    """Whether another process than this one has this id."""
+    """Whether a process other than this one has this id."""
     if pid == os.getpid():
         return False
     try:
@@ -92,7 +92,7 @@ def _runs_elsewhere(pid: int) -> bool:
 
 
 def _system() -> str:
-    """Return an id that is equal in all processes whose process ids share one numbering (machine or container)."""
+    """Return an id of the process namespace (machine or container), within which process ids are unique."""
     with contextlib.suppress(OSError):
         boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot_id} {Path('/proc/self/ns/pid').readlink()}"

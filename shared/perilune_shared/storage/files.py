@@ -20,12 +20,12 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _LONGEST_PATH = 500
 _CHUNK_BYTES = 2**20
 _FICLONE = 0x40049409
-"""FICLONE from linux/fs.h. PowerPC, MIPS and SPARC use another number; there the call fails and files are copied."""
+"""FICLONE from linux/fs.h. On PowerPC, MIPS and SPARC the number differs, so the call fails and files are copied."""
 
 
 def temporary_name(path: Path) -> Path:
     """Return a unique temporary path in the folder of `path`, with the suffix of `path`."""
-    # Random, not the PID: PIDs are not unique across containers.
+    # Use random digits, since process ids are not unique across containers.
     return path.with_name(f".{path.stem}.{secrets.token_hex(8)}.part{path.suffix}")
 
 
@@ -33,9 +33,9 @@ def temporary_name(path: Path) -> Path:
 def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
 
-    The temporary name keeps the suffix of `path`, since image writers choose their format by it. With `durable` the
-    file is synchronised to disk before the rename, so that a power failure leaves no empty file. Callers that write
-    many files synchronise them together at the end (`sync_all`).
+    The temporary name keeps the suffix of `path`, since image writers choose their format by the suffix. With `durable`
+    the file is synchronised to disk before the rename, so that a power failure leaves no empty file. Callers that write
+    many files pass durable=False and synchronise all of them at the end (`sync_all`).
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = temporary_name(path)
@@ -103,7 +103,7 @@ def is_plain(relative: object) -> bool:
 def inside(root: Path, relative: str) -> Path:
     """Return the path of `relative`, a POSIX path from a manifest, below `root`.
 
-    Raises UserError if the path is absolute, contains "..", has an invalid name, is too long or leaves `root` by a
+    Raises UserError if the path is absolute or too long, contains ".." or an invalid name, or leaves `root` through a
     link.
     """
     if not is_plain(relative):
@@ -122,7 +122,7 @@ def inside(root: Path, relative: str) -> Path:
 
 
 def _has_link(root: Path, parts: Iterable[str]) -> bool:
-    """Whether a path below `root` has a link, as far as it exists."""
+    """Whether the existing part of a path below `root` contains a link."""
     path = os.fspath(root)
     for part in parts:
         path = f"{path}{os.sep}{part}"
@@ -137,7 +137,8 @@ def _has_link(root: Path, parts: Iterable[str]) -> bool:
 def _without_links(path: Path) -> Path:
     """Resolve a path that need not exist. Raises OSError or RuntimeError on cyclic links.
 
-    From Python 3.13 on, `Path.resolve` raises on cyclic links only if `strict`, which it also does on missing files.
+    From Python 3.13 on, `Path.resolve` detects cyclic links only with `strict`, which also makes missing files an
+    error.
     """
     try:
         return path.resolve(strict=True)
@@ -148,7 +149,7 @@ def _without_links(path: Path) -> Path:
 
 
 def check_plain_file(path: Path) -> int:
-    """Return the size of a file, bytes. Raises UserError on other types: opening a pipe or device may block."""
+    """Return the size of a file, bytes. Raises UserError on pipes, devices and other types: opening them may block."""
     try:
         state = path.lstat()
     except (OSError, ValueError):
@@ -163,7 +164,7 @@ def check_plain_file(path: Path) -> int:
 def new_folder(out: Path) -> Iterator[Path]:
     """Yield a hidden folder beside `out`; rename it to `out` on success, remove it on any failure.
 
-    Files are synchronised to disk before the rename. Folders left by killed writers of the same `out` are removed.
+    Files are synchronised to disk before the rename. Folders that killed writers left for the same `out` are removed.
     Raises UserError if `out` is not empty or another process is writing it.
     """
     check_free(out)
@@ -205,7 +206,7 @@ def copy_or_link(path: Path, to: Path, *, link: bool) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     if link:
         with contextlib.suppress(OSError):
-            # Link to the target: the target of a symbolic link may not exist in the new place.
+            # Link to the resolved file: a symbolic link might not lead to it from the new folder.
             os.link(path.resolve(), to)
             return
     if not _cloned(path, to):

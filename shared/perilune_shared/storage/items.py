@@ -1,4 +1,4 @@
-"""The files that a store lists."""
+"""List the files of a folder or of an object store."""
 
 import os
 from collections.abc import Iterator, Mapping
@@ -11,7 +11,7 @@ from perilune_shared.errors import UserError
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One file of a store, as listed."""
+    """A file in the listing of a store."""
 
     path: str
     """Path relative to the store."""
@@ -22,12 +22,12 @@ class Item:
 def local_items(folder: Path, prefix: str) -> Iterator[Item]:
     """Yield the files below a folder in the order of their paths; links are not followed.
 
-    Files and folders that another process deletes meanwhile are omitted.
+    Files and folders that another process deletes during the listing are omitted.
     """
     try:
         with os.scandir(folder) as scanned:
-            # "a-b" comes before "a/b", as in the listing of an object store. Entries of millions of files would fill
-            # memory, so only their names are kept.
+            # The slash sorts "a-b" before "a/b", as in the listing of an object store. Directory entries of millions
+            # of files would fill memory, so only names are kept.
             names = sorted(entry.name + ("/" if entry.is_dir(follow_symlinks=False) else "") for entry in scanned)
     except FileNotFoundError:
         return
@@ -45,7 +45,7 @@ def local_items(folder: Path, prefix: str) -> Iterator[Item]:
 def object_items(objects: Mapping[str, Any], prefix: str, address: str) -> Iterator[Item]:
     """Yield the objects that fsspec found below a prefix, in the order of their paths.
 
-    Raises UserError about `address` if the store lists a key elsewhere, or an invalid size.
+    Raises UserError, which names `address`, if the store lists a key outside the prefix or an invalid size.
     """
     for key in sorted(objects):
         path = key.lstrip("/")
@@ -54,13 +54,13 @@ def object_items(objects: Mapping[str, Any], prefix: str, address: str) -> Itera
                 continue
             raise UserError(address, "list", repr(key), "only keys below this address")
         path = path[len(prefix) + 1 :]
-        # A console may have made an empty object for a folder.
+        # Skip the empty objects that some web consoles create for folders.
         if path and not path.endswith("/"):
             yield Item(path, checked_size(objects[key].get("size"), f"{address}: {path}"))
 
 
 def checked_size(size: object, where: str) -> int:
-    """Return the size of an object as the store states it. Raises UserError if it is not a number of bytes."""
+    """Return the size that a store states for an object, bytes. Raises UserError if it is not a valid size."""
     if isinstance(size, bool) or not isinstance(size, int) or not 0 <= size < 2**53:
         raise UserError(where, "size", repr(size), "the size of an object, bytes")
     return size

@@ -1,8 +1,8 @@
 """Lock an output folder, so that only one process writes to it.
 
-The operating system holds the lock and releases it when the process ends for any reason. A record beside the lock file
-states the holder. On network drives that do not propagate locks between machines, only the record protects the folder:
-the holder renews it, and it expires ten minutes after the last renewal.
+The operating system manages the lock and releases it when the process ends for any reason. A record beside the lock
+file names the process that holds the lock. Some network drives do not propagate locks between machines; there only the
+record protects the folder. The holder renews the record, which expires ten minutes after the last renewal.
 """
 
 import contextlib
@@ -50,7 +50,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove temporary files of killed writers at any depth. No other process may be writing in the folder."""
+    """Remove temporary files of killed writers at any depth. Call it only if no other process writes in the folder."""
     for root, _, names in os.walk(folder):
         for name in filter(TEMPORARY_FILE.fullmatch, names):
             Path(root, name).unlink(missing_ok=True)
@@ -76,7 +76,7 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
             yield
     finally:
         if held.is_locked:
-            # Remove the file before the release: afterwards it may be another process's lock.
+            # Remove the file before releasing the lock: later it may be the lock of another process.
             if not held_elsewhere:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
@@ -84,7 +84,7 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
 
 
 def _seconds_left(record: Path) -> float:
-    """Return the seconds until the record of a process on another machine expires; 0 if there is none.
+    """Return the seconds until the record of a process on another machine expires; 0 if there is no such record.
 
     A record from this machine is ignored: since the lock was free, that process has ended.
     """
@@ -116,7 +116,7 @@ def _recorded(record: Path) -> Iterator[None]:
 
 
 def _read(record: Path) -> dict[str, Any] | None:
-    """Read the record of a holder; None if there is none."""
+    """Read the record of the holder; None if there is no record."""
     try:
         if not record.is_file() or record.stat().st_size > _LARGEST_RECORD_BYTES:
             return None

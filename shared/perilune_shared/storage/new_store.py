@@ -1,4 +1,4 @@
-"""Write a new dataset so that it appears whole or not at all, in a local folder or at an address."""
+"""Write a new dataset to a local folder or an object store so that it appears as a whole or not at all."""
 
 import contextlib
 import secrets
@@ -17,9 +17,9 @@ _NONCE_BITS = 64
 def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
     """Yield a store for new files; remove what was written on any failure.
 
-    A local folder is renamed to `out` at the end. In an object store, the create-only write of the file `claim`
-    excludes other writers. Its `content` is JSON of an unfinished dataset; the caller replaces it last. Raises
-    UserError if `out` is not empty or another process is writing it.
+    A local folder is renamed to `out` at the end. In an object store, the file `claim` excludes other writers, since it
+    is written only if it does not exist. `content` is its content, the JSON of an unfinished dataset; the caller
+    replaces this file last. Raises UserError if `out` is not empty or another process is writing to it.
     """
     store = open_store(out)
     if store.folder is not None:
@@ -27,7 +27,7 @@ def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
             yield LocalStore(aside)
         return
     check_empty(store)
-    # Blanks at the end of JSON have no meaning, so they can distinguish the claims of two writers.
+    # Trailing blanks have no meaning in JSON, so they can distinguish the claims of two writers.
     nonce = "".join(" \t"[int(bit)] for bit in f"{secrets.randbits(_NONCE_BITS):0{_NONCE_BITS}b}")
     try:
         store.write(claim, content + nonce.encode() + b"\n")
@@ -47,8 +47,9 @@ def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
 def new_files(out: Address) -> Iterator[Path]:
     """Yield a local folder for new files, which become the files at `out` when the block ends without an error.
 
-    They are renamed to a local folder, or copied into an object store: create-only, and removed there on any failure.
-    Raises UserError if `out` is not empty or another process is writing it.
+    The folder is renamed to a local `out`. Into an object store the files are copied; existing objects are not
+    overwritten, and on any failure the copies are removed. Raises UserError if `out` is not empty or another process is
+    writing to it.
     """
     store = open_store(out)
     if store.folder is not None:
@@ -72,7 +73,7 @@ def new_files(out: Address) -> Iterator[Path]:
 
 
 def check_empty(out: Address) -> None:
-    """Raise UserError if there are files at an address where new ones are to be written."""
+    """Raise UserError if an address for new files is not empty."""
     store = open_store(out)
     if store.folder is not None:
         files.check_free(store.folder)

@@ -1,4 +1,4 @@
-"""Object stores: fsspec's file systems, and their exceptions as errors of one line with the address."""
+"""Open object stores with fsspec, and convert its exceptions to one-line errors that name the address."""
 
 import contextlib
 import os
@@ -9,12 +9,12 @@ from typing import Any
 from perilune_shared.errors import UserError, one_line
 
 OBJECT_STORES = {"s3": "s3", "gs": "gcs", "memory": ""}
-"""Kinds of object stores, and the extra of perilune-shared that each needs."""
+"""The extra of perilune-shared that each kind of object store needs."""
 _TIMEOUTS_S = {"connect_timeout": 10, "read_timeout": 60}
 _LIBRARIES = ("aiohttp", "aiobotocore", "botocore", "fsspec", "gcsfs", "google", "requests", "s3fs", "urllib3")
-"""Libraries below fsspec that raise exceptions of their own."""
+"""Packages whose exceptions `store_faults` converts, besides OSError."""
 _ACCESS = re.compile(r"credential|token|accessdenied|forbidden|signature|access key|\b40[13]\b", re.I)
-"""The status as a word of its own: the number of a port may hold it."""
+"""Messages about missing access. 401 and 403 match only as whole words, since a port number may contain them."""
 _CREDENTIALS = {
     "s3": "credentials with access to it: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE",
     "gs": "credentials with access to it: GOOGLE_APPLICATION_CREDENTIALS, or `gcloud auth application-default login`",
@@ -22,12 +22,12 @@ _CREDENTIALS = {
 
 
 def file_system(kind: str, address: str) -> Any:
-    """Return fsspec's file system for a kind of address; listings are never cached, since others may write."""
+    """Return fsspec's file system for a kind of store; listings are not cached, since other processes may write."""
     import fsspec
 
     options: dict[str, Any] = {} if kind == "memory" else {"use_listings_cache": False}
     if kind == "s3":
-        # Part of the key by which fsspec keeps file systems: the variable may change within a process.
+        # fsspec caches file systems by their options, so pass the variable: it may change within a process.
         options |= {"endpoint_url": os.environ.get("AWS_ENDPOINT_URL"), "config_kwargs": _TIMEOUTS_S}
     try:
         with store_faults(address):
@@ -38,15 +38,15 @@ def file_system(kind: str, address: str) -> Any:
 
 
 def is_missing_bucket(error: Exception) -> bool:
-    """Whether an exception says that the bucket is missing, not only an object in it."""
+    """Whether an exception reports a missing bucket, not only a missing object."""
     return isinstance(error, FileNotFoundError) and "specified bucket" in str(error).lower()
 
 
 @contextlib.contextmanager
 def store_faults(address: str) -> Iterator[None]:
-    """Raise UserError about `address` instead of any exception of an object store, after the library's retries.
+    """Convert any exception of an object store to a UserError that names `address`; the library has retried before.
 
-    FileExistsError and FileNotFoundError about one object pass unchanged: callers handle them.
+    FileExistsError and FileNotFoundError about a single object are not converted, since callers handle them.
     """
     try:
         yield

@@ -16,10 +16,10 @@ _TYPE, _UNCOMPRESSED, _COMPRESSED, _DATA, _DATA_V2 = 1, 2, 3, 5, 8
 
 @dataclass(frozen=True, slots=True)
 class Pages:
-    """Totals over the pages of one column in one row group."""
+    """Totals of the pages of one column in one row group."""
 
     uncompressed_bytes: int
-    """Size after decompression that the page headers state, bytes."""
+    """Total size after decompression according to the page headers, bytes."""
     n_values: int
     """Number of values."""
     has_dictionary: bool
@@ -27,7 +27,7 @@ class Pages:
 
 
 def range_of(column: Any) -> tuple[int, int]:
-    """Return the range (start, end) of the pages of a column in the file, bytes; `column` is its metadata."""
+    """Return the byte range (start, end) of a column's pages in the file; `column` is pyarrow's column metadata."""
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
         start = column.dictionary_page_offset

@@ -1,9 +1,10 @@
-"""Open rasters from outside with rasterio: a few documented formats, and only the files that belong to them.
+"""Open untrusted rasters with rasterio, in a few documented formats and without reading other files.
 
-GDAL, which rasterio calls, opens more than a user expects: text in any of a hundred formats that refers to other files
-or to addresses, also where it is named `.tif`, and files beside a raster or named in its tags. So the format is
-recognised here, its driver alone is used, and the raster is opened through a temporary folder that holds links to
-nothing but its own files. rasterio is optional in some packages, so it is imported where it is used.
+GDAL, which rasterio calls, opens more than a user expects. It recognises about a hundred formats whatever the suffix,
+among them text that refers to other files or to addresses, and it reads files beside a raster or named in its tags.
+Therefore this module recognises the format, permits only the driver of that format, and opens the raster through a
+temporary folder that contains links to the raster's files alone. rasterio is optional in some packages, so it is
+imported where it is used.
 """
 
 import contextlib
@@ -51,12 +52,12 @@ _VRT_ELEMENTS = re.compile(
     "HideNoDataValue|ColorInterp|SimpleSource|ComplexSource|SourceFilename|SourceBand|SourceProperties|SrcRect|DstRect|"
     "NODATA|ScaleOffset|ScaleRatio|UseMaskBand"
 )
-"""Elements of a VRT that joins rasters; others compute, or refer to more files."""
+"""Permitted elements of a VRT; other elements compute values or refer to more files."""
 _OPTIONS = {"GDAL_PAM_ENABLED": "NO", "CPL_VSIL_CURL_ALLOWED_FILENAME": "none", "PROJ_NETWORK": "OFF"}
 _LARGEST_LABEL_BYTES = 2**22
 _LARGEST_WORLD_FILE_BYTES = 4096
 _LARGEST_BLOCK_BYTES = 2**29
-"""Largest block (tile or strip) of a raster with all bands that it interleaves, bytes: GDAL decodes whole blocks."""
+"""Maximum size of a decoded block (tile or strip) with all interleaved bands, bytes: GDAL decodes whole blocks."""
 _VALUE_BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "uint32": 4, "int32": 4, "float32": 4}
 _END = re.compile(rb"\r?\nE(?:ND|nd)\r?\n")
 _POINTER = re.compile(r"^[ \t]*(\^\w+|FILE_NAME)[ \t]*=[ \t\r\n]*\(?[ \t]*(\"[^\"]*\"|'[^']*'|[^\s,)]+)", re.M | re.I)
@@ -65,17 +66,17 @@ _FILE_NAME = re.compile(r"<(?:\w+:)?file_name\b[^>]*>(.*?)</", re.S)
 
 @dataclass(frozen=True, slots=True)
 class RasterFiles:
-    """The files of a raster and the driver that reads them."""
+    """Files of a raster, and the driver that reads them."""
 
     driver: str
     """GDAL's short name of the driver."""
     named: tuple[tuple[str, Path], ...]
-    """Name and path of the file that is opened, then of the data behind a label and of a world file, if there are any.
-    A label may name its data in another letter case than the file has."""
+    """Name and path of each file: first the file that GDAL opens, then data named by a label, then a world file. A
+    label may name its data file in different letter case."""
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """All files, the one that is opened first."""
+        """Paths of all files; the first is the file that GDAL opens."""
         return tuple(path for _, path in self.named)
 
 
@@ -85,12 +86,12 @@ def raster_files(
     field: str = "raster",
     tiles: Sequence[str] | None = None,
 ) -> RasterFiles:
-    """The files of a raster in one of the formats that `drivers` read; nothing but tiles is opened by GDAL.
+    """Return the files of a raster in one of the formats of `drivers`; GDAL opens only the tiles of a VRT here.
 
-    `tiles` permits a VRT, GDAL's text that joins several rasters, and lists all files that it may refer to, by their
-    paths from its folder. Raises UserError if the file is missing or of another format, if a label names a file outside
-    its folder, if a VRT refers to more than `tiles` or does more than join them, or if one of the files is not a
-    regular file.
+    A VRT, GDAL's text format that joins several rasters, is permitted only with `tiles`: all files that it may refer
+    to, as paths relative to its folder. Raises UserError if the file is missing or has another format, if a label names
+    a file outside its folder, if a VRT refers to files not in `tiles` or does more than join them, or if one of the
+    files is not a regular file.
     """
     if not path.is_file():
         found = "no such file" if not path.exists() else "a folder, a pipe or a device"
@@ -116,11 +117,10 @@ def raster_files(
 
 @contextlib.contextmanager
 def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
-    """Open a raster: a `rasterio.DatasetReader` for the time of the block. Needs rasterio.
+    """Open a raster and yield it as a `rasterio.DatasetReader`. Needs rasterio.
 
-    Files beside the raster that are not in `files` (.aux.xml, .ovr, .msk) are not read. Raises UserError if the raster
-    cannot be read, within the block too, if its tags or its projection refer to other files, or if one of its blocks is
-    too large.
+    Other files beside the raster (.aux.xml, .ovr, .msk) are not read. Raises UserError if reading fails, here or in the
+    body of the `with` statement, if tags or projection refer to other files, or if a block of the raster is too large.
     """
     import rasterio
     from rasterio._err import CPLE_BaseError
@@ -133,26 +133,26 @@ def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
             if files.driver == "VRT" and file == path:
                 shutil.copyfile(
                     file, Path(folder) / name
-                )  # GDAL follows a link to a VRT, and looks for its tiles there
+                )  # a copy, since GDAL would follow a link to a VRT and look for the tiles there
             else:
                 (Path(folder) / name).symlink_to(file.resolve())
         try:
             with rasterio.Env(**_OPTIONS):
                 with warnings.catch_warnings():
-                    # The caller that needs the place reports a raster without one.
+                    # Callers that need a georeference report its absence themselves.
                     warnings.simplefilter("ignore")
                     raster = rasterio.open(Path(folder) / path.name, driver=files.driver, sharing=False)
                 with raster:
                     _refuse_references(path, raster, Path(folder), field)
                     yield raster
-        # GDAL's own errors are not wrapped everywhere.
+        # rasterio does not wrap all errors of GDAL.
         except (RasterioError, CRSError, CPLE_BaseError) as error:
             found = str(error.__cause__ or error).replace(f"{folder}{os.sep}", "")
             raise UserError(path, field, found, f"a readable {_NAMES[files.driver]}") from None
 
 
 def label_text(files: RasterFiles) -> str:
-    """The text of a PDS label, up to its end."""
+    """Return the text of a PDS label, without what follows its end."""
     with files.paths[0].open("rb") as stream:
         return _label_in(stream.read(_LARGEST_LABEL_BYTES), files.driver)
 
@@ -165,7 +165,7 @@ def _label_in(head: bytes, driver: str) -> str:
 
 
 def _driver_of(head: bytes) -> str:
-    """GDAL's driver of a file that begins with `head`; empty if the format is unknown here."""
+    """Return GDAL's driver for a file that begins with `head`; empty if the format is not supported."""
     for magic, driver in _MAGIC.items():
         if head.startswith(magic):
             return driver
@@ -183,7 +183,7 @@ def _expected(drivers: Sequence[str]) -> str:
 
 
 def _hint(path: Path, head: bytes) -> str:
-    """What to do with a file of another format."""
+    """Return advice for a file of another format."""
     if b"<VRTDataset" in head[: 2**16]:
         return f"; make one of it with: gdal_translate {path.name} {path.stem}.tif, or list its tiles in vrt_files"
     for suffix in (".lbl", ".LBL", ".xml"):
@@ -194,7 +194,7 @@ def _hint(path: Path, head: bytes) -> str:
 
 
 def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[str]:
-    """Names of the files to which the label of a PDS or ISIS file points."""
+    """Return the names of the files to which the label of a PDS or ISIS file points."""
     label = _label_in(head, driver)
     complete = len(head) < _LARGEST_LABEL_BYTES or (driver != "PDS4" and _END.search(head) is not None)
     if driver == "PDS4":
@@ -217,7 +217,7 @@ def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[st
 
 
 def _vrt_files(path: Path, head: bytes, field: str, tiles: Sequence[str]) -> RasterFiles:
-    """The files of a VRT that joins the given tiles and does nothing else; see `raster_files`."""
+    """Return the files of a VRT that only joins the given tiles; see `raster_files`."""
     if b"<VRTDataset" not in head[: 2**16] or len(head) >= _LARGEST_LABEL_BYTES or b"<!" in head:
         raise UserError(path, field, "no VRT, or a long one", "a VRT with the tiles of vrt_files")
     try:
@@ -238,20 +238,20 @@ def _vrt_files(path: Path, head: bytes, field: str, tiles: Sequence[str]) -> Ras
             continue
         files[name] = inside(path.parent, name)
         with opened_raster(raster_files(files[name], ("GTiff", "JP2OpenJPEG"), field), field):
-            pass  # refused here if its tags refer to other files
+            pass  # opening it raises UserError if its tags refer to other files
     return RasterFiles("VRT", tuple(files.items()))
 
 
 def _beside(path: Path, name: str, field: str) -> Path | None:
-    """The file of this name, or of this name in other letter case, in the folder of a label; None if there is none."""
+    """Return the file that a label names, in the folder of the label, ignoring letter case; None if it is missing."""
     folder = path.resolve().parent
     beside = path.parent / name
     if not beside.exists():
-        # Labels often have another letter case than the files.
+        # The letter case in labels often differs from the files.
         same = (entry for entry in path.parent.iterdir() if entry.name.lower() == name.lower())
         beside = next(same, beside)
     if not beside.exists():
-        return None  # GDAL names the data that it misses; other pointers may be to documents that are not here
+        return None  # GDAL reports missing data; other pointers may name documents that were not downloaded
     if not beside.is_file():
         raise UserError(beside, field, "a folder, a pipe or a device", f"a file, as {path.name} says")
     if not beside.resolve().is_relative_to(folder):
@@ -260,7 +260,7 @@ def _beside(path: Path, name: str, field: str) -> Path | None:
 
 
 def _world_file(path: Path) -> list[Path]:
-    """The world file (.tfw, .pgw, ...) beside a raster, in a list, if there is one."""
+    """Return a list with the world file (.tfw, .pgw, ...) beside a raster, or an empty list."""
     suffix = path.suffix.lower().removeprefix(".")
     for ending in (f"{suffix[:1]}{suffix[-1:]}w", f"{suffix}w", "wld"):
         for beside in (path.with_suffix(f".{ending}"), path.with_suffix(f".{ending.upper()}")):

@@ -17,21 +17,20 @@ from perilune_shared.storage.store import open_store
 
 Out = TypeVar("Out", str, Path)
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
-"""From linux/fcntl.h and linux/fs.h."""
+"""Constants from linux/fcntl.h and linux/fs.h."""
 
 
 @contextlib.contextmanager
 def replaceable(
     out: Out, known_by: tuple[str, ...], *, overwrite: bool, inputs: tuple[str | Path, ...] = ()
 ) -> Iterator[Out]:
-    """Yield where a command is to write: `out`, or with `overwrite` a new folder that then takes the place of `out`.
+    """Yield where a command should write: `out`, or with `overwrite` a new folder that replaces `out` at the end.
 
     The old folder stays until the new one is complete; an interrupted command leaves one of the two. `known_by` has
-    patterns of files that the command always writes: the folder is replaced only if it has a match for each, so that a
-    wrong `out` deletes no other data. `inputs` are what the command reads: paths or addresses.
-
-    Raises UserError if the folder is not empty and not to be replaced. With `overwrite` raises UserError if a file of
-    `known_by` is missing, if the folder holds an input or the current folder, or if `out` is in an object store.
+    patterns of files that the command always writes. The folder is replaced only if each pattern matches a file in it,
+    so that a wrong `out` deletes no other data. `inputs` are the paths or addresses that the command reads.
+    Without `overwrite`, raises UserError if the folder is not empty. With `overwrite`, raises UserError if a pattern
+    has no match, if the folder contains an input or the current folder, or if `out` is in an object store.
     """
     folder = open_store(out).folder
     if overwrite and folder is None:
@@ -74,7 +73,7 @@ def _check_replaceable(
 
 
 def _replace(folder: Path, made: Path) -> None:
-    """Put a folder in the place of another one, which is deleted."""
+    """Replace a folder by another one and delete the old one."""
     with interrupts_held():
         if not _exchanged(folder, made):
             old = made.with_suffix(".old")
@@ -89,7 +88,7 @@ def _replace(folder: Path, made: Path) -> None:
 
 
 def _exchanged(folder: Path, other: Path) -> bool:
-    """Exchange two folders in one step, if the system can (Linux), so that a killed process leaves both whole."""
+    """Exchange two folders atomically if the system can (Linux), so that a killed process leaves both intact."""
     renameat2 = getattr(ctypes.CDLL(None), "renameat2", None) if os.name == "posix" else None
     names = os.fsencode(folder), os.fsencode(other)
     return (

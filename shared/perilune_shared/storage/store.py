@@ -3,10 +3,11 @@
 Use:
 
     store = open_store("s3://bucket/moon")           # or a path, gs://bucket/prefix, memory://name
-    store.write("frames/s000/t000/000000.png", png)  # the whole object or nothing
+    store.write("frames/s000/t000/000000.png", png) # atomic
     store.read("dataset.json")
 
-All paths are relative POSIX paths of plain names. Every fault of an object store is a UserError with its address.
+All paths are relative POSIX paths of plain names. Every fault of an object store raises a UserError that names the
+address.
 """
 
 import abc
@@ -31,7 +32,7 @@ _KINDS = "a path, s3://bucket/prefix, gs://bucket/prefix or memory://name"
 
 
 class Store(abc.ABC):
-    """The files below one address. Get one with `open_store`."""
+    """Base class for the files below one address; `open_store` returns an instance."""
 
     address: str
     """Folder or prefix as text, without a slash at the end."""
@@ -60,7 +61,7 @@ class Store(abc.ABC):
         return hash(self.address)
 
     def exists(self, path: str) -> bool:
-        """Whether there is such a file."""
+        """Whether a file exists."""
         return self.size(path) is not None
 
     def plain_size(self, path: str) -> int:
@@ -85,11 +86,11 @@ class Store(abc.ABC):
 
     @abc.abstractmethod
     def list(self, prefix: str = "") -> Iterator[Item]:
-        """Yield all files below a prefix, sorted by path. Links, pipes and devices of a folder are included."""
+        """Yield all files below a prefix, sorted by path; in a folder also links, pipes and devices."""
 
     @abc.abstractmethod
     def size(self, path: str) -> int | None:
-        """Return the size of a file, bytes; None if it is missing. Raises UserError if it is no file of the store."""
+        """Return the size of a file, bytes; None if it is missing. Raises UserError if it is not a regular file."""
 
     @abc.abstractmethod
     def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
@@ -101,14 +102,15 @@ class Store(abc.ABC):
 
     @abc.abstractmethod
     def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
-        """Write a new file: all of it or nothing. A file with equal content is left as it is.
+        """Write a new file atomically; an existing file with equal content stays unchanged.
 
-        With `durable`, a local file is synchronised to disk. Raises FileExistsError if it exists with other content.
+        With `durable`, a local file is synchronised to disk. Raises FileExistsError if the file exists with other
+        content.
         """
 
     @abc.abstractmethod
     def replace(self, path: str, content: bytes, *, durable: bool = True) -> None:
-        """Write a file: all of it or nothing; replaces a file of that path.
+        """Write a file atomically; an existing file is replaced.
 
         With `durable`, a local file is synchronised to disk.
         """
@@ -131,7 +133,7 @@ Address = str | os.PathLike[str] | Store
 
 
 class LocalStore(Store):
-    """A local folder. Links that leave it, pipes and devices are refused."""
+    """A local folder. Access to pipes, devices and links that leave the folder raises UserError."""
 
     folder: Path
 
@@ -204,7 +206,7 @@ class LocalStore(Store):
 
 
 class ObjectStore(Store):
-    """A prefix of an object store, by fsspec. Usable in processes started by fork and in several threads."""
+    """A prefix of an object store, accessed through fsspec; works in forked processes and in several threads."""
 
     def __init__(self, address: str):
         self.address = address
@@ -217,7 +219,7 @@ class ObjectStore(Store):
 
     @property
     def _system(self) -> Any:
-        """The file system of fsspec; opened again in a new process, since connections do not survive a fork."""
+        """fsspec's file system; opened again in a forked process, since connections do not survive a fork."""
         if self._pid != os.getpid():
             self._opened, self._pid = file_system(self._kind, self.address), os.getpid()
         return self._opened
@@ -272,7 +274,7 @@ class ObjectStore(Store):
         return cast(BinaryIO, Ranges(functools.partial(self._exactly, path), self.plain_size(path)))
 
     def _exactly(self, path: str, start: int, end: int) -> bytes:
-        """Return the bytes [start, end) of a file. Raises UserError if the store gives more or fewer."""
+        """Return the bytes [start, end) of a file. Raises UserError if the store returns more or fewer bytes."""
         content = self.read(path, start, end)
         if len(content) != max(end - start, 0):
             found = f"{len(content)} bytes of {max(end - start, 0)}"
@@ -284,7 +286,7 @@ class ObjectStore(Store):
             try:
                 self._system.pipe_file(self._key(path), content, mode="create")
             except Exception:
-                # A repeated request may find what the first one wrote, though its answer was lost.
+                # If the answer to a first request was lost, its repetition finds the object that the first one wrote.
                 found = self.size(path)
                 if found is None:
                     raise
@@ -308,14 +310,15 @@ class ObjectStore(Store):
     def delete_below(self, prefix: str) -> None:
         keys = [self._key(item.path) for item in self.list(prefix)]
         with store_faults(self.at(prefix)):
-            if keys:  # many in one request, where the store allows it
+            if keys:  # one request deletes many objects if the store supports it
                 self._system.rm(keys)
 
 
 def open_store(address: Address) -> Store:
     """Open the store at a path, s3://bucket/prefix, gs://bucket/prefix or memory://name; nothing is read or written.
 
-    A store is returned as it is. Raises UserError if the address is of another kind, or its library is not installed.
+    An open store is returned unchanged. Raises UserError on another kind of address and if its library is not
+    installed.
     """
     if isinstance(address, Store):
         return address

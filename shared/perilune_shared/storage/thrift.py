@@ -1,4 +1,4 @@
-"""Parse structs in Thrift's compact protocol: page headers and footers of Parquet files, which are untrusted."""
+"""Parse untrusted structs in Thrift's compact protocol: page headers and footers of Parquet files."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -7,11 +7,11 @@ _BOOLS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _STRUCT = (1, 2), 3, (4, 5, 6)
 _MAX_DEPTH = 8
 _LONG = 15
 Fields = dict[int, Any]
-"""Values of the fields of a struct, by field number of parquet.thrift; texts are bytes."""
+"""Field values of a struct, by field number in parquet.thrift; texts are bytes."""
 
 
 def parse(buffer: bytes, start: int = 0) -> tuple[Fields, int]:
-    """Parse the struct at an offset; return it, and the offset after it. Raises ValueError if it is damaged."""
+    """Parse the struct at an offset; return it and the offset after it. Raises ValueError if the struct is damaged."""
     try:
         fields, end = _struct(buffer, start, 0)
     except IndexError:
@@ -20,7 +20,7 @@ def parse(buffer: bytes, start: int = 0) -> tuple[Fields, int]:
 
 
 def items_of(buffer: bytes, number: int) -> Iterator[Fields]:
-    """Yield the structs in the list of this field number of a struct, one at a time, to limit memory.
+    """Yield the structs in the list with a given field number, one at a time to limit memory.
 
     Raises ValueError if the struct is damaged.
     """
@@ -49,7 +49,7 @@ def _field_head(buffer: bytes, at: int, number: int) -> tuple[int, int, int]:
 
 
 def _list_head(buffer: bytes, at: int) -> tuple[int, int, int]:
-    """Return length, type and start of the items of a list."""
+    """Return number, type and start offset of the items of a list."""
     length, inner = buffer[at] >> 4, buffer[at] & 15
     if length < _LONG:
         return length, inner, at + 1
@@ -77,7 +77,7 @@ def _value(kind: int, buffer: bytes, at: int, depth: int) -> tuple[Any, int]:
     if kind in _INTEGERS:
         value, at = _varint(buffer, at)
         return _signed(value), at
-    if kind in _BOOLS:  # of a field; the type is the value
+    if kind in _BOOLS:  # the type of a boolean field is the value
         return kind == _BOOLS[0], at
     if kind == _TEXT:
         length, at = _varint(buffer, at)
@@ -90,7 +90,7 @@ def _value(kind: int, buffer: bytes, at: int, depth: int) -> tuple[Any, int]:
         length, inner, at = _list_head(buffer, at)
         items = []
         for _ in range(length):
-            # Each item takes at least a byte, so a length beyond the buffer ends with IndexError.
+            # Each item takes at least one byte, so a length beyond the buffer causes an IndexError.
             item, at = _bytes(buffer, at, 1) if inner in _BOOLS else _value(inner, buffer, at, depth + 1)
             items.append(item)
         return items, at

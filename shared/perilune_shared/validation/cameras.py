@@ -1,4 +1,4 @@
-"""Check the frames of several cameras on one body: names, and the poses of one instant against the extrinsics."""
+"""Check frames of several cameras on one body: camera names, and poses at one instant against the mountings."""
 
 from collections.abc import Iterator
 
@@ -11,15 +11,15 @@ from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.validation.faults import Fault
 
 _TOLERANCE = 1e-6
-"""Largest difference of the body's pose by two cameras: position, metres; elements of the rotation matrix; time, s."""
+"""Maximum difference between body poses from two cameras: position, metres; rotation matrix elements; time, s."""
 _COLUMNS = ["frame_id", "trajectory_id", "frame_index", "time_s", "split", "position_m", "rotation_wxyz", "camera"]
 
 
 def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault]:
-    """Yield the faults of the frames of one scene of a dataset of several cameras; `where` is their file.
+    """Yield the faults of the frames of one scene in a dataset of several cameras; `where` is their file.
 
-    The pose of the body follows from the pose of each camera and its mounting. It must be the same for all cameras of
-    one instant, as must be time and split. Frames of unknown cameras are reported with their trajectory.
+    The pose of the body is computed from the pose and the mounting of each camera. Body pose, time and split must be
+    equal for all cameras at one instant. Frames of unknown cameras are reported with their trajectory.
     """
     cameras = dataset.info.cameras or {}
     rows = dataset.table("frames", _COLUMNS, scene_id=scene_id).to_pandas()
@@ -47,7 +47,7 @@ def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault
 
 
 def _body_poses(dataset: Dataset, rows: pd.DataFrame) -> np.ndarray:
-    """Position of the body in O_L, metres, and elements of rotation_site_from_body (N, 12), by each row's camera."""
+    """Return body poses (N, 12) from each row's camera: position in O_L, metres, then rotation_site_from_body."""
     position = np.stack(rows["position_m"].to_list())
     rotation = matrix_from_quaternion(np.stack(rows["rotation_wxyz"].to_list()))
     records = [dataset.info.camera_of(name) for name in rows["camera"]]

@@ -1,4 +1,4 @@
-"""The class Fault, and the checks of one part: name, schema, values."""
+"""The class Fault, and checks of a single part: name, schema and values."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -71,7 +71,7 @@ _RANGES = {
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
 MOST_OF_COLUMN = 1000
-"""Maximum number of faults of one column that are listed; others are counted."""
+"""Maximum number of listed faults of one column; further faults are only counted."""
 _MAX_PLAUSIBLE = 1e12
 """Largest plausible value of any length, time or size, far above the values of any trajectory."""
 
@@ -91,7 +91,7 @@ class Fault:
     expected: str
     """Value expected."""
     n_faults: int = 1
-    """Number of faults that it stands for; above 1 for the last one of a column with very many."""
+    """Number of faults that this object represents; above 1 only for the summary of faults that are not listed."""
 
     @classmethod
     def of(cls, file: object, row: int | None, column: object, found: object, expected: object) -> "Fault":
@@ -111,9 +111,9 @@ class Fault:
 
 
 class FaultList:
-    """Collects the first faults of each file and column, at most MOST_OF_COLUMN of a column, and counts the others.
+    """Collects the first fault of each file and column, at most MOST_OF_COLUMN per column, and counts the others.
 
-    So memory is bounded for datasets with a fault in each of millions of files.
+    This limits memory for datasets with a fault in each of millions of files.
     """
 
     def __init__(self) -> None:
@@ -121,7 +121,7 @@ class FaultList:
         self._n_of_column: dict[str, int] = {}
 
     def add(self, fault: Fault) -> None:
-        """Add a fault; one of a file and column that has one is ignored."""
+        """Add a fault, unless the list has a fault of the same file and column."""
         key = fault.file, fault.column, fault.row is None
         if key in self._first:
             return
@@ -131,14 +131,14 @@ class FaultList:
             self._first[key] = fault
 
     def add_made(self, column: str, make: Callable[[], Fault]) -> None:
-        """Add a fault of this column that `make` returns; it is only made if it is listed."""
+        """Add a fault of a column; `make` creates it and is called only if the fault is listed."""
         if self._n_of_column.get(column, 0) < MOST_OF_COLUMN:
             self.add(make())
         else:
             self._n_of_column[column] += 1
 
     def extend(self, faults: Iterable[Fault]) -> None:
-        """Add faults in turn."""
+        """Add faults in order."""
         for fault in faults:
             self.add(fault)
 
@@ -146,7 +146,7 @@ class FaultList:
         return len(self._first)
 
     def faults(self) -> list[Fault]:
-        """Return the faults; the last ones stand for those that were only counted."""
+        """Return the listed faults, then one summary for each column with faults that were only counted."""
         kept = dict.fromkeys(self._n_of_column, 0)
         for fault in self._first.values():
             kept[fault.column] += 1
@@ -155,12 +155,12 @@ class FaultList:
 
 
 def more_faults(column: str, n_faults: int) -> Fault:
-    """Return the fault that stands for others of a column, which are not listed."""
+    """Return a fault that summarises the faults of a column that are not listed."""
     return Fault("...", None, column, f"{n_faults} more faults", "none; the first ones are listed", n_faults)
 
 
 def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
-    """Yield the faults that can be found in one part alone."""
+    """Yield the faults that can be found without reading other parts."""
     path, stem = dataset.store.folder and dataset.store.folder / where, PurePosixPath(where).stem
     if path is not None and path.is_symlink():
         yield Fault.of(where, None, "part", "a link", "a regular file")
@@ -196,13 +196,13 @@ def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
 
 
 def _definition(field: pa.Field) -> tuple[object, ...]:
-    """Return all that must agree. Versions may word the meaning of a column differently."""
+    """Return the properties of a column that must agree; its description may differ between versions."""
     metadata = {key: value for key, value in (field.metadata or {}).items() if key != b"meaning"}
     return field.type, field.nullable, metadata
 
 
 def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
-    """Yield a fault if a part has rows that its name excludes: readers select parts by name."""
+    """Yield a fault if a part has rows that its name excludes, since readers select parts by name."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem):
         return
@@ -253,5 +253,5 @@ def _value_faults(where: str, first_row: int, field: pa.Field, column: pa.Array)
 
 
 def matches(pattern: str, text: object) -> bool:
-    """Whether the whole text matches a pattern."""
+    """Whether a pattern matches the whole text."""
     return isinstance(text, str) and re.fullmatch(pattern.removeprefix("^").removesuffix("$"), text) is not None

@@ -1,7 +1,8 @@
 """Compare the files of a dataset with its index, and find files that do not belong to it.
 
-Other tools may read files that this package ignores: any file below manifest/, any Parquet file or image in the folder.
-So every unknown file is a fault, and so is every file that is not of the dataset format, even if the index names it.
+Other tools may read files that this package ignores: any file below manifest/, and any Parquet file or image in the
+folder. Therefore every unknown file is a fault. A file that does not belong to the dataset format is a fault even if
+the index lists it.
 """
 
 import functools
@@ -37,19 +38,19 @@ EXTRA_NAMES = frozenset(
 )
 """Files that tools or users may add directly in the dataset; `perilune-manifest card` adds them to the index."""
 _RECORDS = "work"
-"""Folder of the records of a rendering in progress."""
+"""Folder for the records of a rendering in progress."""
 _LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
 _READ_FOLDERS = ("manifest/", "shards/")
-"""Folders whose files are read without being named by a row."""
+"""Folders whose files are read although no row names them."""
 _ROWS_AT_A_TIME = 10_000
 _IN_INDEX = "as in the index"
 _HASH = "SHA-256"
 
 
 def check_files(dataset: Dataset, progress: Progress = NO_PROGRESS, replaced: Container[str] = ()) -> None:
-    """Raise UserError about the first fault of the files; a new index would hide it.
+    """Raise UserError about the first fault of the files, since a new index would hide it.
 
-    Files that will be `replaced`, frames, and unknown files that nothing reads may have faults.
+    Faults are ignored in files that will be `replaced`, in frames, and in unknown files that nothing reads.
     """
     for fault in file_faults(dataset, progress):
         unread = fault.column == "file" and not fault.file.startswith(_READ_FOLDERS)
@@ -62,8 +63,8 @@ def check_files(dataset: Dataset, progress: Progress = NO_PROGRESS, replaced: Co
 def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[Fault]:
     """Yield faults of dataset.json, of the index and of all files. The content of frames is not read.
 
-    The lock of a writer is accepted. In a dataset that is not complete, which has no index, so are its temporary files
-    and the records of its rendering.
+    A writer's lock file is not a fault. An incomplete dataset has no index, and may also have temporary files and the
+    records of its rendering.
     """
     try:
         frames = _named_files(dataset, "frames", IMAGE_KINDS)
@@ -85,7 +86,7 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
         expected = "the SHA-256 that is its last member, of the text before it"
         yield Fault.of(INFO_NAME, None, _HASH, "a different SHA-256", expected)
     try:
-        # Read again: a card may have been added since the dataset was opened.
+        # Read dataset.json again: a card may have been added since the dataset was opened.
         info = read_info(dataset.store)
         rows = read_index(dataset.store, info)
     except UserError as error:
@@ -107,14 +108,14 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
 
 
 def _named_files(dataset: Dataset, table: str, kinds: Sequence[ImageKind | SceneFileKind]) -> pa.Table:
-    """Return path, bytes and sha256 of the files that frames or scenes have, as in that table."""
+    """Return path, bytes and sha256 of the files that are named in the table frames or scenes."""
     pieces = [pa.schema([field.with_nullable(True) for field in INDEX]).empty_table()]
     if dataset.info.images == "files":
         columns = [f"{kind}_{name}" for kind in kinds for name in ("path", "bytes", "sha256")]
         rows = dataset.table(table, columns)
         for kind in kinds:
             of_kind = rows.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
-            # Files of other types stay unexpected, even if a row names them.
+            # Files of other types remain faults, even if a row names them.
             fits = pc.and_(
                 pc.ends_with(of_kind["path"], SUFFIXES[kind]),
                 pc.invert(pc.match_substring_regex(of_kind["path"], "^(manifest|shards|index)/")),
@@ -131,16 +132,16 @@ def _named_by_format(dataset: Dataset) -> set[str]:
 
 
 def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[str, int], list[Fault]]:
-    """List the files: return the sizes of those that are known, bytes, and faults of the others.
+    """List all files; return the sizes of known files, bytes, and a fault for each unknown file or folder.
 
-    An unknown folder is one fault. Memory does not grow with the number of unknown files.
+    Memory does not grow with the number of unknown files.
     """
     fixed = {INFO_NAME, *_LOCKS, *(part.path for part in info.index)}
     folders = {path.rpartition("/")[0] for paths in (known, fixed) for path in paths}
     folders |= {index.FOLDER, *(f"manifest/{table}" for table in TABLES)}
     folders |= {str(parent) for folder in folders for parent in PurePosixPath(folder).parents}
     sizes: dict[str, int] = {}
-    # Apart, so that no number of other files hides those that are read.
+    # Separate lists, so that many files elsewhere cannot hide unknown files in folders that are read.
     in_read_folders, elsewhere = FaultList(), FaultList()
     last = ""
     for item in dataset.store.list():
@@ -150,7 +151,7 @@ def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[
         elif path not in fixed and not (not info.complete and _is_of_rendering(path)):
             folder = path.rpartition("/")[0]
             unknown = path if folder in folders else _top_unknown(folder, folders)
-            # The files of a folder follow each other.
+            # The files of one folder follow each other in the listing.
             if unknown != last:
                 strays = in_read_folders if unknown.startswith(_READ_FOLDERS) else elsewhere
                 strays.add_made("file", functools.partial(_stray, unknown))
@@ -168,13 +169,13 @@ def _is_of_rendering(path: str) -> bool:
 
 
 def _top_unknown(folder: str, folders: set[str]) -> str:
-    """Return the first folder above, or this one, that is not in `folders`."""
+    """Return the topmost folder that is not in `folders`: this folder or one above it."""
     above = [*reversed(PurePosixPath(folder).parents)][1:]
     return next((str(parent) for parent in above if str(parent) not in folders), folder)
 
 
 def _cure(path: str) -> str:
-    """Return what should be done about an unknown file."""
+    """Return advice on an unknown file."""
     name = PurePosixPath(path).name
     if path in EXTRA_NAMES:
         return "a file in the index; `perilune-manifest card` on the dataset adds it, or delete it"
@@ -184,9 +185,9 @@ def _cure(path: str) -> str:
 
 
 def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]:
-    """Compare the index with path, size and hash in the table frames or scenes; yield the first difference of each.
+    """Compare path, size and hash in the index with the table frames or scenes; yield the first difference of each.
 
-    The file of these faults is the folder of the index.
+    These faults name the index folder as their file.
     """
     rows_in_index = pc.index_in(named["path"], rows["path"].combine_chunks())
     if rows_in_index.null_count:
@@ -232,6 +233,6 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
 
 
 def _rows_of(rows: pa.Table) -> Iterator[tuple[str, int, str]]:
-    """Yield path, size and hash of each row; few rows at a time become objects of Python."""
+    """Yield path, size and hash of each row; converts few rows to Python objects at a time."""
     for batch in rows.to_batches(max_chunksize=_ROWS_AT_A_TIME):
         yield from zip(*(batch[name].to_pylist() for name in INDEX.names), strict=True)

@@ -1,4 +1,4 @@
-"""Check a dataset's frames, as files, against the manifest."""
+"""Check the files of a dataset's frames against the manifest."""
 
 import contextlib
 import hashlib
@@ -15,7 +15,7 @@ from perilune_shared.validation.faults import Fault
 
 
 def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
-    """Yield missing frames and faults in size, header and hash of the files of every frame."""
+    """Yield a fault for each missing frame file and each wrong size, header or hash."""
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
     columns = [
         "frame_id",

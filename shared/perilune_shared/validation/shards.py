@@ -17,9 +17,9 @@ from perilune_shared.validation.images import png_faults
 
 
 def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
-    """Yield faults of packed frames: every frame occurs once, in its split's shards, with its rows of the manifest.
+    """Yield faults of packed frames: each frame must occur once, in a shard of its split, and match the manifest.
 
-    Reads one row group at a time, and the tables of its trajectories.
+    Reads one row group at a time, together with the tables of its trajectories.
     """
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
     missing = set(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())

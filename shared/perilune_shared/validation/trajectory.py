@@ -1,4 +1,4 @@
-"""Check one trajectory: frames against scene and camera, labels against craters and poses, times of measurements."""
+"""Check one trajectory: frames against scene and camera, labels against craters and poses, measurement times."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from perilune_shared.validation.faults import Fault
 
 _LABEL_TOLERANCE_PX = 1e-6
 _LABEL_ROUNDING = 2.0**-23
-"""Relative error of a float32, with a margin of 2."""
+"""Maximum relative rounding error of a float32, times 2 as a margin."""
 _SUN_TOLERANCE = 1e-9
 _FARTHEST_M = 1e9
 _TIME_TOLERANCE_S = 1e-6
@@ -40,11 +40,11 @@ class TrajectoryRows:
     labels: pa.Table
     """Labels of these frames."""
     where: dict[str, str]
-    """Files to report, by the names of the tables `frames` and `labels`."""
+    """Files to name in faults, by table (`frames` or `labels`)."""
 
 
 def trajectory_faults(info: DatasetInfo, rows: TrajectoryRows) -> Iterator[Fault]:
-    """Yield the faults of a trajectory: of its frames against scene and camera, of its labels against their source."""
+    """Yield the faults of a trajectory: frames against scene and camera, labels against craters and poses."""
     frames, where = rows.frames, rows.where
     names = frames["camera"].unique().to_pylist()
     if info.cameras is not None and (len(names) != 1 or names[0] not in info.cameras):
@@ -112,7 +112,7 @@ def _labels(
     labels: pa.Table,
     files: dict[str, str],
 ) -> Iterator[Fault]:
-    """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
+    """Check the references of labels, and compare their ellipses with ellipses projected from crater and pose."""
     where = files["labels"]
     frame_of = _row_numbers(labels["frame_id"], frames["frame_id"])
     crater_of = _row_numbers(labels["crater_id"], craters["crater_id"])
@@ -170,7 +170,8 @@ def _projected(
 ) -> dict[str, Array]:
     """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames.
 
-    With a rolling shutter of `row_s` seconds from row to row, a crater is seen from the pose of its centre's row.
+    With a rolling shutter (`row_s` seconds from row to row), each crater is projected from the camera pose at which the
+    row of its centre is exposed.
     """
     rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
     centre = np.stack([craters[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
@@ -187,7 +188,7 @@ def _projected(
     radius = craters["diameter_m"].to_numpy()[crater_of] / 2
     valid = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(normal_in_camera) <= 2).all(axis=1)
     valid &= (radius > 0) & (radius < _FARTHEST_M)
-    # Replace invalid input by a circle behind the camera: its projection is NaN, so the label does not match.
+    # Replace invalid input by a circle behind the camera, whose projection is NaN, so that the label does not match.
     in_camera[~valid], normal_in_camera[~valid], radius[~valid] = (0, 0, -10), (0, 0, 1), 1
     with np.errstate(all="ignore"):
         try:
@@ -213,9 +214,9 @@ def _vectors(column: pa.ChunkedArray) -> Array:
 
 
 def measurement_faults(table: str, rows: pa.Table, trajectory: dict) -> Iterator[Fault]:
-    """Yield the faults of the rows of `inertial` or `ranges` of a trajectory; `trajectory` is its row.
+    """Yield the faults of a trajectory's rows of `inertial` or `ranges`; `trajectory` is the row of the trajectory.
 
-    Times must increase, for each grade, from 0 to the duration of the trajectory. The intervals of inertial
+    For each grade, times must increase and lie between 0 and the duration of the trajectory. The intervals of inertial
     measurements must follow each other without gaps.
     """
     where, key = f"manifest/{table}", f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"

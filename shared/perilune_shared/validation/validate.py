@@ -1,6 +1,6 @@
 """Check a whole dataset and return its faults: file, row, column, value found and value expected.
 
-Tables are read by part, then by trajectory, so memory does not grow with the dataset.
+Tables are read part by part, then trajectory by trajectory, so memory does not grow with the dataset.
 """
 
 from collections import defaultdict
@@ -67,7 +67,7 @@ def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
 
 
 def _table_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
-    """Check rows of several tables against each other."""
+    """Check the rows of different tables against each other."""
     counts = count_rows(dataset).model_dump()
     for name, present in counts.items():
         counted = getattr(dataset.info.counts, name)

@@ -1,8 +1,8 @@
-"""Read crater catalogues: longitude, latitude and diameter, from the columns that a file has.
+"""Read longitude, latitude and diameter from crater catalogues with known or stated columns.
 
-Recognised by their columns: Robbins 2018 (doi 10.1029/2018JE005592), Head et al. 2010, Povilaitis et al. 2018 (also as
-LROCCraters.csv of DeepMoon), the gazetteer of the IAU, and every table with latitude, longitude and a diameter or
-radius whose name states its unit, as craterpy's.
+These catalogues are recognised by their columns: Robbins 2018 (doi 10.1029/2018JE005592), Head et al. 2010, Povilaitis
+et al. 2018 (also as LROCCraters.csv of DeepMoon), the gazetteer of the IAU, and every table with latitude, longitude
+and a diameter or radius whose column name contains the unit, such as craterpy's tables.
 """
 
 import re
@@ -20,9 +20,9 @@ from perilune_shared.storage.tables.read import open_table
 
 Array = NDArray[np.float64]
 PLACES = ("longitude_deg", "latitude_deg")
-"""Names of the places of craters in a statement of columns; east and north are positive."""
+"""Keys of the coordinates when a user states columns; east and north are positive."""
 METRES = {"diameter_m": 1.0, "diameter_km": 1000.0, "radius_m": 2.0, "radius_km": 2000.0}
-"""Names of a size in a statement of columns, with the diameter in metres that one unit means."""
+"""Keys of the size when a user states columns, with the factor that converts the size to a diameter in metres."""
 _KNOWN: dict[str, Mapping[str, str]] = {
     "Robbins 2018": {
         "longitude_deg": "LON_CIRC_IMG",
@@ -40,7 +40,7 @@ _KNOWN: dict[str, Mapping[str, str]] = {
         "diameter_km": "Diameter",
     },
 }
-"""Catalogues whose columns the patterns do not recognise."""
+"""Columns of catalogues that the patterns do not recognise."""
 _UNIT = r"[ _]?[(\[]?{}[)\]]?"
 _DEGREES = r"[ _]?[(\[]?(?:deg(?:rees)?)?[ _]?{}[)\]]?"
 _PATTERNS = {
@@ -52,7 +52,7 @@ _PATTERNS = {
     "radius_km": re.compile(r"(?:r|rad|radius)" + _UNIT.format("(?:km|kilometers|kilometres)"), re.IGNORECASE),
 }
 _MOST_NEIGHBOURS = 100
-"""Craters from west to east with which each is compared; bounds the time that a hostile catalogue takes."""
+"""Number of craters, from west to east, with which each crater is compared; limits the time for hostile catalogues."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,23 +66,23 @@ class SurfaceCraters:
     diameter_m: Array
     """Diameters, metres (N,)."""
     names: Mapping[str, str]
-    """Columns of the file by what they contain: PLACES and one of METRES."""
+    """Names of the file's columns, by key: PLACES and one of METRES."""
     columns: Columns
-    """The columns that were read, also the requested others."""
+    """All columns that were read, including the additional ones."""
 
     @property
     def size(self) -> str:
-        """What the column of sizes contains: one of METRES."""
+        """Key of the size column: one of METRES."""
         return next(name for name in self.names if name in METRES)
 
 
 def read_craters(
     path: Path, setting: str, names: Mapping[str, str] | None = None, others: Sequence[str] = ()
 ) -> SurfaceCraters:
-    """Read a catalogue, CSV or Parquet. `names` states its columns; without it they are recognised.
+    """Read a catalogue, CSV or Parquet. `names` states the columns; if it is empty, they are recognised.
 
-    `setting` is the setting of `names`, for messages. `others` are optional columns of numbers. Raises UserError on a
-    file without such columns, and on the first value that is not a place on the Moon or not a size.
+    Messages call the setting of `names` by the name `setting`. `others` are additional optional columns of numbers.
+    Raises UserError on a file without such columns, and on the first value that is not a valid coordinate or size.
     """
     with open_table(path, CATALOGUE) as table:
         chosen = _stated(path, setting, table.names, names) if names else recognised(path, setting, table.names)
@@ -98,7 +98,7 @@ def read_craters(
 
 
 def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]:
-    """Return the columns of a catalogue by what they contain. Raises UserError if they cannot be recognised."""
+    """Return the names of a catalogue's columns, by key. Raises UserError if they cannot be recognised."""
     for known in _KNOWN.values():
         if set(known.values()) <= set(names):
             return dict(known)
@@ -121,15 +121,15 @@ def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]
 
 
 def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
-    """Whether each crater (N,) repeats an earlier one: centre within a tenth of the radius, size within a tenth.
+    """Return whether each crater (N,) repeats an earlier one: centre within a tenth of the radius, size within a tenth.
 
-    Catalogues that were joined from several sources contain craters twice, with slightly different values.
+    Catalogues joined from several sources contain some craters twice, with slightly different values.
     """
     repeats = np.zeros(len(x_m), bool)
     by_size = np.argsort(diameter_m, kind="stable")
     sizes = diameter_m[by_size]
     for low in np.unique(np.floor(np.log2(sizes))):
-        # The window is wider than the octave, so that craters on both sides of its end are compared.
+        # The window extends beyond the octave, so that craters on both sides of the upper limit are compared.
         high = 1.1 * 2 ** (low + 1)
         similar = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
         order = similar[np.argsort(x_m[similar], kind="stable")]
@@ -146,7 +146,7 @@ def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
 
 
 def _stated(path: Path, setting: str, names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
-    """Return stated columns. Raises UserError if the file lacks one."""
+    """Return the columns that the user stated. Raises UserError if the file lacks one."""
     missing = [name for name in stated.values() if name not in names]
     if missing:
         raise UserError(

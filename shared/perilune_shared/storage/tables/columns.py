@@ -1,4 +1,4 @@
-"""Columns that were read from a table: numbers and texts with the place of each row for messages."""
+"""Columns that were read from a table, with the line of each row for messages."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from perilune_shared.errors import UserError
 
 Kind = Literal["number", "integer", "text"]
-"""How a column is read: float64, NaN where it has no value; int64; or text."""
+"""Type of a column: float64 with NaN for missing values, int64, or text."""
 
 
 @dataclass(frozen=True, slots=True)
 class Texts:
-    """A column of texts. Equal texts are stored once, so that memory stays small."""
+    """A column of texts. Equal texts are stored once to save memory."""
 
     words: list[str]
-    """The different texts (m,)."""
+    """The distinct texts (m,)."""
     codes: NDArray[np.int32]
-    """Place of each row's text in `words` (n,); -1 where the row has no value."""
+    """Index in `words` of each row's text (n,); -1 if the row has no value."""
 
     def __len__(self) -> int:
         return len(self.codes)
 
     def __getitem__(self, row: int) -> str:
-        """Return the text of a row, or "" where it has no value."""
+        """Return the text of a row, or "" if it has no value."""
         code = self.codes[row]
         return self.words[code] if code >= 0 else ""
 
@@ -39,10 +39,10 @@ class Texts:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The rows of a table, restricted to the requested columns that it has."""
+    """The rows of a table, limited to the requested columns that exist in it."""
 
     path: Path
-    """The file."""
+    """Path of the file."""
     arrays: dict[str, NDArray[np.float64] | NDArray[np.int64] | Texts]
     """Columns by name, each (n,)."""
     n_rows: int
@@ -54,7 +54,7 @@ class Columns:
         return name in self.arrays
 
     def numbers(self, name: str) -> NDArray[np.float64]:
-        """Return a column that was read as "number" (n,); NaN where a row has no value."""
+        """Return a column that was read as "number" (n,); NaN if a row has no value."""
         values = self.arrays[name]
         assert isinstance(values, np.ndarray)
         return values.astype(np.float64, copy=False)
@@ -72,18 +72,18 @@ class Columns:
         return values
 
     def finite(self, name: str, low: float = -np.inf, high: float = np.inf) -> NDArray[np.float64]:
-        """Return a column of finite numbers from `low` to `high` (n,). Raises UserError that names the first other."""
+        """Return a column of finite numbers from `low` to `high` (n,). Raises UserError about the first other value."""
         values = self.numbers(name)
         self.check(name, np.isfinite(values) & (values >= low) & (values <= high), _range_text(low, high))
         return values
 
     def check(self, name: str, fits: NDArray[np.bool_], expected: str) -> None:
-        """Raise UserError about the first row (n,) that does not fit."""
+        """Raise UserError about the first row for which `fits` (n,) is false."""
         if not fits.all():
             raise self.fault(int(fits.argmin()), name, expected)
 
     def fault(self, row: int, name: str, expected: str) -> UserError:
-        """Return the error about the value of a column in a row, counted from 0."""
+        """Return a UserError about the value in a column and a row, counted from 0."""
         values = self.arrays[name]
         value: object = values[row]
         if isinstance(values, Texts):
@@ -93,7 +93,7 @@ class Columns:
         return UserError(*self.at(row, name), value, expected)
 
     def at(self, row: int, name: str) -> tuple[str, str]:
-        """Return where a value stands: file with line, and column; for Parquet file, and column with row, from 0."""
+        """Return the location of a value: (file and line, column) in text, (file, column and row from 0) in Parquet."""
         if self.lines is None:
             return str(self.path), f"{name}: row {row}"
         return f"{self.path}:{self.lines[row]}", name

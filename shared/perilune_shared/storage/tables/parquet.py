@@ -1,8 +1,8 @@
-"""Read Parquet tables from outside: schema, rows and sizes first, then only the requested columns.
+"""Read untrusted Parquet tables: check schema, rows and sizes first, then read only the requested columns.
 
-A short file can state any number of rows and any length of text: dictionaries and runs repeat values without bytes. So
-rows and sizes are compared with the limits before anything is decompressed, texts are read as dictionaries, and one
-column is in memory beside the result.
+A short file can have any number of rows and texts of any length, since dictionaries and runs repeat values without
+further bytes. Therefore rows and sizes are compared with the limits before anything is decompressed, texts are read as
+dictionaries, and only one column is in memory besides the result.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,7 +39,7 @@ class ParquetTable:
     """An open Parquet file whose footer has been checked."""
 
     def __init__(self, path: Path, limits: TableLimits):
-        """Open a file. Raises UserError if it is no Parquet file or exceeds the limits."""
+        """Open a file. Raises UserError if it is not a Parquet file or exceeds the limits."""
         self.path, self._limits = path, limits
         self._n_bytes = path.stat().st_size
         self._file = self._open(())
@@ -61,7 +61,7 @@ class ParquetTable:
         }
         """Metadata of the schema."""
         self.comments: list[str] = []
-        """Empty; for text the comment lines."""
+        """Always empty; a TextTable has comment lines here."""
 
     def __enter__(self) -> "ParquetTable":
         return self
@@ -75,10 +75,10 @@ class ParquetTable:
         return self._file.metadata.num_rows
 
     def peek(self) -> None:
-        """Return None: a Parquet file has a header. For text, return the next row."""
+        """Return None; `TextTable.peek` returns the next row."""
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read the given columns, as far as the table has them. Raises UserError on a column of another type."""
+        """Read the given columns; columns that the table lacks are omitted. Raises UserError on another type."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
@@ -124,7 +124,7 @@ class ParquetTable:
             raise UserError(self.path, f"column {name}", type_in_file, expected)
 
     def _check_sizes(self, names: Sequence[str]) -> None:
-        """Check the sizes of the columns that will be read, in the footer and in the headers of the pages."""
+        """Check the sizes of the columns that will be read, as stated in the footer and in the page headers."""
         footer = self._file.metadata
         in_file = {self._name_in_file[name] for name in names}
         paths = [footer.schema.column(index).path for index in range(footer.num_columns)]

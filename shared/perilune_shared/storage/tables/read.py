@@ -1,4 +1,4 @@
-"""Open a table from outside: Parquet or text, by its content."""
+"""Open an untrusted table; the content decides whether it is read as Parquet or as text."""
 
 import stat
 from collections.abc import Mapping, Sequence
@@ -25,14 +25,14 @@ _OTHERS = {
     b"<": "HTML or XML",
     b"{": "JSON",
 }
-"""Beginnings of files that users give instead of a table."""
+"""First bytes of other file types that users may give instead of a table."""
 
 
 def open_table(path: Path, limits: TableLimits, header: Sequence[str] | None = None) -> "TextTable | ParquetTable":
-    """Open a table and read its header: `names`, then `read`. Use it in a `with` statement.
+    """Open a table in a `with` statement and read the header; then use `names` and `read`.
 
-    `header` has the names of the columns of a text file without a header. Raises UserError if the file is missing, not
-    a regular file, larger than its limit, or of another format.
+    `header` gives the column names of a text file without a header. Raises UserError if the file is missing, not a
+    regular file, too large or of another format.
     """
     expected = f"a CSV or Parquet file with {limits.kind}"
     try:
@@ -53,7 +53,7 @@ def open_table(path: Path, limits: TableLimits, header: Sequence[str] | None = N
         if start.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(magic):
             raise UserError(path, "format", found, expected)
     if start.startswith(_PARQUET):
-        # pyarrow takes a second to load.
+        # Imported here, since pyarrow takes a second to load.
         from perilune_shared.storage.tables.parquet import ParquetTable
 
         return ParquetTable(path, limits)
@@ -63,6 +63,6 @@ def open_table(path: Path, limits: TableLimits, header: Sequence[str] | None = N
 def read_table(
     path: Path, limits: TableLimits, columns: Mapping[str, Kind], required: Sequence[str] | None = None
 ) -> Columns:
-    """Read columns of a table with a header; columns outside `required` (default: all) may be absent."""
+    """Read columns of a table with a header. Only columns in `required` must exist; by default all of them."""
     with open_table(path, limits) as table:
         return table.read(columns, list(columns) if required is None else required)

@@ -1,8 +1,8 @@
-"""Read tables of text: values separated by commas, semicolons, tabs or spaces, a row on a line.
+"""Read text tables: one row per line, with values separated by commas, semicolons, tabs or spaces.
 
-Accepts what spreadsheets and other programs write: a byte order mark, CRLF, spaces around names and values, a separator
-at the end of each line, empty lines, comments (`#`) anywhere. If the first row contains only numbers, a comment before
-it with as many names is the header, as in files of EuRoC.
+Accepts the output of spreadsheets and other programs: a byte order mark, CRLF, spaces around names and values, a
+separator at the end of each line, empty lines, and comments (`#`) anywhere. If the first row contains only numbers, and
+a comment before it contains as many names, that comment is the header, as in files of EuRoC.
 """
 
 import csv
@@ -31,19 +31,19 @@ _BATCH_ROWS, _BATCH_CHARACTERS = 20_000, 2_000_000
 _MOST_COMMENTS = 1_000
 _LEAST_INTEGER, _MOST_INTEGER = -(2**63), 2**63 - 1
 Row = tuple[int, list[str]]
-"""Line number, from 1, and values."""
+"""Line number from 1, and the values of a row."""
 
 
 class TextTable:
-    """An open table of text whose header has been read."""
+    """An open text table whose header has been read."""
 
     def __init__(self, path: Path, limits: TableLimits, header: Sequence[str] | None = None):
-        """Open a file. `header` has the names of the columns of a file that has no header itself."""
+        """Open a file. `header` gives the column names of a file without a header."""
         self.path, self._limits = path, limits
         self.comments: list[str] = []
-        """Comment lines before the first row, without `#`, at most 1000."""
+        """At most 1000 comment lines before the first row, without `#`."""
         self.metadata: dict[str, str] = {}
-        """Empty; for Parquet the metadata of the schema."""
+        """Always empty; a ParquetTable has the schema's metadata here."""
         self._stream: TextIO = path.open(encoding="utf-8-sig", errors="surrogateescape", newline=None)
         try:
             self._lines = self._read_lines()
@@ -62,16 +62,16 @@ class TextTable:
         self._stream.close()
 
     def peek(self) -> Row | None:
-        """Return the next row without taking it; None at the end."""
+        """Return the next row without consuming it; None at the end."""
         first = next(self._rows, None)
         if first is not None:
             self._rows = itertools.chain([first], self._rows)
         return first
 
     def rows(self) -> Iterator[Row]:
-        """Yield the rows that have not been read yet, each with as many values as the table has names.
+        """Yield the remaining rows, each with one value per column.
 
-        Raises UserError on a row of another length and above the limit of rows.
+        Raises UserError on a row of another length, and if there are more rows than the limit.
         """
         n_names = len(self.names)
         for n_rows, (line, words) in enumerate(self._rows, 1):
@@ -89,7 +89,7 @@ class TextTable:
             yield line, words
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read the given columns, as far as the table has them. Raises UserError on a value that is not of its kind."""
+        """Read the given columns; columns that the table lacks are omitted. Raises UserError on an invalid value."""
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
@@ -127,7 +127,7 @@ class TextTable:
                 yield line, text
 
     def _split(self, lines: Iterator[tuple[int, str]]) -> Iterator[Row]:
-        """Yield the values of each row without spaces around them, without rows that have no value."""
+        """Yield the stripped values of each row; rows without any value are omitted."""
         if self.separator == " ":
             yield from ((line, text.split()) for line, text in lines)
             return
@@ -135,7 +135,7 @@ class TextTable:
         reader = csv.reader(counted, delimiter=self.separator, skipinitialspace=True)
         try:
             for values in reader:
-                # Stripping takes most of the time, and only lines with a space need it.
+                # Strip only lines that contain a space, since stripping takes most of the time.
                 words = [value.strip() for value in values] if counted.has_space else values
                 if words[0] or any(words):
                     yield counted.first_line, words
@@ -144,7 +144,7 @@ class TextTable:
             raise UserError(f"{self.path}:{counted.line}", "row", error, "values with separators") from None
 
     def _header(self) -> list[str]:
-        """Read the names of the columns."""
+        """Read the column names."""
         first = next(self._rows, None)
         if first is None:
             return self._names_in_comment(0) or []
@@ -163,7 +163,7 @@ class TextTable:
         return names
 
     def _names_in_comment(self, n_columns: int) -> list[str] | None:
-        """Return the names in the last comment if it has this many; for 0 any number above one."""
+        """Return the names in the last comment if there are `n_columns` of them; 0 accepts any number above one."""
         for comment in reversed(self.comments[-1:]):
             names = (
                 comment.split() if self.separator == " " else [word.strip() for word in comment.split(self.separator)]
@@ -175,7 +175,7 @@ class TextTable:
 
 
 class _Counted:
-    """Lines for csv.reader: the line at which the current row began, and a limit on the length of a row."""
+    """Lines for csv.reader; records the line where the current row began, and limits the length of a row."""
 
     def __init__(self, path: Path, lines: Iterator[tuple[int, str]]):
         self._path, self._lines, self._length = path, lines, 0
@@ -196,7 +196,7 @@ class _Counted:
         return text
 
     def begin_row(self) -> None:
-        """Count from the next line on."""
+        """Start a row at the next line."""
         self.first_line = self._length = 0
         self.has_space = False
 
@@ -279,7 +279,7 @@ def _builder(kind: Kind, path: Path, name: str) -> _Numbers | _Integers | _Words
 
 
 def _batch(rows: Iterator[Row]) -> list[Row]:
-    """Take the next rows, so few that they take little memory."""
+    """Return the next rows, few enough to need little memory."""
     batch: list[Row] = []
     n_characters = 0
     for line, words in rows:
@@ -291,14 +291,14 @@ def _batch(rows: Iterator[Row]) -> list[Row]:
 
 
 def _separator(line: str) -> str:
-    """Return the separator of a line: the one that gives the most values, a space if there is no other."""
+    """Return the separator that splits a line into the most values; a space if no other separator occurs."""
     counts = {separator: len(next(csv.reader(io.StringIO(line), delimiter=separator), [])) for separator in ",;\t"}
     best = max(counts, key=lambda separator: counts[separator])
     return best if counts[best] > 1 or len(line.split()) == 1 else " "
 
 
 def _without_empty_end(words: list[str], n_least: int) -> list[str]:
-    """Return values without empty ones at the end, at least `n_least`."""
+    """Remove empty values at the end, but keep at least `n_least` values."""
     while len(words) > n_least and not words[-1]:
         words = words[:-1]
     return words

@@ -120,7 +120,7 @@ def test_coco(tmp_path):
         ({"categories": [{"id": 1, "name": "cat"}, {"id": 2, "name": "dog"}]}, "categories: got cat, dog"),
         ({"annotations": [{"image_id": 8, "category_id": 1, "bbox": [1, 2, 3, 4]}]}, r"annotations\[0\].image_id"),
         ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, 3]}]}, r"annotations\[0\].bbox"),
-        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, -1, 4]}]}, "above 0"),
+        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, -1, 4]}]}, "at least 0"),
         ({"annotations": [{"image_id": 7, "category_id": 1}]}, r"annotations\[0\].bbox: got None"),
     ],
 )
