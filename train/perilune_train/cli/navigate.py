@@ -102,7 +102,10 @@ def benchmark(
     ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Score a navigator on the locked benchmark; writes benchmark.md, benchmark.json, error tables and pictures."""
+    """Score a navigator on the locked benchmark.
+
+    Writes benchmark.md, benchmark.json, error tables and pictures.
+    """
     # torch takes seconds to load.
     from perilune_train.motion.benchmark import FIGURES, HEADLINE, PAGE, score_navigator
 

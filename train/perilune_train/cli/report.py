@@ -67,9 +67,10 @@ def paper(
         ),
     ] = None,
 ) -> None:
-    """Write the page of the paper's experiment: the paper's tables and figures beside ours, and verdicts on its claims.
+    """Write the page that compares the paper's experiment with ours.
 
-    The section of an unfinished run states that the run is unfinished.
+    It shows the paper's tables and figures beside ours, and a verdict on each claim of the paper. The section of an
+    unfinished run states that the run is unfinished.
     """
     # torch and matplotlib take seconds to load.
     from perilune_train.report.paper.page import write_page

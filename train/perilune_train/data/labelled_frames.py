@@ -31,12 +31,12 @@ _BOX_COLUMNS = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 
 
 class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
-    """The frames of a split, in memory, in the order of scene, trajectory and time. An item is an image and a target.
+    """The frames of a split, in memory, in the order of scene, trajectory and time.
 
-    The image is (1, height, width) float32, 0 to 1; a 16-bit frame gives its upper eight bits. The target contains
-    tensors, float32 unless stated: `boxes` (M, 4) x0, y0, x1, y1, pixels; `ellipses` (M, 5) centre x and y and
-    semi-axes a and b, pixels, and direction of a, radians; `crater_id` (M,) int64; `position_m` (3,) and
-    `rotation_wxyz` (4,) of the camera; and the text `frame_id`.
+    An item is an image and a target. The image is (1, height, width) float32, 0 to 1; a 16-bit frame gives its upper
+    eight bits. The target contains tensors, float32 unless stated: `boxes` (M, 4) x0, y0, x1, y1, pixels; `ellipses`
+    (M, 5) centre x and y and semi-axes a and b, pixels, and direction of a, radians; `crater_id` (M,) int64;
+    `position_m` (3,) and `rotation_wxyz` (4,) of the camera; and the text `frame_id`.
     """
 
     def __init__(self, dataset: Dataset, split: str = "train", selection: str = "visible"):

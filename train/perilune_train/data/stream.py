@@ -1,4 +1,4 @@
-"""Frames of a packed dataset as a stream: shuffled, divided among processes and workers, resumable within an epoch.
+"""Stream the frames of a packed dataset: shuffled, divided among workers, resumable within an epoch.
 
 Use:
 
@@ -241,7 +241,10 @@ class FrameStream(torch_data.IterableDataset):
 
 
 def _groups_of(dataset: Dataset, split: str) -> _Groups:
-    """Read the row groups of a split's shards. Raises UserError if a shard is missing or damaged, or if none exists."""
+    """Read the row groups of a split's shards.
+
+    Raises UserError if a shard is missing or damaged, or if the split has no shards.
+    """
     if dataset.info.images != "packed":
         raise UserError(dataset.store, "images", dataset.info.images, "packed; see `perilune-manifest pack`")
     shards = dataset.shards(split)

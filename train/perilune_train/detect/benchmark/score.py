@@ -1,4 +1,4 @@
-"""Score detections on all parts of the benchmark by every scoring rule, bin and region; find the lowest figures."""
+"""Score detections on all parts of the benchmark: by scoring rule, bin and region, and the lowest figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -100,8 +100,10 @@ def openvino_engine(
 
 
 def _within_quota() -> int:
-    """Number of threads for an engine that ignores a container's CPU quota; 0 (the engine decides) if no quota limits
-    it."""
+    """Number of threads for an engine that ignores a container's CPU quota; 0 without a limiting quota.
+
+    With 0, the engine decides.
+    """
     return usable_cores() if usable_cores() < cores_in_affinity() else 0
 
 
@@ -128,8 +130,10 @@ def _readable(path: Path) -> Any:
 
 
 def _check_no_other_files(path: Path) -> None:
-    """Raise UserError if an ONNX file refers to other files for its tensors: it could make the engine read any file as
-    weights."""
+    """Raise UserError if an ONNX file refers to other files for its tensors.
+
+    Such a file could make the engine read any file of the disk as weights.
+    """
     model = package("onnx").load(str(path), load_external_data=False)
     names = [f"a tensor in the file {each.value!r}" for tensor in _tensors(model) for each in tensor.external_data]
     if names:

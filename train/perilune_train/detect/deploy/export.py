@@ -133,8 +133,10 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """Terrain record of the exported network, including its int8 calibration, and the check of the calibration's
-    terrain."""
+    """Terrain record of the exported network, and the check of the int8 calibration's terrain.
+
+    The record includes the terrain of the calibration. Without calibration the check is None.
+    """
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None

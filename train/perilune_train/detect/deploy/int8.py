@@ -88,9 +88,10 @@ def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config
 
 
 def quantise(source: Path, out: Path, images: Array) -> None:
-    """Quantise an ONNX file with ONNX Runtime's static method: weights per channel, and the inputs of convolutions.
+    """Quantise an ONNX file with ONNX Runtime's static method.
 
-    The network runs on `images` (N, C, H, W) to measure the range of each activation.
+    Quantises weights per channel, and activations at the inputs of convolutions. The network runs on `images` (N, C, H,
+    W) to measure the range of each activation.
     """
     onnx, quantization = package("onnx"), package("onnxruntime.quantization")
 
@@ -139,7 +140,10 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:
-    """Time of each call of each engine, seconds; engines take turns, so that other load slows all of them equally."""
+    """Time of each call of each engine, seconds.
+
+    The engines take turns, so that other load slows all of them equally.
+    """
     for engine in engines.values():
         for _ in range(warm_up):
             engine(images)

@@ -50,8 +50,9 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
 
 @compiled
 def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
-    """Indices of the boxes (N, 4) that suppression keeps, at most `max_count`; boxes are x, y, width, height, best
-    first.
+    """Indices of the boxes (N, 4) that suppression keeps, at most `max_count`.
+
+    Boxes are x, y, width, height, best first.
 
     Each cell of a grid lists the kept boxes that touch it, so that a box is compared only with nearby boxes. Two boxes
     that overlap touch a common cell; cells at the edge of the grid include everything beyond the grid. A box that

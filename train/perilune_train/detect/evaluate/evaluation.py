@@ -162,11 +162,12 @@ def evaluate_detections(
 
 
 def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
-    """Errors of detected craters, in pixels or (`_relative`) divided by the label's radius; NaN without detections.
+    """Errors of the centres and radii of detected craters; NaN without detections.
 
-    The centre of a crater is the centre of its box, and the radius is sqrt(w h) / 2 of the box, for detections and
-    labels alike. For a rotated ellipse this radius is slightly larger than sqrt(a b), which a box does not determine.
-    The bias is the mean of detected minus true radius.
+    Errors are in pixels (`_px`) or divided by the label's radius (`_relative`). The centre of a crater is the centre of
+    its box, and the radius is sqrt(w h) / 2 of the box, for detections and labels alike. For a rotated ellipse this
+    radius is slightly larger than sqrt(a b), which a box does not determine. The bias is the mean of detected minus
+    true radius.
     """
     hits = (matches.label >= 0) & (matches.scores >= threshold)
     ours, truth = overlaps.boxes[hits], overlaps.label_boxes[matches.label[hits]]

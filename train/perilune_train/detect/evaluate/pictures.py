@@ -96,7 +96,7 @@ def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) ->
 
 
 def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], path: Path, count: int = 2) -> None:
-    """Draw the best, typical and worst frames by F1, one row each: every frame plain and with labels and detections."""
+    """Draw the best, typical and worst frames by F1, each plain and with labels and detections."""
     chosen = choose_frames(evaluation.frame_f1(), evaluation.facts.trajectory, count)
     rows = [(name, index) for name, part in chosen.items() for index in part]
     f1 = evaluation.frame_f1()

@@ -1,4 +1,4 @@
-"""Draw detections over an image as ellipses coloured by score; a strip below shows the colour scale and a count."""
+"""Draw detections over an image as ellipses coloured by score, with a colour scale and a count below."""
 
 from pathlib import Path
 

@@ -12,7 +12,7 @@ _FOLDERS_OF_ARCHIVES = ("__MACOSX",)
 
 
 def is_picture(path: Path) -> bool:
-    """Whether a file name ends like the name of a picture."""
+    """Whether a file has the suffix of a picture."""
     return path.suffix.lower() in _PICTURES
 
 

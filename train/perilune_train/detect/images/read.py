@@ -190,7 +190,10 @@ def _luma(bands: NDArray) -> NDArray:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Picture]:
-    """Open a picture by its content. Raises UserError on other files, and if reading within the block finds damage."""
+    """Open a picture by its content.
+
+    Raises UserError if the file is not a picture, or if reading within the block finds damage.
+    """
     driver = raster_files(path, PICTURE_DRIVERS, "image").driver
     by_pillow = driver in ("GTiff", "PNG", "JPEG")
     has_rasterio = importlib.util.find_spec("rasterio") is not None

@@ -64,7 +64,10 @@ def _of_video(path: Path, folder: Path) -> list[Path]:
 
 
 def _pages(path: Path) -> list[int]:
-    """Numbers of the pages of a TIFF that are separate pictures; [] if it is unreadable, which `read_grey` reports."""
+    """Numbers of the pages of a TIFF that are separate pictures.
+
+    Returns [] for an unreadable file; `read_grey` later reports the error.
+    """
     pages: list[int] = []
     with contextlib.suppress(OSError, ValueError, SyntaxError, EOFError), Image.open(path, formats=("TIFF",)) as image:
         for number in range(_MOST_PAGES):

@@ -41,7 +41,10 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
 
 
 def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
-    """Paint craters (N, 5) into `painted`, each in a window of `side` pixels; rows are frame and box in map pixels."""
+    """Paint craters into `painted`, each in a window of `side` pixels.
+
+    `rows` (N, 5) are the frame and the box of each crater, in map pixels.
+    """
     _, height, width = painted.shape
     centre, half = (rows[:, 1:3] + rows[:, 3:]) / 2, ((rows[:, 3:] - rows[:, 1:3]) / 2).clamp(min=_TINY)
     first = (centre - side / 2).ceil().long()
