@@ -1,4 +1,4 @@
-"""Functions that numba compiles."""
+"""Compile functions with numba."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,10 +7,10 @@ import numba
 
 
 def compiled(function: Callable) -> Any:
-    """The function, compiled at its first call; the machine code is kept beside the source or in the user's cache.
+    """Compile a function at its first call, and keep the machine code beside the source or in the user's cache.
 
-    Kept code is compiled again only if the file of the function changes: it must use no function and no constant of
-    another file. Divisions by zero give infinity or NaN, as in NumPy.
+    numba compiles again only if the function's file changes, so the function must not use functions or constants of
+    other files. A division by zero gives infinity or NaN, as in NumPy.
     """
     options = {"nogil": True, "error_model": "numpy"}
     try:

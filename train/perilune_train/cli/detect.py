@@ -83,9 +83,9 @@ def train(
 
     Writes runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
     detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. The same
-    command resumes an interrupted run and leaves a finished one unchanged; --overwrite replaces it.
+    command resumes an interrupted run and leaves a finished run unchanged; --overwrite replaces it.
 
-    The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
+    To train the baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
     settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
@@ -163,8 +163,8 @@ def evaluate(
 ) -> None:
     """Evaluate a run's best weights: report.md, metrics.json, detections.parquet and pictures.
 
-    The threshold is the run's own, chosen on the validation split of its training dataset, unless --threshold sets one
-    or --choose-threshold chooses a new one.
+    The run chose its score threshold on the validation split of its training dataset. --threshold sets another one,
+    and --choose-threshold chooses a new one.
     """
     from perilune_shared.dataset.names import SPLITS
 
@@ -241,7 +241,7 @@ def benchmark(
     ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Score on the locked benchmark: benchmark.md, benchmark.json, and pictures by rule of labels."""
+    """Score a detector on the locked benchmark; writes benchmark.md, benchmark.json and pictures."""
     if run is not None and detections is not None:
         raise UserError("benchmark", "options", "both --run and --detections", "one of them")
     if (threshold is None) != (detections is None):
@@ -312,9 +312,9 @@ def predict(
 ) -> None:
     """Find craters in images.
 
-    Writes detections.parquet and detections.csv (one row per crater, in pixels of the upright image, from the outer
-    corner of its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference. Frames of
-    a video, and pages, are images named <file>.<index, six digits>.png or .tif.
+    Writes detections.parquet and detections.csv with one row per crater, <image>.overlay.png, and detections.geojson if
+    an image has a georeference. Coordinates are pixels of the upright image, from the outer corner of its top-left
+    pixel. The image names of video frames are <file>.<index, six digits>.png, and those of TIFF pages end in .tif.
     """
     if min_score is not None and not 0 < min_score <= 1:
         raise UserError("--min-score", "score", min_score, "above 0, at most 1")
@@ -357,9 +357,9 @@ def deploy(
 ) -> None:
     """Write a trained detector as ONNX and OpenVINO files, for flight.
 
-    Writes detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. Every
-    file is run and compared with torch first. --int8 adds detector-int8.onnx, quantised on training frames, only if it
-    is faster and loses at most 0.005 of AP on the validation frames.
+    Writes detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. First
+    runs every file and compares its output with torch. --int8 quantises the network on training frames and writes
+    detector-int8.onnx if that file is faster and loses at most 0.005 of AP on the validation frames.
     """
     asked = tuple(part.strip() for part in formats.split(","))
     if not set(asked) <= {"onnx", "openvino"}:
@@ -396,11 +396,12 @@ def weights(
 ) -> None:
     """Write the weights of a run as a file to share, or as a Darknet file; `detect.init_from` reads both.
 
-    NAME.safetensors has half precision and holds no code; a folder with it as weights.safetensors, config.yaml and
-    metrics.json is a run.
+    NAME.safetensors stores the weights in half precision and contains no code. Rename it to weights.safetensors and put
+    it beside config.yaml and metrics.json: this folder is a run.
 
-    NAME.conv.74 has the 52 convolutions of the backbone. NAME.weights has all 75 and needs a network without attention
-    and with strides 8 16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors.
+    NAME.conv.74 contains the 52 convolutions of the backbone. NAME.weights contains all 75 convolutions; the network
+    must have no attention and the strides 8 16 32. Its output layers have 15 filters: x, y, width, height and
+    objectness for each of 3 anchors.
     """
     if not out.name.endswith((".safetensors", ".conv.74", ".weights")):
         expected = "a name that ends in .safetensors, .conv.74 or .weights"

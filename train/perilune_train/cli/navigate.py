@@ -1,4 +1,4 @@
-"""`perilune-train navigate`: train navigators, evaluate and compare them, fly the filter over descents."""
+"""`perilune-train navigate`: train, evaluate and compare navigators, and run the filter on descents."""
 
 from pathlib import Path
 from typing import Annotated
@@ -38,14 +38,14 @@ def train(
     allow_overlap: AllowOverlap = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Train the navigation networks and evaluate them together with the nominal motion, mean motions and KLT tracks.
+    """Train the navigation networks and compare them with the nominal motion, mean motions and KLT tracks.
 
     Writes runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's network), each
     with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row per method),
     errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. With navigate.stack.target=pose
-    the stack run has pose.md (the table) in place of descent.png. The stack network is initialised
-    with the backbone of runs/detect/<name>, if that has the same architecture. The same command resumes an interrupted
-    run and leaves finished ones unchanged; --overwrite replaces them.
+    the stack run has pose.md (the table) instead of descent.png. The stack network starts from the
+    backbone of runs/detect/<name> if the architectures are equal. The same command resumes an interrupted run and
+    leaves finished runs unchanged; --overwrite replaces them.
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
@@ -72,11 +72,11 @@ def evaluate(
     ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Evaluate a run's best weights together with KLT tracks and the nominal motion.
+    """Evaluate a run's best weights, and compare them with KLT tracks and the nominal motion.
 
     Writes metrics.json, navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png and
-    errors.png. A run for poses (navigate.stack.target=pose) is evaluated over the landing area of its training, beside
-    the mean pose, with pose.md in place of descent.png.
+    errors.png. A run that estimates poses (navigate.stack.target=pose) is evaluated over the landing area on which it
+    was trained, and compared with the mean pose; pose.md then replaces descent.png.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
@@ -102,7 +102,10 @@ def benchmark(
     ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Score on the locked benchmark: benchmark.md, benchmark.json, tables of errors and pictures."""
+    """Score a navigator on the locked benchmark.
+
+    Writes benchmark.md, benchmark.json, error tables and pictures.
+    """
     # torch takes seconds to load.
     from perilune_train.motion.benchmark import FIGURES, HEADLINE, PAGE, score_navigator
 
@@ -128,7 +131,10 @@ def benchmark_landing(
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Score poses from craters and the filter on the locked benchmark: benchmark.md, benchmark.json, frames.parquet."""
+    """Score poses from craters, and the filter, on the locked benchmark.
+
+    Writes benchmark.md, benchmark.json and frames.parquet.
+    """
     # torch takes seconds to load.
     from perilune_train.landing.methods.benchmark import FIGURES, PAGE, POSITION, score_landing
 
@@ -150,9 +156,10 @@ def calibrate(
     ],
     split: Annotated[str, typer.Option(help="train, val or test: the descents to fit to.")] = "val",
 ) -> None:
-    """Fit the covariance that a warp network states to its errors on validation descents; writes covariance.json.
+    """Fit the covariance of a warp network to its errors on validation descents; writes covariance.json.
 
-    Refuses test terrain. A training does this at its end. Use it for runs of earlier versions, or for another camera.
+    Test terrain is refused. Training runs this step at its end. Use the command for runs of earlier versions, or for
+    another camera.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
@@ -205,10 +212,11 @@ def deploy(
     ] = None,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Write a trained navigator as an ONNX file, for flight: one pair of frames and the state in, motion and state out.
+    """Write a trained navigator as an ONNX file, for flight.
 
-    Writes navigator.onnx, navigator.json (sizes, camera, normalisation) and README.md with a program that uses them.
-    The file is run pair by pair and compared with torch over the whole sequence first; without a dataset on noise.
+    The file maps one pair of frames and a state to the motion and the new state. Writes navigator.onnx, navigator.json
+    (sizes, camera, normalisation) and README.md with an example program. First runs the file pair by pair and compares
+    it with torch on the whole sequence: on validation frames, or on noise without a dataset.
     """
     # torch takes seconds to load.
     from perilune_train.motion.deploy.export import export_navigator
@@ -242,11 +250,11 @@ def methods(
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Fly all methods over a split: learned and classical motion, poses from craters, lost in space, the filter.
+    """Run all methods on a split: learned and classical motion, poses from craters, lost in space, the filter.
 
     Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
     frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
-    metrics.json (hashes, command, commit, versions). Catalogues, priors and starts are drawn with a fixed seed.
+    metrics.json (hashes, command, commit, versions). Catalogues, priors and initial states use a fixed random seed.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
@@ -281,9 +289,9 @@ def monte_carlo(
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Fly the filter over random starts, catalogues and inertial errors of each descent.
+    """Run the filter on each descent with random initial states, catalogues and inertial errors.
 
-    The detector runs once over every frame; all draws use its detections. Writes monte_carlo.md (table and pictures),
+    The detector runs once on every frame; all draws use its detections. Writes monte_carlo.md (table and pictures),
     draws.parquet (one row per draw and frame), errors.png and consistency.png.
     """
     if split not in SPLITS:
@@ -311,10 +319,10 @@ def make_map(
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Make a crater catalogue of each scene from two images of an orbiter, with our own detector.
+    """Make a crater catalogue of each scene by running the detector on two images taken from orbit.
 
     Writes <scene_id>.parquet (x_m, y_m, z_m, diameter_m, score) for `navigate fly` and `navigate methods --map`,
-    map.json (stated errors), map.md and errors.parquet (compared with the craters of the terrain), and map.png.
+    map.json (stated errors), map.md and errors.parquet (errors against the terrain's true craters), and map.png.
     """
     # torch takes seconds to load.
     from perilune_train.landing.map.map_scenes import PAGE, map_scenes
@@ -349,11 +357,11 @@ def fly(
     live: Annotated[Path | None, typer.Option(help="Picture that is drawn again after each frame, *.png.")] = None,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Estimate position, velocity and attitude at each frame of a descent by craters, inertial unit and ranges.
+    """Estimate position, velocity and attitude at each frame of a descent from craters, inertial data and ranges.
 
-    Prints one line per frame to standard output: time, status (tracking, coasting or lost), position and its deviations
-    in O_L, largest deviation of the attitude, craters matched. Writes estimates.parquet, estimates.csv and flight.png.
-    `navigate descent` writes an example of all files.
+    Prints one line per frame to standard output: time, status (tracking, coasting or lost), position in O_L and its
+    standard deviations, largest standard deviation of the attitude, and number of matched craters. Writes
+    estimates.parquet, estimates.csv and flight.png. `navigate descent` writes examples of all input files.
     """
     if live is not None and live.suffix.lower() != ".png":
         raise UserError("--live", "name", live, "a name that ends in .png")
@@ -400,8 +408,8 @@ def descent(
 ) -> None:
     """Write a descent as frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv.
 
-    The prior is off by random errors; the catalogue has those of one made from orbit (1 m in position, 3 % in diameter,
-    one in ten craters missing, one in twenty false).
+    The prior has random errors. The catalogue has the errors of a catalogue made from orbit: 1 m in position, 3 % in
+    diameter, one in ten craters missing, one in twenty false.
     """
     ids = tuple(trajectory.split("/"))
     if len(ids) != 2:

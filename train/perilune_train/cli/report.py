@@ -1,4 +1,4 @@
-"""`perilune-train report` and `paper`: the HTML report, and the page of the paper's experiment."""
+"""`perilune-train report` writes the HTML report; `paper` writes the page of the paper's experiment."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,7 +10,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import is_plain
 
 USUAL_MB = 15
-"""Size below which the page of `small` is to be, MB (1e6 bytes); a larger page opens slowly."""
+"""Size limit of the page of `small`, MB (1e6 bytes); a larger page opens slowly."""
 
 
 def report(
@@ -29,10 +29,10 @@ def report(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report. [default: runs/report/<name>]")] = None,
 ) -> None:
-    """Write the report of a demo, a paper run or a benchmark: one HTML file, and a summary in Markdown.
+    """Write the report of a demo, a paper run or a benchmark as one HTML file, with a summary in Markdown.
 
-    report.html needs no server and no network. It shows datasets, detection, navigation, explanation and the source of
-    each figure, and a viewer of one descent. What does not exist is left out and named.
+    report.html needs no server and no network. It shows datasets, detection, navigation, explanation, the source of
+    each figure, and a viewer of one descent. The report lists the parts that do not exist.
     """
     # matplotlib and pandas take seconds to load.
     from perilune_train.report.page import SUMMARY, write_report
@@ -67,9 +67,10 @@ def paper(
         ),
     ] = None,
 ) -> None:
-    """Write the page of the paper's experiment: its tables and figures beside ours, and a verdict on each claim.
+    """Write the page that compares the paper's experiment with ours.
 
-    Sections of runs that are not finished say so.
+    It shows the paper's tables and figures beside ours, and a verdict on each claim of the paper. The section of an
+    unfinished run states that the run is unfinished.
     """
     # torch and matplotlib take seconds to load.
     from perilune_train.report.paper.page import write_page

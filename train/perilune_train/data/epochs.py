@@ -1,4 +1,4 @@
-"""Batches of one process in every epoch, from one loader for the whole training."""
+"""Batches of one process for all epochs, from one loader that lasts for the whole training."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -14,14 +14,14 @@ class DataLost(UserError):
 
 
 class EpochBatches(torch_data.Sampler[list[Any]]):
-    """Batches of the keys with which a dataset is indexed: `size` keys each, in the order of the current epoch.
+    """Batches of dataset keys: `size` keys each, in the order of the current epoch.
 
-    `keys(epoch)` are the keys of this process in order. `fewest` is the number of keys of the process that has the
-    fewest. All processes take as many batches as that process needs, so that each step has one batch of each process;
-    the last keys of the others may be left out.
+    `keys(epoch)` returns the keys of this process in order. `fewest` is the smallest number of keys of any process. All
+    processes take as many batches as the process with the fewest keys, so that each step has one batch of each process;
+    the last keys of the other processes may be left out.
 
-    The first epoch starts at batch `start`, for a run that is resumed within an epoch; the length is always that of a
-    whole epoch. Lightning sets the epoch before each later epoch.
+    The first epoch starts at batch `start`, for a run that is resumed within an epoch; `len` always counts a whole
+    epoch. Lightning sets the epoch before each later epoch.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ def batch_loader(
     workers: int,
     pinned: bool,
 ) -> torch_data.DataLoader:
-    """Load batches in `workers` processes, which live as long as the loader; with 0 in the calling process.
+    """Load batches in `workers` processes, which live as long as the loader, or with 0 in the calling process.
 
-    With workers, OpenCV uses one thread from now on, here and in the workers, which together use all cores anyway. This
-    is set before the workers are forked: a worker that stopped inherited threads would wait forever. `pinned` puts the
-    batches into page-locked memory, from which a GPU copies them without making the process wait.
+    With workers, OpenCV uses one thread from now on, in this process and in the workers; the workers together use all
+    cores anyway. OpenCV is set before the workers are forked, because a worker that stops inherited threads would wait
+    forever. `pinned` puts the batches into page-locked memory, from which a GPU copies them while the process goes on.
     """
     if workers:
         one_thread()
@@ -72,7 +72,7 @@ def batch_loader(
 
 
 def one_thread(_: int = 0) -> None:
-    """Let OpenCV use one thread in this process."""
+    """Make OpenCV use one thread in this process."""
     # A forked worker inherits the setting; a spawned one does not.
     if cv2.getNumThreads() != 1:
         cv2.setNumThreads(1)

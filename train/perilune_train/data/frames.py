@@ -20,7 +20,7 @@ from perilune_shared.threads import usable_cores
 from perilune_train.data.shares import ALONE, Share
 
 _PORTION = 256
-"""Number of compressed frames in memory at a time."""
+"""Number of compressed frames held in memory at a time."""
 _ORDER = ["scene_id", "trajectory_id", "frame_index"]
 _POSE = ["time_s", "position_m", "rotation_wxyz", "sun_direction"]
 _FILE = ["png_path", "png_bytes"]
@@ -64,7 +64,7 @@ def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int
 def frame_table(dataset: Dataset, split: str) -> pd.DataFrame:
     """Ids, times, poses and files of the frames of a split, sorted by scene, trajectory and frame index.
 
-    Raises UserError if there are none.
+    Raises UserError if the split has no frames.
     """
     table = dataset.table("frames", ["frame_id", *_ORDER, *_POSE, *_FILE], split=split).to_pandas()
     if table.empty:
@@ -73,10 +73,10 @@ def frame_table(dataset: Dataset, split: str) -> pd.DataFrame:
 
 
 def load_frames(dataset: Dataset, split: str, share: Share = ALONE, table: pd.DataFrame | None = None) -> FrameStore:
-    """Load the frames of a split, or only those of a share of it; a frame of 256 x 256 px takes 64 kB.
+    """Load the frames of a split, or of a share of it; a frame of 256 x 256 px takes 64 kB.
 
     `table` is the `frame_table` of the split, if the caller has it. Raises UserError if the split is empty, if its
-    frames do not fit into memory, or if one is invalid.
+    frames do not fit into memory, or if a frame is invalid.
     """
     table = frame_table(dataset, split) if table is None else table
     rows = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
@@ -86,7 +86,7 @@ def load_frames(dataset: Dataset, split: str, share: Share = ALONE, table: pd.Da
 def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np.uint8]:
     """Load the pixels (N, height, width) of N rows of the `frame_table` of a split.
 
-    Raises UserError if they do not fit into memory or if one is invalid.
+    Raises UserError if the frames do not fit into memory or if a frame is invalid.
     """
     camera = dataset.info.camera
     n_bytes = len(table) * camera.height_px * camera.width_px
@@ -118,9 +118,10 @@ def _portions(frames: Iterable[tuple[str, bytes]], size: int) -> Iterator[list[t
 
 
 def normalised(images: NDArray) -> NDArray[np.float32]:
-    """Subtract each image's mean and divide by its standard deviation, at least 1. Images are (..., height, width).
+    """Subtract each image's mean and divide by its standard deviation or 1, whichever is larger.
 
-    A constant image becomes zero. The exposure of a frame carries no information about craters or motion.
+    Images are (..., height, width). A constant image becomes zero. Normalising loses nothing: the exposure of a frame
+    carries no information about craters or motion.
     """
     pixels = images.astype(np.float32)
     mean = pixels.mean(axis=(-2, -1), keepdims=True)

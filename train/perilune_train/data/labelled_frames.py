@@ -1,12 +1,12 @@
-"""A split of a dataset with its crater labels, for your own loop in PyTorch: `dataset.torch(split="train")`.
+"""A split of a dataset with its crater labels, for a custom PyTorch loop: `dataset.torch(split="train")`.
 
     frames = LabelledFrames(open_single("data/small/detect"), "train", "visible")
     loader = DataLoader(frames, batch_size=8, shuffle=True, collate_fn=frames.collate)
     for images, targets in loader:
-        ...  # images (B, 1, height, width); a dictionary for each
+        ...  # images (B, 1, height, width); one dictionary per image
 
-The networks of this package have loaders of their own (`perilune_train.detect.data`); a dataset larger than memory is
-read by `perilune_train.data.stream`.
+The networks of this package use other loaders (`perilune_train.detect.data`). To read a dataset larger than memory, use
+`perilune_train.data.stream`.
 """
 
 from collections.abc import Sequence
@@ -31,19 +31,19 @@ _BOX_COLUMNS = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 
 
 class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
-    """The frames of a split, in memory, in the order of scene, trajectory and time. An item is an image and a target.
+    """The frames of a split, in memory, in the order of scene, trajectory and time.
 
-    The image is (1, height, width) float32, 0 to 1; of 16-bit frames it has the upper eight bits. The target has
-    tensors, float32 unless stated: `boxes` (M, 4) x0, y0, x1, y1 and `ellipses` (M, 5) centre x and y, semi-axes a and
-    b, pixels, and direction of a, radians; `crater_id` (M,) int64; `position_m` (3,) and `rotation_wxyz` (4,) of the
-    camera; and the text `frame_id`.
+    An item is an image and a target. The image is (1, height, width) float32, 0 to 1; a 16-bit frame gives its upper
+    eight bits. The target contains tensors, float32 unless stated: `boxes` (M, 4) x0, y0, x1, y1, pixels; `ellipses`
+    (M, 5) centre x and y and semi-axes a and b, pixels, and direction of a, radians; `crater_id` (M,) int64;
+    `position_m` (3,) and `rotation_wxyz` (4,) of the camera; and the text `frame_id`.
     """
 
     def __init__(self, dataset: Dataset, split: str = "train", selection: str = "visible"):
         """Read frames and labels of a split; `selection` (all, paper, visible) chooses the labels.
 
-        Raises UserError on another name, on a split without frames, on several cameras, and on frames that do not fit
-        into memory.
+        Raises UserError if a name is unknown, if the split has no frames, if the dataset has several cameras, or if the
+        frames do not fit into memory.
         """
         if split not in SPLITS:
             raise UserError("torch", "split", split, nearest(split, SPLITS))

@@ -1,4 +1,4 @@
-"""Shares of the data for several processes that train together."""
+"""Divide the data among several processes that train together."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class Share:
     """Number of processes that train together."""
 
     def of(self, count: int) -> range:
-        """Numbers of this share among 0 .. count - 1."""
+        """The numbers among 0 .. count - 1 that belong to this share."""
         return range(self.process, count, self.processes)
 
     def owns(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Frames of a packed dataset as a stream: shuffled, divided among processes and workers, resumable within an epoch.
+"""Stream the frames of a packed dataset: shuffled, divided among workers, resumable within an epoch.
 
 Use:
 
@@ -9,11 +9,11 @@ Use:
             ...  # a list of StreamedFrame, or what `stream.make` returns
             state = stream.state_dict()  # load_state_dict(state) continues after this batch
 
-Everything is a function of seed, epoch, and the numbers of processes and workers: the row groups of all shards are
-permuted, cut into equal shares, and each share is read in windows of a few row groups, whose frames are permuted. So a
-position is enough to resume, and each frame occurs exactly once in an epoch.
+The order depends only on the seed, the epoch, and the numbers of processes and workers. The row groups of all shards
+are permuted and cut into equal shares. Each share is read in windows of a few row groups, and the frames of a window
+are permuted. So a position is enough to resume, and each frame occurs exactly once in an epoch.
 
-Memory of each worker (of the process itself without workers): two windows, one being used and one being read. `pack`
+Each worker, or the process itself without workers, holds two windows in memory: one in use and one being read. `pack`
 limits a row group to 64 frames and 8 MiB (more only for a single frame), so a window takes at most 64 MiB.
 """
 
@@ -39,7 +39,7 @@ from perilune_train.data.shares import ALONE, Share
 
 _GROUPS_PER_WINDOW = 8
 _MAX_OPEN_SHARDS = 16
-"""Largest number of open shards of a worker. For shards in an object store, footers are kept."""
+"""Largest number of shards that a worker keeps open. An open shard of an object store holds its footer."""
 _NESTED = ("image", "labels")
 COLUMNS = tuple(name for name in SHARDS.names if name not in _NESTED)
 """Columns of the table frames; all are read by default."""
@@ -96,7 +96,7 @@ def _unchanged(frames: list[StreamedFrame], epoch: int) -> list[StreamedFrame]:
 
 
 class FrameStream(torch_data.IterableDataset):
-    """Batches of the frames of a split that belong to one of several processes; see the module.
+    """Batches of one process's share of the frames of a split; see the module.
 
     All processes have the same number of batches, `len(stream)`, of `batch_size` frames each. The last batch of an
     epoch has the remaining frames: at least one, at most batch_size + 1.
@@ -121,7 +121,7 @@ class FrameStream(torch_data.IterableDataset):
         self.make = _unchanged
         self._nested = _NESTED if content.images else _NESTED[1:]
         self.epoch = self.batches = self.workers = 0
-        # Epoch and first batch of the current iteration, for workers, which live longer than an epoch.
+        # Workers live longer than an epoch: they read here the epoch and the first batch of the current iteration.
         self._begun = torch.zeros(2, dtype=torch.int64).share_memory_()
         self._groups = _groups_of(dataset, split)
         self.n_frames = int(self._groups.n_frames.sum())
@@ -145,7 +145,7 @@ class FrameStream(torch_data.IterableDataset):
         return {"epoch": self.epoch, "batches": self.batches, **self._settings()}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continue at a position. Raises UserError if a setting that determines the order of frames differs."""
+        """Move to a saved position. Raises UserError if a setting that determines the order of frames differs."""
         for name, value in self._settings().items():
             # The number of workers is unknown before the first iteration.
             if state[name] != value and not (name == "workers" and 0 in (value, state[name])):
@@ -157,9 +157,9 @@ class FrameStream(torch_data.IterableDataset):
         return dict(zip(_STATE, values, strict=True))
 
     def __iter__(self) -> Iterator[Any]:
-        """Yield the batches of this worker, or all of the process, from batch `batches` of the epoch on.
+        """Yield the batches of this worker, or all batches without workers, from batch `batches` of the epoch on.
 
-        In a worker a UserError is yielded instead of raised, because torch would lose its type (`StreamLoader`).
+        A worker yields a UserError instead of raising it, because torch would lose its type (`StreamLoader`).
         """
         worker = torch_data.get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker is not None else (0, 1)
@@ -174,7 +174,7 @@ class FrameStream(torch_data.IterableDataset):
             yield error
 
     def _batches(self, lane: int, lanes: int) -> Iterator[Any]:
-        """Yield batches lane, lane + lanes, ... of this process, without those before `batches`."""
+        """Yield batches lane, lane + lanes, ... of this process; skip batches before `batches`."""
         share = self.share
         start, stop = (self.n_frames * rank // share.processes for rank in (share.process, share.process + 1))
         sizes = np.full(len(self), self.batch_size)
@@ -199,7 +199,7 @@ class FrameStream(torch_data.IterableDataset):
                 yield from self._of_window(*last)
 
     def _windows(self, start: int, stop: int, n_done: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Yield row groups (N,) and rows in them (N,) of the frames of each window, in their order."""
+        """For each window, yield row group (N,) and row in that group (N,) of its frames, in the order of use."""
         order = np.random.default_rng([self.seed, self.epoch]).permutation(len(self._groups.shard))
         ends = np.cumsum(self._groups.n_frames[order])
         first, last = np.searchsorted(ends, [start, stop - 1], side="right")
@@ -241,7 +241,10 @@ class FrameStream(torch_data.IterableDataset):
 
 
 def _groups_of(dataset: Dataset, split: str) -> _Groups:
-    """Read the row groups of a split's shards. Raises UserError if there are none, or if one is missing or damaged."""
+    """Read the row groups of a split's shards.
+
+    Raises UserError if a shard is missing or damaged, or if the split has no shards.
+    """
     if dataset.info.images != "packed":
         raise UserError(dataset.store, "images", dataset.info.images, "packed; see `perilune-manifest pack`")
     shards = dataset.shards(split)
@@ -267,7 +270,7 @@ def _group_sizes(dataset: Dataset, path: str) -> list[int]:
 
 
 class StreamLoader:
-    """Batches of a stream from worker processes, or from the calling process; counts them in the stream."""
+    """Batches of a stream, loaded by workers or the calling process; counts the batches in the stream."""
 
     def __init__(self, stream: FrameStream, workers: int = 0, pinned: bool = False):
         """`pinned` puts the batches into page-locked memory, from which a GPU copies them without waiting."""

@@ -17,7 +17,7 @@ COARSEST_STRIDE = 32
 class LabelSettings(Selection):
     """Selection of the craters to find. All other labels are ignored: neither ground truth nor false positives.
 
-    The name of a selection sets all thresholds; thresholds that are also given override it. A run stores all values.
+    The name of a selection sets all thresholds. Thresholds given in addition override these. A run stores all values.
     """
 
     selection: str = "visible"
@@ -32,7 +32,7 @@ class LabelSettings(Selection):
         if not isinstance(name, str):
             return given
         if name not in SELECTIONS:
-            # Keep only the name, so that its own validator reports the error.
+            # Keep only the name, so that the validator of the name reports the error.
             return {"selection": name}
         limits = given.get("radius_px")
         if isinstance(limits, list):
@@ -62,10 +62,10 @@ class AugmentSettings(Section):
     """Largest fraction of the darkest pixels, and of the brightest, that become black and white. Published images are
     often stretched in this way."""
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.2
-    """Largest standard deviation of a Gaussian blur, pixels. Rendered frames already contain the sensor's blur; much
-    more hides the smallest craters."""
+    """Largest standard deviation of a Gaussian blur, pixels. Rendered frames already contain the sensor's blur; a much
+    larger value hides the smallest craters."""
     noise: Annotated[float, Field(ge=0, le=100)] = 1.0
-    """Largest standard deviation of Gaussian noise, grey levels of 255, in addition to the sensor's noise."""
+    """Largest standard deviation of Gaussian noise, in grey levels of 0 to 255, added to the sensor's noise."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "AugmentSettings":
@@ -82,7 +82,7 @@ class LossSettings(Section):
     objectness: Literal["hard", "iou"] = "iou"
     """Objectness target of a positive predictor: 1, or the IoU of its box with its label."""
     reduction: Literal["means", "sums"] = "means"
-    """means: over the predictors of each scale, scales weighted by 1 / stride. sums: plain sums (the paper)."""
+    """means: average over the predictors of each scale, weight scales by 1 / stride. sums: plain sums (the paper)."""
     lambda_iou: Weight = 0.05
     """Weight of L_ciou."""
     lambda_obj: Weight = 1.0
@@ -90,36 +90,37 @@ class LossSettings(Section):
     lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
     lambda_teacher: Weight = 1.0
-    """Weight of the distillation loss from `teacher`; its box and objectness terms have the weights above."""
+    """Weight of the distillation loss from `teacher`; its two terms are weighted by lambda_iou and lambda_obj."""
     lambda_guide: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Weight of the guidance of attention gates: 1 - correlation with the labelled craters of the masks of B_11, B_22
-    and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the paper). No effect
-    without attention."""
+    """Weight of the guidance loss of attention gates: 1 - correlation of the gate's mask with the labelled craters. It
+    covers B_11, B_22 and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the
+    paper). No effect without attention."""
 
 
 class EvaluationSettings(Section):
     """Detection from the network's outputs, and its evaluation."""
 
     scales: Annotated[tuple[Annotated[float, Field(ge=0.25, le=4)], ...], Field(min_length=1, max_length=4)] = (1.0,)
-    """Factors by which frames are resized before inference; detections at all scales are merged. 1 and 2 together
-    find more of the smallest craters at five times the cost. Validation during training uses scale 1 only."""
+    """Factors by which frames are resized before inference; detections at all scales are merged. Scales 1 and 2
+    together find more of the smallest craters but cost five times as much. Validation during training uses scale 1
+    only."""
     match_iou: Annotated[float, Field(gt=0, lt=1)] = 0.5
     """Minimum IoU of a detection and a label for a match."""
     nms_iou: Annotated[float, Field(gt=0, lt=1)] = 0.45
     """Of two detections with a larger IoU, non-maximum suppression removes the one with the lower score."""
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Detections below this score are dropped first. The precision-recall curve ends at this score."""
+    """Detections below this score are dropped before suppression. The precision-recall curve ends at this score."""
     max_aspect: Annotated[float, Field(gt=1, le=1000)] | None = None
     """Largest ratio of a box's longer to its shorter side; longer boxes are dropped before suppression. A box around
     two craters is longer than a crater seen from above. None keeps all."""
     max_detections: Annotated[int, Field(ge=1, le=100_000)] = 2000
     """Largest number of detections in a frame; the usual 100 would truncate crowded frames."""
     varied_frames: bool = False
-    """Choose the score threshold on the validation frames and on copies of them with other contrast, blur and noise,
-    for a detector of images from unknown cameras."""
+    """Choose the score threshold on the validation frames and on copies of them with other contrast, blur and noise.
+    Use this for a detector of images from unknown cameras."""
     min_precision: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Choose the score threshold with the highest recall at this precision on the validation split. None: highest
-    F1."""
+    """Choose the score threshold that gives the highest recall at this precision on the validation split. None: choose
+    the threshold of the highest F1."""
 
 
 class DetectConfig(Section):
@@ -139,42 +140,42 @@ class DetectConfig(Section):
     epochs: Count = 20
     """Passes over the training frames."""
     frozen_epochs: Epochs = 0
-    """Number of first epochs in which the backbone is frozen except its attention gates. Used only with `init_from`:
-    freezing random weights does not help, so without it training starts unfrozen."""
+    """Number of epochs at the start in which the backbone, except its attention gates, is frozen. Used only with
+    `init_from`; otherwise training starts unfrozen, because freezing random weights does not help."""
     init_from: str | None = None
-    """Weights to start from. best.ckpt of a detect run of equal width and in_channels, or crater-detector (the
-    installed detector, width 0.40625): all weights if the strides are equal, else the backbone. Or a Darknet file:
-    darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads too); Darknet files need width 1 and
-    in_channels 3."""
+    """Initial weights. best.ckpt of a detect run of equal width and in_channels, or crater-detector (the installed
+    detector, width 0.40625), sets all weights if the strides are equal, otherwise the backbone only. A Darknet file
+    needs width 1 and in_channels 3; darknet53.conv.74 sets the backbone, yolov3.weights also sets neck and heads."""
     init_layers: Literal["all", "from_second"] = "all"
-    """Layers that `init_from` gives: all, or all but the first convolution (the paper)."""
+    """Layers that `init_from` initialises: all, or all but the first convolution (the paper)."""
     plain_gates_before_frozen_layers: bool = False
-    """Allow attention=cbam with frozen_epochs if `init_from` has no gates (the paper). New plain gates scale their
-    input by about 0.25, so the frozen layers get features that they were not trained on."""
+    """Allow attention=cbam with frozen_epochs even if `init_from` has no gates (the paper). New plain gates scale their
+    input by about 0.25, so the frozen layers get features on which they were not trained."""
     teacher: str | None = None
-    """best.ckpt of a detect run, usually wider, to distil from in addition to the labels. The strides and in_channels
-    must be the same; its anchors are used."""
+    """Teacher for distillation in addition to the labels: best.ckpt of a detect run, usually wider. Its strides and
+    in_channels must equal those of this network, which takes over its anchors."""
     validate_every: Count = 1
-    """Epochs between validations; `epochs` is a multiple of it. The best validated weights are kept."""
+    """Epochs between validations; `epochs` must be a multiple. The weights of the best validation are kept."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] = 8
     """Frames of each process in a training step."""
     learning_rate: Rate = 1e-3
-    """Peak learning rate of AdamW: linear warm-up, then a cosine down to a hundredth."""
+    """Peak learning rate of AdamW. It rises linearly (warm-up), then falls as a cosine to a hundredth."""
     warmup_steps: Annotated[int, Field(ge=0, le=100_000_000)] = 100
     """Number of steps of the warm-up."""
     weight_decay: Annotated[float, Field(ge=0, le=1000)] = 0.01
-    """Weight decay of AdamW; each step multiplies it by the learning rate."""
+    """Weight decay of AdamW; the learning rate multiplies it in each step."""
     gradient_clip: Annotated[float, Field(gt=0, le=1e9)] = 10.0
-    """Largest norm of all gradients together; larger gradients are scaled down to it."""
+    """Largest norm of all gradients together. If the norm is larger, the gradients are scaled down to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
     """Decay per step of the moving average of the weights; the average is evaluated and saved. At step s the decay is
     at most (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
     anchor_sampling: Literal["rare", "plain"] = "rare"
-    """Sizes of labels from which anchors are clustered. rare: with weights of one over the square root of their
-    frequency, so that large craters get anchors. plain: as frequent as they are (the paper)."""
+    """Weights of the label sizes from which anchors are clustered. rare: one over the square root of the frequency of
+    the size, so that large craters get anchors. plain: equal weights (the paper)."""
     assignment: Literal["several", "one"] = "several"
     """Predictors that learn a label. several: every anchor within anchor_ratio, in the cell of the label's centre and
-    in the two nearest cells. one: the anchor of highest IoU in the cell of the centre, as in YOLOv3 (the paper)."""
+    in the two nearest cells. one: the anchor of the highest IoU, in the cell of the centre, as in YOLOv3 (the
+    paper)."""
     anchor_ratio: Annotated[float, Field(gt=1, le=1000)] = 2.0
     """An anchor is assigned to a label if width and height are both within this factor."""
     labels: LabelSettings = LabelSettings()
@@ -196,14 +197,14 @@ class DetectConfig(Section):
     strategy: Strategy = "auto"
     """Lightning's strategy for several processes; auto selects what the settings need."""
     checkpoint_minutes: Annotated[float, Field(ge=0, le=100_000)] = 10.0
-    """Minutes between saves of the training state within an epoch; 0: after every step. It is always saved after an
-    epoch."""
+    """Minutes between saves of the training state within an epoch; 0 saves after every step. The state is always saved
+    after an epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Worker processes that augment frames; 0 augments in the training process, which is best on few cores."""
 
     stream: bool = False
     """Read the training frames of a packed dataset as a stream instead of loading them into memory. The order of
-    frames then also depends on `workers`, which must be the same when a run is resumed."""
+    frames then also depends on `workers`, so do not change it before you resume a run."""
 
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":

@@ -12,9 +12,9 @@ _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
 
 def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
-    """Settings of a run, from its own config.yaml only; a setting missing in the file has its default.
+    """Settings of a run, from its config.yaml only; a setting missing from the file has its default.
 
-    `settings` overrides single settings of the evaluation. Raises UserError on a setting that would change the network.
+    `settings` overrides single evaluation settings. Raises UserError if a setting would change the network.
     """
     path = run / "config.yaml"
     if not path.is_file():
@@ -31,13 +31,13 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
             )
     named = any(text.startswith("detect.labels.selection=") for text in settings)
     if named:
-        # The run stores every threshold of its own selection; another selection sets its own thresholds.
+        # Drop the thresholds stored for the run's selection, so that the new selection sets its thresholds.
         section = {key: value for key, value in section.items() if key != "labels"}
     return resolve_over(DetectConfig, "detect", str(path), section, None, settings)
 
 
 def chosen_threshold(run: Path) -> float:
-    """Read the score threshold that a run chose on its validation split. Raises UserError if there is none."""
+    """Read the score threshold that a run chose on its validation split. Raises UserError if it is missing."""
     threshold = read_metrics(run).get("test/threshold")
     if isinstance(threshold, bool) or not isinstance(threshold, float | int) or not math.isfinite(threshold):
         raise UserError(run / METRICS_FILE, "test/threshold", threshold, "a number; or give --threshold")

@@ -1,4 +1,4 @@
-"""Score detections on all parts of the benchmark: every scoring rule, bins, regions, and the least favourable rule."""
+"""Score detections on all parts of the benchmark: by scoring rule, bin and region, and the lowest figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Spread, spreads
 
 SELECTIONS = ("visible", "paper")
-"""Selections of labels; the second is the paper's."""
+"""Selections of labels; the paper uses the second."""
 SCORING_RULES = {"usual": "", "edge": "edge/", "strict": "strict/"}
 """Rules that decide which detections are false positives (matching.py), and their prefix in the figures."""
 MATCH_IOU = 0.5
@@ -41,7 +41,7 @@ class Region:
     ap50_paper: float
     """AP as defined in the paper."""
     spread: Spread
-    """Spread of it over the scenes."""
+    """Spread of ap50_paper over the scenes."""
     edge_ap50_paper: float
     """AP by the edge scoring rule."""
     f1: float
@@ -62,7 +62,7 @@ class Score:
     """Number of frames scored and number of frames of the locked manifest, by part."""
 
     def least(self, metric: str) -> tuple[str, str, float]:
-        """Selection, scoring rule and value of the lowest `metric` (ap50_paper, f1) over all of both."""
+        """Lowest `metric` (ap50_paper or f1) over all selections and scoring rules: selection, rule, value."""
         values = {
             (selection, rule): float(evaluation.figures()[f"{prefix}{metric}"] or 0.0)
             for selection, evaluation in self.evaluations.items()
@@ -114,8 +114,10 @@ def score(
     detections_by_part: Mapping[str, list[Detections]],
     threshold: float,
 ) -> Score:
-    """Score detections, by part of the benchmark with one entry for each frame; `loaded` is the result of
-    `load_parts`."""
+    """Score detections.
+
+    `detections_by_part` has one entry per frame for each part of the benchmark; `loaded` is the result of `load_parts`.
+    """
     evaluations, regions = {}, {}
     splits = loaded[SELECTIONS[0]]
     facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})

@@ -7,8 +7,8 @@ For each scale:
 3. Predictors whose cells touch the middle of an ignored label become ignored (`_cells_touched`).
 4. All other predictors are negative.
 
-The number of positive predictors depends on the labels. On a GPU the process would have to wait for that number, so the
-loader assigns on the CPU, and the loss only gathers.
+The number of positive predictors depends on the labels. On a GPU the process would have to wait for that number.
+Therefore the loader assigns predictors on the CPU, and the loss only gathers them.
 """
 
 from collections.abc import Callable
@@ -39,11 +39,11 @@ class Assignment:
     predictors: Tensor
     """Frame, anchor, row and column of each positive predictor (4, P)."""
     boxes: Tensor
-    """Box of its label: x0, y0, x1, y1 in pixels (P, 4)."""
+    """Label box of each positive predictor: x0, y0, x1, y1 in pixels (P, 4)."""
     ignored: Tensor
     """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
     counted: Tensor | None = None
-    """False for rows that only fill the other arrays up to a constant length (P,); None: all rows count."""
+    """False for rows that only pad the other arrays to a constant length (P,); None: no row is padding."""
 
     @property
     def positive(self) -> Tensor:
@@ -61,7 +61,7 @@ class Assignment:
         return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Assignment":
-        """The assignment on another device; from page-locked memory without waiting."""
+        """Copy the assignment to another device; from page-locked memory, the process does not wait."""
         return self._each(lambda part: part.to(device, non_blocking=True))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Assignment":
@@ -82,8 +82,8 @@ Targets = list[Assignment]
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float | None) -> Tensor:
     """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
 
-    True for every anchor whose width and height are within the factor `ratio`, and always for the anchor of highest IoU
-    (all boxes centred on one point). Without `ratio`, only for the latter.
+    True for the anchor of the highest IoU (all boxes centred on one point). With `ratio`, also true for every anchor
+    whose width and height are within this factor.
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors
@@ -106,12 +106,12 @@ def assign(
 
     A predictor is positive if its anchor is within the factor `ratio` of a selected label and its cell contains the
     label's centre or is the nearest neighbour of that cell along x or y (as in later YOLO versions). Deviation: YOLOv3
-    makes one predictor of one scale positive for each label. This gives about nine times as many positives, so that a
+    makes one predictor of one scale positive for each label. Our rule gives about nine times as many positives, so a
     short training suffices. Without `ratio`, one predictor is positive, as in YOLOv3.
 
     A predictor is ignored if its anchor matches and its cell touches the middle half of an ignored label's box. All
-    others are negative, including those around a selected label. YOLOv3 ignores those if their boxes overlap the label
-    by more than 0.5; then the loss does not lower their scores below the scores of better boxes.
+    other predictors are negative, including those around a selected label. YOLOv3 ignores predictors around a label if
+    their boxes overlap it by more than 0.5; the loss then does not push their scores below the scores of better boxes.
     """
     matches = matching_anchors(labels.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
     centre = (labels.boxes[:, :2] + labels.boxes[:, 2:]) / 2
@@ -147,7 +147,7 @@ def assign(
 
 
 def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shape: tuple[int, int, int, int]) -> Tensor:
-    """Cells (N, 3, h, w) whose centre is within a quarter of a box, plus half a cell, of the box's centre.
+    """Cells (N, 3, h, w) with a centre closer to a box's centre than a quarter of the box plus half a cell.
 
     `at` and `size` (P, 2) are the centres and sizes of the boxes in cells.
     """
@@ -157,7 +157,7 @@ def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shap
     reach = size / 4 + 0.5
     span = int(reach.max().ceil()) + 1
     offsets = torch.arange(-span, span + 1, device=at.device)
-    # Columns and rows (P, 2, S) around each centre; a cell is touched if both its column and its row are.
+    # Columns and rows (P, 2, S) around each centre; a cell is touched if both its column and its row are near.
     cells = at.floor()[..., None] + offsets
     limit = at.new_tensor([shape[3], shape[2]])[:, None]
     near = ((cells + 0.5 - at[..., None]).abs() < reach[..., None]) & (cells >= 0) & (cells < limit)

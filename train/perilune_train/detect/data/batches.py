@@ -1,4 +1,4 @@
-"""Batches of frames and labels: order of an epoch, augmentation, assignment, the network's input."""
+"""Make batches of frames and labels: order of an epoch, augmentation, assignment, network input."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
 """A normalised frame (H, W), its boxes (M, 4) in pixels, and which of them are selected (M,)."""
 Batch = tuple[Tensor, Targets]
-"""Normalised frames (N, H, W) and the assignments of their labels; none without training."""
+"""Normalised frames (N, H, W) and the assignments of their labels; no assignments outside training."""
 Key = tuple[int, int]
 """Epoch and number of a frame within a share."""
 
@@ -96,10 +96,10 @@ class Collate:
 def training_loader(
     split: DetectSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> torch_data.DataLoader:
-    """Training batches of a share, in every epoch in its order; the first epoch, `epoch`, starts at batch `start`.
+    """Training batches of a share in the order of each epoch; the first epoch, `epoch`, starts at batch `start`.
 
-    `anchors` (scales, 3, 2) are the anchors of the network. All processes have the same number of batches: each frame
-    is seen once in an epoch, except at most processes - 1 frames, which differ from epoch to epoch.
+    `anchors` (scales, 3, 2) are the anchors of the network. All processes have equally many batches. So each frame is
+    used once in an epoch, except at most processes - 1 frames, which differ from epoch to epoch.
     """
     frames = TrainingFrames(split, config)
     fewest = split.n_frames // split.share.processes
@@ -108,18 +108,18 @@ def training_loader(
 
 
 def evaluation_loader(split: DetectSplit, config: DetectConfig, anchors: Tensor | None = None) -> torch_data.DataLoader:
-    """Batches of a share in order, not augmented; with `anchors` as in training, else without assignments."""
+    """Batches of a share in order, not augmented; with `anchors` they have assignments, as in training."""
     frames = EvaluationFrames(split)
     batches = torch_data.BatchSampler(range(len(frames)), config.batch_size, drop_last=False)
     return batch_loader(frames, batches, collate_of(config, anchors), config.workers, pinned(config))
 
 
 def collate_of(config: DetectConfig, anchors: Tensor | None) -> Collate:
-    """Make batches with assignments to anchors (scales, 3, 2); without, if they are None."""
+    """Return a collate function that assigns labels to anchors (scales, 3, 2); None disables assignment."""
     ratio = config.anchor_ratio if config.assignment == "several" else None
     return Collate(None if anchors is None else anchors.cpu(), config.strides, ratio)
 
 
 def pinned(config: DetectConfig) -> bool:
-    """Whether batches are put into page-locked memory: if they are copied to a GPU."""
+    """Whether to put batches into page-locked memory: True if they are copied to a GPU."""
     return choose_device(config.device) == "cuda"

@@ -56,7 +56,7 @@ def facts_of(frames: FrameStore) -> FrameFacts:
 
 
 def joined_facts(parts: Mapping[str, FrameFacts]) -> FrameFacts:
-    """Facts of all frames; names of frames, scenes and trajectories begin with the name of the part."""
+    """Join the metadata of several parts; names of frames, scenes and trajectories begin with the part's name."""
 
     def renamed(part: str, names: list[str]) -> list[str]:
         return [f"{part}/{name}" for name in names]

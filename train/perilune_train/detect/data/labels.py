@@ -1,4 +1,4 @@
-"""Labels of the frames of a split, read scene by scene into one array per column."""
+"""Read the labels of a split's frames, scene by scene, into one array per column."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,8 +43,8 @@ class FrameLabels:
     depth_ratio: Array | None = None
     """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
     crowd: NDArray[np.bool_] | None = None
-    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`; never selected. None if there is no such
-    label."""
+    """Whether a label is a region of many craters (M,), as COCO's `iscrowd`. Such a label is never selected. None if
+    there are no such labels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class LabelLimits:
 
 @dataclass(frozen=True)
 class SplitLabels(Sequence[FrameLabels]):
-    """Labels of N frames; an item is a view of the arrays. Worker processes share the few arrays without copies."""
+    """Labels of N frames; an item is a view of the arrays. Worker processes share the arrays without copies."""
 
     shape: Array
     """Box (4), radius and ellipse (5) of all labels, frame after frame (L, 10)."""
@@ -72,7 +72,7 @@ class SplitLabels(Sequence[FrameLabels]):
     depth_ratio: Array
     """See FrameLabels (L,)."""
     bounds: NDArray[np.int64]
-    """The labels of frame i are those from bounds[i] to bounds[i + 1] (N + 1,)."""
+    """Start of each frame's labels (N + 1,): frame i has the labels bounds[i] to bounds[i + 1] - 1."""
 
     def __len__(self) -> int:
         return len(self.bounds) - 1
@@ -100,8 +100,8 @@ def read_split_labels(
 ) -> tuple[SplitLabels, Array]:
     """Labels and ignored craters of the share's frames, and sizes (S, 2) of the selected labels of all frames.
 
-    `table` has all frames of the split (`frame_table`). Memory holds the result and the craters and labels of one scene
-    at a time. Raises UserError if a part cannot be read or keys are broken.
+    `table` has all frames of the split (`frame_table`). Memory holds the result and one scene's craters and labels at a
+    time. Raises UserError if a part cannot be read, or if a key refers to a missing row or is not unique.
     """
     rows = dataset.table("frames", FRAME_COLUMNS)
     check = KeyCheck(dataset, rows)
@@ -146,8 +146,9 @@ def frame_labels(
     craters: Craters,
     limits: LabelLimits,
 ) -> FrameLabels:
-    """Labels and ignored craters of one frame, given its row, its rows of the table labels and its scene's craters.
+    """Labels and ignored craters of one frame.
 
+    `row` is its row of the table frames, `labels` its rows of the table labels, and `craters` the craters of its scene.
     Raises UserError if the crater of a label is missing.
     """
     ids = labels["crater_id"].to_numpy()
@@ -177,7 +178,7 @@ class _SceneLabels:
 
     @classmethod
     def of(cls, labels: pa.Table, craters: Craters, selection: Selection) -> "_SceneLabels":
-        """From rows of the table labels, whose craters all exist."""
+        """Convert rows of the table labels; all their craters must exist."""
         ids = labels["crater_id"].to_numpy()
         row = np.searchsorted(craters.crater_id, ids)
         depth_m, diameter_m = craters.depth_m[row], craters.diameter_m[row]
@@ -188,7 +189,7 @@ class _SceneLabels:
 
 
 class _Joined:
-    """Collects the labels and the ignored craters of one frame after the other."""
+    """Collects the labels and the ignored craters of frames, one frame at a time."""
 
     def __init__(self) -> None:
         self.shape: list[Array] = []

@@ -1,8 +1,8 @@
-"""Training frames and their assignments on the GPU, so that batches need no work of the processor.
+"""Training frames and their assignments on the GPU, so that the CPU does not prepare batches.
 
-A GPU trains a detector faster than a process can prepare its batches. Without augmentation a frame is the same in every
-epoch, so frames and assignments are moved to the GPU once, and a batch is gathered there. All batches of one size have
-equal shapes, which a captured step needs (`detect/train/captured.py`).
+A GPU trains a detector faster than a process can prepare the batches. Without augmentation a frame does not change
+between epochs, so frames and assignments are moved to the GPU once, and batches are gathered there. All batches of one
+size have equal shapes, which a captured step needs (`detect/train/captured.py`).
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class ResidentScale:
     predictors: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
     boxes: Tensor
-    """Box of its label: x0, y0, x1, y1 in pixels (F, K, 4)."""
+    """Label box of each positive predictor: x0, y0, x1, y1 in pixels (F, K, 4)."""
     counted: Tensor
     """False for rows of padding (F, K)."""
     ignored: Tensor
@@ -89,7 +89,7 @@ class ResidentFrames:
 
 
 def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
-    """Assignments of portions of the frames as arrays of constant length."""
+    """Join the assignments of all portions, and pad the rows of each frame to one length."""
     predictors, boxes = [], []
     for part in parts:
         order = torch.argsort(part.predictors[0], stable=True)
@@ -108,7 +108,7 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
 
 
 def may_reside(config: DetectConfig) -> bool:
-    """Whether the settings allow resident frames: no augmentation, teacher or guidance, one process, no stream."""
+    """Whether the settings allow resident frames: one process, and no augmentation, teacher, guidance or stream."""
     alone = config.devices == config.num_nodes == 1
     plain = config.teacher is None and config.loss.lambda_guide == 0
     return alone and plain and not config.stream and config.augment == _UNCHANGED
@@ -120,7 +120,7 @@ def fits(split: DetectSplit, device: torch.device) -> bool:
 
 
 class _Numbers(torch_data.Dataset):
-    """A data set whose items are the numbers of the frames."""
+    """A dataset whose items are the numbers of the frames."""
 
     def __getitem__(self, key: tuple[int, int]) -> int:
         return key[1]

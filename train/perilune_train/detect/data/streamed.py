@@ -38,8 +38,8 @@ class StreamedSplit:
 def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> StreamedSplit:
     """Open the training split of a packed dataset as a stream.
 
-    Raises UserError on damaged or missing shards, on frame sizes unfit for the network and on fewer frames than
-    processes.
+    Raises UserError if a shard is damaged or missing, if the network cannot use the frame size, or if there are fewer
+    frames than processes.
     """
     check_frame_size(dataset)
     radius_px = evaluated_range(dataset, config.labels)
@@ -60,7 +60,7 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
 def streamed_loader(
     split: StreamedSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> StreamLoader:
-    """Training batches of a stream, in every epoch in its order; the first epoch, `epoch`, starts at batch `start`.
+    """Training batches of a stream in the order of each epoch; the first epoch, `epoch`, starts at batch `start`.
 
     `anchors` (scales, 3, 2) are the anchors of the network.
     """
@@ -72,7 +72,7 @@ def streamed_loader(
 
 @dataclass(frozen=True)
 class _Labels:
-    """Labels and ignored craters of streamed frames; keeps the craters of the last scenes."""
+    """Labels and ignored craters of streamed frames; keeps the craters of recently used scenes."""
 
     dataset: Dataset
     config: DetectConfig
@@ -80,7 +80,7 @@ class _Labels:
     scenes: dict[str, Craters] = field(default_factory=dict)
 
     def __call__(self, frame: StreamedFrame) -> FrameLabels:
-        """Return the labels of a frame. Raises UserError if the crater of one is missing."""
+        """Return the labels of a frame. Raises UserError if the crater of a label is missing."""
         scene_id = frame.row["scene_id"]
         craters = self.scenes.pop(scene_id, None)
         if craters is None:
@@ -104,7 +104,7 @@ class _Batches:
         return self.collate([self.sample(frame, epoch) for frame in frames])
 
     def sample(self, frame: StreamedFrame, epoch: int) -> Sample:
-        """Decode and augment a frame; the augmentation depends on seed, epoch and frame only, as in memory."""
+        """Decode and augment a frame; as for frames in memory, augmentation depends on seed, epoch and frame only."""
         config, camera, labels = self.labels.config, self.labels.dataset.info.camera, self.labels(frame)
         name, size = frame.row["frame_id"], frame.row["png_bytes"]
         image = decode(frame.png, f"{self.labels.dataset.store}/{name}", camera.height_px, camera.width_px, size)

@@ -1,4 +1,4 @@
-"""Inference engines: functions from images to boxes and scores."""
+"""Inference engines: functions that map images to boxes and scores."""
 
 import contextlib
 import functools
@@ -20,7 +20,7 @@ from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
 
 Array = NDArray[np.float32]
 Engine = Callable[[Array], tuple[Array, Array]]
-"""Normalised images (N, C, H, W) in float32 to boxes (N, K, 4) in pixels and scores (N, K)."""
+"""Maps normalised images (N, C, H, W), float32, to boxes (N, K, 4) in pixels and scores (N, K)."""
 EnginePrecision = Literal["f32", "bf16"]
 _EXPECTED = "a file written by `perilune-train detect deploy`"
 
@@ -29,8 +29,8 @@ def package(name: str) -> Any:
     """Import a module of the extra `export`. Raises UserError if it is not installed."""
     # Official builds of ONNX Runtime send telemetry unless this is set before the import.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    # OpenVINO reports each import to an analytics service, and keeps an identity in the home folder for it. It does
-    # neither where this package is absent; a program that has imported it itself keeps it.
+    # OpenVINO reports each import to an analytics service, and stores a user id for it in the home folder. It does
+    # neither if the package openvino_telemetry is missing, so hide it, unless the program has already imported it.
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     try:
         return importlib.import_module(name)
@@ -39,7 +39,7 @@ def package(name: str) -> Any:
 
 
 def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engine:
-    """Engine of a torch network that returns boxes and scores; channels last, with torch's number of threads."""
+    """Engine of a torch network that returns boxes and scores; uses channels last and torch's thread count."""
     network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
     @torch.inference_mode()
@@ -53,7 +53,7 @@ def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engi
 
 
 def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
-    """ONNX Runtime engine of an .onnx file; 0 threads means one per core, or as many as a container's quota allows."""
+    """ONNX Runtime engine of an .onnx file; `threads` 0 uses one per core, within a container's CPU quota."""
     onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or _within_quota()
@@ -66,10 +66,11 @@ def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
 
 @functools.cache
 def openvino_core() -> Any:
-    """The one `openvino.Core` of this process, kept until it ends.
+    """The only `openvino.Core` of this process, kept until the process ends.
 
-    Each core replaces the thread's signal stack and restores the previous one when it is destroyed. If several overlap,
-    the last one restores an unmapped stack, and the next Ctrl-C ends Python with a segmentation fault.
+    Each core replaces the thread's signal stack, and restores the previous stack when the core is destroyed. If the
+    lifetimes of several cores overlap, the last core restores an unmapped stack, and the next Ctrl-C ends Python with a
+    segmentation fault.
     """
     return package("openvino").Core()
 
@@ -77,9 +78,9 @@ def openvino_core() -> Any:
 def openvino_engine(
     path: Path, precision: EnginePrecision = "f32", threads: int = 0, batch: int | None = None
 ) -> Engine:
-    """OpenVINO engine of an .onnx or .xml file; with `batch` for that number of images only, which is faster.
+    """OpenVINO engine of an .onnx or .xml file; `batch` fixes the number of images, which is faster.
 
-    By default OpenVINO uses bfloat16 if the processor has it; here `precision` decides.
+    OpenVINO alone would use bfloat16 whenever the processor supports it; here `precision` decides.
     """
     core = openvino_core()
     with _readable(path):
@@ -99,8 +100,10 @@ def openvino_engine(
 
 
 def _within_quota() -> int:
-    """Number of threads for an engine that ignores a container's quota; 0 (the engine decides) if the quota is no
-    limit."""
+    """Number of threads for an engine that ignores a container's CPU quota; 0 without a limiting quota.
+
+    With 0, the engine decides.
+    """
     return usable_cores() if usable_cores() < cores_in_affinity() else 0
 
 
@@ -111,7 +114,7 @@ def has_bf16() -> bool:
 
 @contextlib.contextmanager
 def _readable(path: Path) -> Any:
-    """Raise UserError if an engine cannot read a file; each engine raises its own kind of RuntimeError."""
+    """Raise UserError if an engine cannot read a file; engines raise various kinds of RuntimeError."""
     if not path.is_file():
         raise UserError(path, "network", "no such file", _EXPECTED)
     if path.stat().st_size > MOST_WEIGHT_BYTES:
@@ -127,8 +130,10 @@ def _readable(path: Path) -> Any:
 
 
 def _check_no_other_files(path: Path) -> None:
-    """Raise UserError if an ONNX file refers to other files for its tensors: any file of the disk could be read as
-    weights."""
+    """Raise UserError if an ONNX file refers to other files for its tensors.
+
+    Such a file could make the engine read any file of the disk as weights.
+    """
     model = package("onnx").load(str(path), load_external_data=False)
     names = [f"a tensor in the file {each.value!r}" for tensor in _tensors(model) for each in tensor.external_data]
     if names:
@@ -141,7 +146,7 @@ def _tensors(message: Any) -> Iterator[Any]:
         yield message
         return
     for field, value in message.ListFields():
-        # Only messages have parts; a list of numbers may be long.
+        # Search messages only: numbers contain no tensors, and a list of numbers may be long.
         if field.message_type is not None:
             for part in value if isinstance(value, Sequence) else [value]:
                 yield from _tensors(part)

@@ -37,9 +37,9 @@ from perilune_train.records.provenance import (
 from perilune_train.training.runs import RunFolder, load_weights
 
 MAX_DIFFERENCE_PX = 1e-3
-"""Largest allowed difference of a coordinate of a compared box from torch's float32, pixels."""
+"""Largest allowed difference between a compared box coordinate and torch's float32 result, pixels."""
 MAX_DIFFERENCE_SCORE = 1e-3
-"""Largest allowed difference of any predictor's score."""
+"""Largest allowed difference between a predictor's score and torch's."""
 _CHECKED_BOXES = 100
 FORMATS = ("onnx", "openvino")
 _CHECKED_FRAMES = 8
@@ -47,9 +47,9 @@ _CHECKED_FRAMES = 8
 
 @torch.no_grad()
 def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
-    """Largest differences from torch's float32: of box coordinates in pixels, and of scores.
+    """Largest differences from torch's float32 results: of box coordinates, in pixels, and of scores.
 
-    Compares all scores, and the boxes with a score of at least `min_score` or among the best 100 of their image.
+    Compares all scores, but only boxes with a score of at least `min_score` or among the best 100 of their image.
     """
     boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
     found_boxes, found_scores = engine(images)
@@ -87,7 +87,7 @@ class Trained:
     network: YOLOv3
     """Network with the run's best weights, in evaluation mode, on the CPU."""
     config: DetectConfig
-    """Its settings."""
+    """Settings of the run."""
     threshold: float
     """Score threshold that the run chose on its validation split."""
     checkpoint: Path
@@ -133,8 +133,10 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """Terrain record of the exported network, including the terrain of the int8 calibration, and the check of the
-    latter."""
+    """Terrain record of the exported network, and the check of the int8 calibration's terrain.
+
+    The record includes the terrain of the calibration. Without calibration the check is None.
+    """
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None
@@ -167,9 +169,9 @@ def export_run(
     Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (metadata)
     and README.md. Compares on frames of the dataset's validation split, or on noise without a dataset.
 
-    Raises UserError, and writes nothing, if a file differs from torch, if the dataset has frames of another size, or if
-    int8 would be calibrated on terrain of a test split, the run's or the dataset's. With `allow_overlap` such terrain
-    is allowed, and detector.json and README.md are marked.
+    Raises UserError, and writes nothing, if a file's output differs from torch's, if the dataset has frames of another
+    size, or if int8 would be calibrated on terrain of a test split (of the run or of the dataset). `allow_overlap`
+    allows such terrain, and marks detector.json and README.md.
     """
     formats, size_px, int8 = files.formats, files.size_px, files.int8
     for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):

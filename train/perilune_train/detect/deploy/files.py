@@ -1,4 +1,4 @@
-"""The detector for flight, with fewer and simpler operations, and its files: ONNX and OpenVINO."""
+"""The detector for flight, with fewer and simpler operations, and its export to ONNX and OpenVINO files."""
 
 import copy
 import json
@@ -17,11 +17,11 @@ _OPSET = 17
 
 
 class FlightDetector(nn.Module):
-    """Images (N, in_channels, size_px, size_px) to boxes (N, K, 4), x0 y0 x1 y1 in pixels, and scores (N, K).
+    """Maps images (N, in_channels, size_px, size_px) to boxes (N, K, 4), x0 y0 x1 y1 in pixels, and scores (N, K).
 
-    Equal to `YOLOv3.detect` up to rounding: batch norm is folded into the convolutions (exactly: W' = W g / sqrt(v +
-    eps), b' = beta - m g / sqrt(v + eps)), CBAM has no custom backward pass, decoding is included, suppression is not.
-    The given network is not changed.
+    Boxes and scores equal those of `YOLOv3.detect` up to rounding. Batch norm is folded exactly into the convolutions:
+    W' = W g / sqrt(v + eps), b' = beta - m g / sqrt(v + eps). CBAM has no custom backward pass. The module decodes
+    boxes but does not suppress any. The given network is not changed.
     """
 
     def __init__(self, network: YOLOv3, size_px: int = 256):
@@ -47,12 +47,12 @@ class FlightDetector(nn.Module):
 
 
 def write_onnx(detector: FlightDetector, path: Path, metadata: dict[str, Any], in_channels: int, size_px: int) -> None:
-    """Write the graph for any number of images; `metadata` is stored in it, each entry as JSON."""
+    """Write an ONNX file for any number of images; it stores each entry of `metadata` as JSON."""
     onnx = package("onnx")
     names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
-        # The tracing exporter: the newer one needs two more packages and gives the same graph.
+        # Use the tracing exporter: the newer exporter needs two more packages and gives the same graph.
         torch.onnx.export(
             detector,
             (torch.zeros(1, in_channels, size_px, size_px),),

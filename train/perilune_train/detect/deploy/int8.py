@@ -1,4 +1,4 @@
-"""Quantisation of the detector to int8 after training; kept only if it is faster and nearly as accurate."""
+"""Quantise a trained detector to int8; keep the result only if it is faster and nearly as accurate."""
 
 import dataclasses
 import logging
@@ -39,13 +39,13 @@ class Int8Verdict:
     ap50_paper_float: float
     """AP on the validation split in float32, at scale 1 only."""
     ap50_paper_int8: float
-    """AP of the int8 network, with its other parts in `precision`."""
+    """AP on the validation split of the int8 network; the parts that are not int8 compute in `precision`."""
     float_s: float
     """Median time of one image before quantisation, seconds, in `precision`."""
     int8_s: float
     """Median time of one image in int8, seconds."""
     precision: EnginePrecision
-    """Precision of the parts that are not int8: bf16 if the processor has it."""
+    """Precision of the parts that are not int8: bf16 if the processor supports it."""
 
     @property
     def kept(self) -> bool:
@@ -68,7 +68,7 @@ class Int8Verdict:
 def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config: DetectConfig) -> Int8Verdict:
     """Quantise the ONNX file `source` into `out` and evaluate both on `val`; deletes `out` unless int8 is kept.
 
-    Calibrated on 64 frames spread over the training split.
+    Calibrates on 64 frames spread over the training split.
     """
     frames = load_frames(dataset, "train").images
     chosen = frames[np.linspace(0, len(frames) - 1, min(_CALIBRATION_FRAMES, len(frames))).astype(int)]
@@ -88,9 +88,10 @@ def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config
 
 
 def quantise(source: Path, out: Path, images: Array) -> None:
-    """Static quantisation of an ONNX file (ONNX Runtime's): weights per channel, activations at convolutions' inputs.
+    """Quantise an ONNX file with ONNX Runtime's static method.
 
-    `images` (N, C, H, W) are run through the network to measure the range of each activation.
+    Quantises weights per channel, and activations at the inputs of convolutions. The network runs on `images` (N, C, H,
+    W) to measure the range of each activation.
     """
     onnx, quantization = package("onnx"), package("onnxruntime.quantization")
 
@@ -116,7 +117,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
             activation_type=quantization.QuantType.QUInt8,
             weight_type=quantization.QuantType.QInt8,
             nodes_to_exclude=[node.name for node in graph.node if _KEPT_FLOAT.search(node.name)],
-            # So that engines can fuse a convolution with the next operation before rounding.
+            # Do not quantise outputs, so that engines can fuse a convolution with the next operation before rounding.
             extra_options={"OpTypesToExcludeOutputQuantization": ["Conv"]},
         )
     finally:
@@ -124,7 +125,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
 
 def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, label: str) -> float:
-    """The paper's AP, at the run's IoU, of an engine on a split: image by image, at scale 1 only, as in flight."""
+    """The paper's AP of an engine on a split, at the run's IoU; images run one by one at scale 1, as in flight."""
     import torch
 
     detections = []
@@ -139,7 +140,10 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:
-    """Times of each engine's calls, seconds; the engines take turns, so that other load slows all of them equally."""
+    """Time of each call of each engine, seconds.
+
+    The engines take turns, so that other load slows all of them equally.
+    """
     for engine in engines.values():
         for _ in range(warm_up):
             engine(images)

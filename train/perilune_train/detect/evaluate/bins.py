@@ -1,9 +1,9 @@
 """Metrics by crater size, altitude, Sun elevation and freshness.
 
-Altitude and Sun elevation belong to a frame: a bin holds whole frames. Radius belongs to a label: a bin follows COCO's
-rule for areas, so detections are matched again with the labels of other bins ignored, and an unmatched detection is
-ignored if its own radius is outside the bin. Freshness, depth over diameter, belongs to a label too, but a false
-positive has none, so only recall is defined.
+Altitude and Sun elevation belong to a frame, so a bin holds whole frames. Radius belongs to a label, so a bin follows
+COCO's rule for areas: detections are matched again while the labels of other bins are ignored, and an unmatched
+detection is ignored if its radius is outside the bin. Freshness (depth over diameter) belongs to a label too. A false
+positive has no freshness, so only recall is defined.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from perilune_train.records.spread import Resamples, Spread, spreads
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0, float("inf"))
-"""The paper's range up to 50 px, then one open bin for the larger labels of wider images."""
+"""Bins of the paper's range up to 50 px, and one open bin for the larger labels of wider images."""
 _PAPER_MAX_RADIUS_PX = 50.0
 ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
 SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
@@ -41,7 +41,7 @@ class BinFigures:
     low: float
     """Lower limit, included."""
     high: float
-    """Upper limit; included only in the last bin and in the paper's largest radius bin (up to 50 px)."""
+    """Upper limit. It belongs to the bin only in the last bin and in the paper's largest radius bin (up to 50 px)."""
     frames: int
     """Number of frames with a selected label in the bin."""
     labels: int
@@ -83,7 +83,7 @@ def figures_by_bin(
     criteria: Criteria,
     resamples: Resamples,
 ) -> list[BinFigures]:
-    """Metrics of every bin that holds selected labels; `matches` are by the same criteria.
+    """Metrics of every bin that holds selected labels; `matches` must follow `criteria`.
 
     The outer altitude bins include frames up to a tenth beyond the first and the last altitude, because trajectories
     end near the nominal altitude, not exactly at it.
@@ -152,7 +152,7 @@ def _of_labels(
     threshold: float,
     resamples: Resamples,
 ) -> BinFigures:
-    """Recall of the labels `in_bin` (L,) in the matching with all labels."""
+    """Recall of the labels `in_bin` (L,); the matches are those of all labels."""
     hit = np.zeros(len(in_bin), np.bool_)
     hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
     frames = overlaps.label_frame[in_bin]

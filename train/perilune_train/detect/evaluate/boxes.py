@@ -23,7 +23,7 @@ def coverage_matrix(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def _intersections(first: ArrayLike, second: ArrayLike) -> tuple[Array, Array]:
-    """Areas (N, M) that boxes (N, 4) and (M, 4) have in common, and the areas (N,) of the first."""
+    """Areas (N, M) of the intersections of boxes (N, 4) and (M, 4), and areas (N,) of the first boxes."""
     a, b = (np.asarray(boxes, np.float64).reshape(-1, 4).T for boxes in (first, second))
     # One matrix per side, because a last axis of length two takes twice as long.
     width, height = (
@@ -36,9 +36,9 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
     """Non-maximum suppression: indices of the kept boxes, best first, at most `max_count`.
 
     A box is removed if its IoU with a kept box of a higher score exceeds `threshold_iou`; equal scores keep their
-    order. Scores are above 0. The result is that of OpenCV (`cv2.dnn.NMSBoxes`), which compares scores and overlaps as
-    float32. There is no limit on candidates: several hundred craters with a dozen predictors each would exceed any
-    usual limit.
+    order. Scores must be above 0. The result equals OpenCV's (`cv2.dnn.NMSBoxes`), which compares scores and overlaps
+    as float32. The number of candidates is not limited: several hundred craters with a dozen predictors each would
+    exceed any usual limit.
     """
     boxes, scores = np.asarray(boxes, np.float64).reshape(-1, 4), np.asarray(scores, np.float64)
     if not len(boxes):
@@ -50,12 +50,13 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
 
 @compiled
 def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
-    """Indices of the boxes (N, 4) that suppression keeps, at most `max_count`; boxes are x, y, width, height, best
-    first.
+    """Indices of the boxes (N, 4) that suppression keeps, at most `max_count`.
 
-    Kept boxes are listed in the cells of a grid that they touch, so that a box is compared only with nearby boxes. Two
-    boxes that overlap touch a common cell; cells at the edge of the grid include everything beyond. A box that touches
-    more than `most` cells, or has no area, is kept in a separate list and compared with all.
+    Boxes are x, y, width, height, best first.
+
+    Each cell of a grid lists the kept boxes that touch it, so that a box is compared only with nearby boxes. Two boxes
+    that overlap touch a common cell; cells at the edge of the grid include everything beyond the grid. A box that
+    touches more than `most` cells, or has no area, goes to a separate list and is compared with all boxes.
     """
     side, most = 32, 64
     n, low, high = len(boxes), np.empty(2), np.empty(2)

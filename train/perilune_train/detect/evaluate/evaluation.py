@@ -1,14 +1,12 @@
-"""Evaluation of detections: all computations, on plain arrays.
-
-Use it for rendered datasets and real images alike:
+"""Compute all metrics of detections, on plain arrays; works for rendered datasets and for real images.
 
     evaluation = evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px=(2.0, 50.0)))
     figures = evaluation.figures()                       # flat keys, for metrics.json
     write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
 
-`detections` is a list of Detections, `labels` a list of FrameLabels (real images: all selected and labelled, with the
-ellipses inscribed in the boxes) and `facts` a FrameFacts (`unknown_facts` if nothing is known). Each has one entry per
-frame.
+`detections` is a list of Detections, `labels` a list of FrameLabels, and `facts` a FrameFacts (`unknown_facts` if
+nothing is known). Each has one entry per frame. Labels of real images are all selected and labelled, and their ellipses
+are inscribed in the boxes.
 """
 
 from collections.abc import Sequence
@@ -63,7 +61,7 @@ class Evaluation:
     by_iou: list[Matches]
     """Matches at each of COCO_IOUS."""
     bins: list[BinFigures]
-    """By radius, altitude, Sun elevation and freshness; only bins that hold labels."""
+    """Metrics by radius, altitude, Sun elevation and freshness, for bins that hold labels."""
     spreads: dict[str, Spread]
     """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper by the edge and
     strict scoring rules."""
@@ -72,14 +70,14 @@ class Evaluation:
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """Centre and radius errors of the found craters, see `errors_of_found`."""
+        """Centre and radius errors of the detected craters; see `errors_of_found`."""
         return errors_of_found(self.overlaps, self.matches, self.threshold)
 
     def figures(self) -> Metrics:
         """Flat keys for metrics.json; NaN where undefined.
 
-        The keys are those of `metrics.figures`, `figures_over_ious` and `Spread.keys`, <bin>/ap50_paper and others,
-        recall_radius_... and `errors`.
+        The keys come from `metrics.figures`, `figures_over_ious`, `Spread.keys` and `errors`; others are
+        <bin>/ap50_paper and further metrics of each bin, and recall_radius_...
         """
         result: Metrics = {
             **figures(self.matches, self.threshold),
@@ -128,7 +126,7 @@ def evaluate_detections(
 ) -> Evaluation:
     """Evaluate the detections of all frames.
 
-    The edge scoring rule is valid only if `labels` include, as ignored ones, craters well below the range of radii.
+    The edge scoring rule is valid only if `labels` also include craters well below the range of radii, as ignored.
     `seed` is the random seed of the bootstrap.
     """
     match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
@@ -164,11 +162,12 @@ def evaluate_detections(
 
 
 def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
-    """Errors of found craters, in pixels and (`_relative`) divided by the label's radius; NaN if none was found.
+    """Errors of the centres and radii of detected craters; NaN without detections.
 
-    The centre is the centre of the box. The radius is sqrt(w h) / 2 of a box, for the detection and for the label. For
-    a rotated ellipse it is slightly larger than sqrt(a b), which a box does not determine. Bias is the mean of detected
-    minus true.
+    Errors are in pixels (`_px`) or divided by the label's radius (`_relative`). The centre of a crater is the centre of
+    its box, and the radius is sqrt(w h) / 2 of the box, for detections and labels alike. For a rotated ellipse this
+    radius is slightly larger than sqrt(a b), which a box does not determine. The bias is the mean of detected minus
+    true radius.
     """
     hits = (matches.label >= 0) & (matches.scores >= threshold)
     ours, truth = overlaps.boxes[hits], overlaps.label_boxes[matches.label[hits]]

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Curve:
-    """Precision and recall at decreasing score thresholds."""
+    """Precision-recall curve: precision and recall at decreasing score thresholds."""
 
     scores: Array
     """Thresholds, decreasing (K,)."""
@@ -25,14 +25,14 @@ class Curve:
     def ap_paper(self) -> float:
         """The paper's AP, the headline metric: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.
 
-        There is one threshold per distinct score, as in scikit-learn's average_precision_score: equal scores count
-        together. Never above `ap_envelope`.
+        There is one threshold per distinct score, as in scikit-learn's average_precision_score, so equal scores count
+        together. The result is never above `ap_envelope`.
         """
         ends = self._thresholds()
         return float(np.sum(np.diff(self.recall[ends], prepend=0.0) * self.precision[ends]))
 
     def ap_envelope(self) -> float:
-        """All-point interpolated AP: P_n is replaced by the best precision at that recall or a higher one.
+        """All-point interpolated AP: P_n is replaced by the best precision at an equal or higher recall.
 
         Equal scores count one by one in the order of the detections, as in COCO's tools.
         """
@@ -45,7 +45,7 @@ class Curve:
         return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
 
     def _thresholds(self) -> NDArray[np.bool_]:
-        """Which points are possible thresholds (K,): the last of equal scores, since a threshold keeps all of them."""
+        """Which points are possible thresholds (K,): only the last of equal scores, since a threshold keeps all."""
         return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:
@@ -55,9 +55,9 @@ class Curve:
         return float(self.scores[int(f1_score(self.precision, self.recall).argmax())])
 
     def operating_threshold(self, min_precision: float | None) -> tuple[float, str]:
-        """Score threshold (0 to 1) and its description: highest F1, or highest recall at a precision of min_precision.
+        """Score threshold (0 to 1) and its description: highest F1, or highest recall at `min_precision`.
 
-        If no threshold reaches that precision, highest F1 is used, and the description says so.
+        If no threshold reaches that precision, the threshold of the highest F1 is used, and the description says so.
         """
         if min_precision is None:
             return self.best_threshold(), "of highest F1"
@@ -92,13 +92,15 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
 
 
 def figures(matches: Matches, threshold: float) -> dict[str, float]:
-    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key; with the prefix "strict/" by the strict
-    rule."""
+    """Six metrics by key: ap50_paper, ap50_envelope, ap50_coco101, precision, recall, f1.
+
+    Keys with the prefix "strict/" hold the metrics by the strict scoring rule.
+    """
     return figures_of_rule(matches, threshold, "") | figures_of_rule(matches.strict(), threshold, "strict/")
 
 
 def figures_of_rule(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
-    """The six metrics by one scoring rule, by key with a prefix."""
+    """The six metrics by one scoring rule; `prefix` starts their keys."""
     points = curve(matches)
     precision, recall, f1 = at_threshold(matches, threshold)
     return {

@@ -69,10 +69,10 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
 
 
 def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) -> dict[str, list[int]]:
-    """Select `count` frames each of best, typical (nearest the median) and worst F1 (N,).
+    """Choose `count` frames each with the best, typical (nearest the median) and worst F1 (N,).
 
-    Prefer frames of different `groups` (trajectories). Never select a frame without selected labels (NaN), nor a frame
-    twice.
+    Prefers frames of different `groups` (trajectories). Never chooses a frame twice, or a frame without selected labels
+    (NaN).
     """
     known = np.flatnonzero(np.isfinite(f1))
     middle = np.median(f1[known]) if len(known) else 0.0
@@ -96,7 +96,7 @@ def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) ->
 
 
 def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], path: Path, count: int = 2) -> None:
-    """Draw rows of best, typical and worst frames by F1: each plain, and with its labels and detections."""
+    """Draw the best, typical and worst frames by F1, each plain and with labels and detections."""
     chosen = choose_frames(evaluation.frame_f1(), evaluation.facts.trajectory, count)
     rows = [(name, index) for name, part in chosen.items() for index in part]
     f1 = evaluation.frame_f1()

@@ -34,7 +34,7 @@ def write_evaluation(
 ) -> None:
     """Write report.md, precision_recall.png and .parquet, bins.png (if there are bins) and detections.png.
 
-    `images` are the frames (height, width), grey; `about` are lines of Markdown that state what was evaluated and how.
+    `images` are the grey frames (height, width); the Markdown lines `about` state what was evaluated and how.
     """
     write_markdown(folder / "report.md", markdown(evaluation, about))
     curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}

@@ -1,9 +1,9 @@
-"""Evaluation of a run on labelled real images, with the same report as for a dataset.
+"""Evaluate a run on labelled real images; the report has the form of a dataset's report.
 
 Boxes of at least `min_size_px` (sqrt(w h)) that are centred in their image are ground truth. Smaller boxes, boxes
-centred off the image and boxes that a COCO file ignores are ignored, and so are unmatched detections below that size.
-The threshold is the run's own, from its validation split. The metrics at the best threshold for these images are also
-reported, as an oracle: choosing it needs labels.
+centred off the image and boxes that a COCO file marks as ignored are ignored, and so are unmatched detections below
+that size. The run chose the threshold on its validation split. The report also gives the metrics at the best threshold
+for these images, as an oracle: this threshold cannot be chosen without labels.
 """
 
 from collections.abc import Iterator, Sequence
@@ -54,7 +54,7 @@ class ImageSettings:
     min_size_px: float = 8.0
     """Minimum size of a crater to find, sqrt(w h), pixels."""
     threshold: float | None = None
-    """Score threshold; None for the threshold of the run."""
+    """Score threshold; None takes the threshold of the run."""
     nodata: float | None = None
     """Value of pixels without data."""
     request: Request = field(default_factory=Request)
@@ -62,7 +62,7 @@ class ImageSettings:
 
 
 class _Pictures(Sequence[NDArray[np.uint8]]):
-    """Pictures that are read when needed: all of them may not fit into memory."""
+    """Pictures that are read only when needed, because they may not all fit into memory."""
 
     def __init__(self, images: Sequence[LabelledImage], nodata: float | None):
         self._images, self._nodata, self._told = images, nodata, set[int]()
@@ -152,7 +152,7 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
 def evaluate_detections_in_images(
     image_set: ImageSet, detections: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
-    """Evaluate the detections of all images; boxes are clipped at the image edge if the boxes of labels are clipped."""
+    """Evaluate the detections of all images; if label boxes are clipped at the image edge, detections are too."""
     sizes = np.array([[image.width_px, image.height_px] for image in image_set.images])
     if image_set.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)

@@ -31,7 +31,7 @@ from perilune_train.training.runs import RunFolder
 ImageLike = str | PathLike[str] | NDArray[Any] | Image.Image
 """A file, pixels (height, width) or (height, width, 3), or a Pillow image."""
 Images = list[Any] | tuple[Any, ...]
-"""Several such images."""
+"""Several images, each an `ImageLike`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,9 +39,9 @@ class Craters:
     """The craters that a detector finds in one image, best first."""
 
     table: pd.DataFrame
-    """One row per crater, in pixels from the outer corner of the first pixel: the box `x0_px`, `y0_px`, `x1_px`,
-    `y1_px`, `centre_x_px`, `centre_y_px`, `radius_px` (half of sqrt(w h)), `score`, and the columns of an ellipse as in
-    the table `labels`. The detector finds boxes: the ellipse is the axis-aligned one inside the box."""
+    """One row per crater: the box `x0_px`, `y0_px`, `x1_px`, `y1_px`, then `centre_x_px`, `centre_y_px`, `radius_px`
+    (half of sqrt(w h)), `score`, and the ellipse columns of the table `labels`. Pixels count from the outer corner of
+    the first pixel. The detector finds boxes, so the ellipse is the axis-aligned ellipse inside the box."""
     image: NDArray[np.uint8]
     """The image as the network sees it before it is normalised: upright, 8-bit grey (height, width)."""
 
@@ -59,7 +59,7 @@ class Craters:
         return with_ellipses(self.image, self.table[ELLIPSE_COLUMNS].to_numpy())
 
     def show(self) -> None:
-        """Show the picture of `plot` in the notebook, or in the system's viewer."""
+        """Show the picture made by `plot` in the notebook, or in the system's viewer."""
         display(self.plot())
 
     def __repr__(self) -> str:
@@ -72,7 +72,7 @@ class CraterDetector:
     """Finds craters in images of any size; `load_detector` makes one. Call it with an image or a list of images."""
 
     def __init__(self, run: Path):
-        """Load the network of a finished detect run. Raises UserError if the folder has none."""
+        """Load the network of a finished detect run. Raises UserError if the folder is not such a run."""
         config = config_of_run(run)
         self.run = run
         self.threshold = chosen_threshold(run)
@@ -88,8 +88,8 @@ class CraterDetector:
 
         An image is a path (PNG, TIFF, JPEG; others with the extra `geo`), a NumPy array (height, width) or (height,
         width, 3), or a Pillow image. Pixels of more than 8 bits are stretched as by `perilune-train detect predict`.
-        `threshold` is the lowest score, by default the one that the run chose on its validation split. Raises UserError
-        on anything else, and on a file that cannot be read.
+        `threshold` is the lowest score; by default the threshold that the run chose on its validation split. Raises
+        UserError if `image` is anything else, or if a file cannot be read.
         """
         threshold = self.threshold if threshold is None else threshold
         if not 0 <= threshold <= 1:
@@ -109,7 +109,7 @@ class CraterDetector:
 
 
 def load_detector(run_or_file: str | PathLike[str] | None = None) -> CraterDetector:
-    """Load a crater detector: the installed one, or the one of a run.
+    """Load a crater detector: the installed detector, or the detector of a run.
 
     `run_or_file` is the folder of a detect run, a file in it (such as checkpoints/best.ckpt), or the name of an
     installed network. Raises UserError if it is none of these.
@@ -150,7 +150,7 @@ def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
 
 
 def _with_ellipses(table: pd.DataFrame, detections: Detections) -> pd.DataFrame:
-    """The table with the axis-aligned ellipses inside the boxes, in the columns of the table `labels`."""
+    """Add the axis-aligned ellipses inside the boxes to the table, as the columns of the table `labels`."""
     x0, y0, x1, y1 = detections.boxes.T
     width, height = x1 - x0, y1 - y0
     columns = [(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(width, height) / 2, np.minimum(width, height) / 2]

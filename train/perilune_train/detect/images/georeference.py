@@ -1,6 +1,6 @@
-"""Location of an image on the Moon, and detections as GeoJSON.
+"""Locate an image on the Moon, and convert detections to GeoJSON.
 
-The georeference is a GeoTIFF's own, or a world file (.pgw, .tfw, .jgw) with the projection's .prj beside the image.
+A georeference comes from the GeoTIFF itself, or from a world file (.pgw, .tfw, .jgw) and a .prj file beside the image.
 Reading it needs rasterio and pyproj (the extra `geo`).
 """
 
@@ -26,8 +26,8 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 _LARGEST_PRJ = 2**16
 _CORNERS = 32
 _GRID = 17
-"""Number of sample points per side that test whether an image is on its map: the corners of a full disc are off the
-map."""
+"""Sample points per side to test whether an image lies on its map. The corners alone are not enough: in an image of the
+full disc they are off the map."""
 _DECIMALS = 8
 """Decimals of degrees: 0.3 mm on the ground."""
 
@@ -84,7 +84,7 @@ def read_georeference(path: Path) -> Georeference | None:
             raise UserError(beside, "georeference", error, "a projection as text (.prj)") from None
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
-    # A georeference refers to the stored pixels, detections to the pixels of the upright picture.
+    # A georeference refers to stored pixels, but detections refer to pixels of the upright picture.
     stored, place = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
     a, b, c, d, e, f = (place[:, :2] @ stored + place * [0, 0, 1]).ravel().tolist()
     size = picture_size(path)
@@ -108,9 +108,9 @@ def can_read_georeferences() -> bool:
 def features(name: str, detections: Detections, reference: Georeference) -> list[dict[str, Any]]:
     """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
 
-    Longitudes continue past 180 degrees if a polygon crosses it. A polygon around a pole is not valid in longitude and
-    latitude: its vertices are correct, but its area is not. Detections that reach off the map are left
-    out.
+    The longitudes of a polygon that crosses 180 degrees continue beyond 180. A polygon around a pole is not valid in
+    longitude and latitude: its vertices are correct, but its area is not. Detections that extend off the map are
+    omitted.
     """
     from pyproj import Geod
 
@@ -154,8 +154,8 @@ def features(name: str, detections: Detections, reference: Georeference) -> list
 def collection(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """A GeoJSON FeatureCollection in the Moon's longitude and latitude.
 
-    Deviation from RFC 7946, which allows only the Earth's WGS 84: the member `crs` of GeoJSON 2008 names the Moon's
-    system. GDAL and QGIS read it, other programs ignore it.
+    Deviation from RFC 7946, which allows only the Earth's WGS 84: the member `crs`, from GeoJSON 2008, names the Moon's
+    coordinate system. GDAL and QGIS read this member; other programs ignore it.
     """
     crs = {"type": "name", "properties": {"name": MOON_CRS}}
     return {"type": "FeatureCollection", "name": "craters", "crs": crs, "features": parts}

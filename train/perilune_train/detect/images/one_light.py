@@ -1,12 +1,14 @@
-"""Tell pictures of the Moon from others: one Sun lights all craters of a lunar picture from the same side.
+"""Warn about pictures that are not of the Moon.
 
-The grey levels inside the box of a crater fall from its lit to its shaded side. `agreement_of_light` is the length of
-the mean of the unit vectors of these directions: 1 if all are the same, near 0 if they are at random.
+In a lunar picture, the Sun lights all craters from the same side. The grey levels inside the box of a crater fall from
+its lit to its shaded side. `agreement_of_light` is the length of the mean of the unit vectors of these directions: 1 if
+all directions are equal, near 0 if they are random.
 
-With the installed detector, 192 lunar pictures (12 crops of Narrow Angle Camera images, 180 rendered frames) have 0.87
-to 0.99. Of 35 others (the pictures in the wheels of scikit-image 0.26 and scikit-learn 1.9, and six charts of
-docs/pictures) 26 have ten craters or more, and 0.04 to 0.79. The threshold was chosen on every second picture: in the
-other half it doubts 0 of 96 lunar pictures and 12 of 12 others (`benchmarks/train/one_light.py`, `--most 60`).
+With the installed detector, 192 lunar pictures (12 crops of Narrow Angle Camera images, 180 rendered frames) have an
+agreement of 0.87 to 0.99. Of 35 other pictures (from the wheels of scikit-image 0.26 and scikit-learn 1.9, and six
+charts of docs/pictures), 26 have ten or more detections, with an agreement of 0.04 to 0.79. The threshold was chosen on
+every second picture. In the other half, it flags 0 of 96 lunar pictures and 12 of 12 other pictures
+(`benchmarks/train/one_light.py`, `--most 60`).
 """
 
 import cv2
@@ -16,9 +18,9 @@ from numpy.typing import NDArray
 from perilune_train.detect.evaluate.matching import Detections
 
 LEAST_AGREEMENT = 0.8
-"""Agreement below which a picture is doubted."""
+"""A picture with a lower agreement is flagged as possibly not lunar."""
 LEAST_CRATERS = 10
-"""Fewer craters say nothing."""
+"""Number of craters below which the agreement is not meaningful."""
 _MOST_CRATERS = 500
 _LEAST_SIDE_PX, _LEAST_SCORE = 4, 0.5
 _SIDE, _FLAT = 16, 1e-6
@@ -29,7 +31,7 @@ _WEIGHTS = np.stack([np.where(_IN_DISC, _STEPS, 0.0), np.where(_IN_DISC, _STEPS[
 
 
 def doubt_of(image: NDArray[np.uint8], found: Detections) -> str | None:
-    """Return a line about a grey image (height, width) that does not look like the Moon; None if it may be the Moon."""
+    """Return a warning if a grey image (height, width) does not look like the Moon, else None."""
     agreement, count = agreement_of_light(image, found)
     if count < LEAST_CRATERS or agreement >= LEAST_AGREEMENT:
         return None
@@ -38,7 +40,7 @@ def doubt_of(image: NDArray[np.uint8], found: Detections) -> str | None:
 
 
 def agreement_of_light(image: NDArray[np.uint8], found: Detections) -> tuple[float, int]:
-    """Return the agreement (0 to 1) of the direction of light in the best-scored craters, and their number."""
+    """Return the agreement (0 to 1) of the light directions in the highest-scored craters, and their number."""
     height, width = image.shape
     best = np.argsort(-found.scores, kind="stable")
     best = best[found.scores[best] >= _LEAST_SCORE]

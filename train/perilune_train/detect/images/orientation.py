@@ -1,4 +1,4 @@
-"""Orientation of a picture: the EXIF or TIFF tag 274, which says how stored rows turn into the upright picture.
+"""Orientation of a picture: the EXIF or TIFF tag 274, which states how to turn the stored picture upright.
 
 In all formats the tag is applied, so pixels, labels and detections refer to the upright picture. Otherwise
 a photograph that a camera marked as rotated would be compared with labels drawn on the upright picture that every
@@ -37,10 +37,10 @@ def upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
 
 
 def stored_coordinates(orientation: int, width_px: int, height_px: int) -> NDArray[np.float64]:
-    """The matrix (2, 3) from pixel coordinates of the upright picture to stored ones; takes the stored width and
-    height.
+    """The matrix (2, 3) from pixel coordinates of the upright picture to coordinates of the stored picture.
 
-    Coordinates begin at the outer corner of the top-left pixel.
+    `width_px` and `height_px` are those of the stored picture. Coordinates begin at the outer corner of the top-left
+    pixel.
     """
     right, down = (height_px, width_px) if is_turned(orientation) else (width_px, height_px)
     x = [-1.0, 0.0, right] if orientation in _MIRRORED else [1.0, 0.0, 0.0]
@@ -62,7 +62,7 @@ def orientation_of(picture: Any, path: Path) -> int:
 
 
 def tiff_tags(path: Path) -> dict[int, Any]:
-    """The tags of a TIFF's first picture, also of kinds that Pillow cannot open; {} if they are damaged."""
+    """The tags of a TIFF's first picture, even if Pillow cannot open the picture; {} if the tags are damaged."""
     try:
         with path.open("rb") as file:
             header = file.read(8)
@@ -77,7 +77,7 @@ def tiff_tags(path: Path) -> dict[int, Any]:
 
 
 def tiff_orientation(tags: dict[int, Any]) -> int:
-    """The orientation that a TIFF's tags give; 1 without a valid one."""
+    """The orientation that a TIFF's tags give; 1 without a valid tag."""
     return _valid(tags.get(ORIENTATION_TAG))
 
 

@@ -1,4 +1,4 @@
-"""Draw detections over an image: ellipses coloured by score, above a strip with the scale of colours and a count."""
+"""Draw detections over an image as ellipses coloured by score, with a colour scale and a count below."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ _SMALLEST_PX = 1600
 _LINE_OPACITY = 0.8
 """Lines are one pixel wide, OpenCV's minimum, so that the ground shows through."""
 _DARKEST = 80
-"""First of the 256 entries of the colour map that is used: darker ones are invisible on grey."""
+"""First entry used of the 256 entries of the colour map: darker entries are invisible on grey."""
 _STRIP_SHARE = 0.02
 """Height of the strip below the image, as a share of the image's longer side."""
 
@@ -24,8 +24,8 @@ _STRIP_SHARE = 0.02
 def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, threshold: float) -> None:
     """Draw the detections as ellipses over the image; small images are enlarged, large ones reduced.
 
-    Colours go from purple (the threshold) to yellow (a score of 1). At most MOST_DRAWN detections are drawn, those of
-    the highest scores; the strip below the image states how many.
+    Colours go from purple (the threshold) to yellow (a score of 1). Draws at most the MOST_DRAWN detections of the
+    highest scores; the strip below the image states their number.
     """
     side = max(image.shape)
     factor = min(max(_SMALLEST_PX // side, 1), 4) if side < _LARGEST_PX else _LARGEST_PX / side
@@ -46,7 +46,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, 
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
     """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) in blue, green, red."""
-    # OpenCV takes integers, here sixteenths of a pixel, and has its origin at a pixel's centre.
+    # OpenCV takes integers, here sixteenths of a pixel, and counts from the centre of the first pixel.
     sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
     for x, y, a, b in sixteenths.astype(int).tolist():
         cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, colour, 1, cv2.LINE_AA, 4)
@@ -62,7 +62,7 @@ def _colours(scores: NDArray[np.float64], threshold: float) -> list[tuple[int, i
 
 
 def _strip(width_px: int, side_px: int, threshold: float, count: str) -> NDArray[np.uint8]:
-    """A black strip with the scale of colours and a line of text, (height, width, 3); cut on narrow images."""
+    """A black strip (height, width, 3) with the colour scale and a line of text, cut off below narrow images."""
     height = max(round(_STRIP_SHARE * side_px), 24)
     strip = np.zeros((height, max(width_px, 1), 3), np.uint8)
     scale, margin = height / 48, height // 4

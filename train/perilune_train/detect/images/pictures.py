@@ -1,4 +1,4 @@
-"""The pictures of a folder, without files that are not pictures of their own."""
+"""List the pictures of a folder, without hidden files, masks and overlays."""
 
 from pathlib import Path
 
@@ -12,15 +12,15 @@ _FOLDERS_OF_ARCHIVES = ("__MACOSX",)
 
 
 def is_picture(path: Path) -> bool:
-    """Whether a file is named like a picture."""
+    """Whether a file has the suffix of a picture."""
     return path.suffix.lower() in _PICTURES
 
 
 def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
-    """The pictures of a folder, sorted; a message names the files that are left out.
+    """The pictures of a folder, sorted; a message states how many files were omitted.
 
-    Left out are hidden files (`._x.png` of macOS), masks and overlays of other pictures (`x_mask.png` with `x.png`),
-    and the data file of a detached PDS3 label, which is listed instead. Raises UserError on a name that is not UTF-8.
+    Omits hidden files (`._x.png` of macOS), and masks and overlays of other pictures (`x_mask.png` beside `x.png`).
+    Lists a detached PDS3 label instead of its data file. Raises UserError if a name is not UTF-8.
     """
     paths = sorted(path for path in (folder.rglob("*") if recursive else folder.iterdir()) if path.is_file())
     shown = [path for path in paths if not _is_hidden(path, folder)]
@@ -58,7 +58,7 @@ def _is_hidden(path: Path, folder: Path) -> bool:
 
 
 def _is_mask(path: Path, stems: set[str]) -> bool:
-    """Whether the name is that of another picture with a suffix such as `_mask`."""
+    """Whether the name is the name of another picture plus a suffix such as `_mask`."""
     stem = path.with_suffix("").as_posix()
     return any(
         stem.lower().endswith(f"{sign}{ending}") and stem[: -len(ending) - 1] in stems

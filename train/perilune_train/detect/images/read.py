@@ -1,8 +1,8 @@
 """Read a picture as 8-bit grey: PNG, TIFF, JPEG, JPEG 2000, ISIS cubes and PDS, of any size and depth.
 
-Pillow reads PNG, JPEG and 8-bit TIFF, OpenCV 16-bit colours in PNG, which Pillow reduces to 8 bits. rasterio (the extra
-`geo`) reads all others, strip by strip; without it Pillow reads 16-bit and float32 TIFF. Pixels are turned upright
-(orientation.py).
+Pillow reads PNG, JPEG and 8-bit TIFF. OpenCV reads PNG with 16-bit colours, which Pillow would reduce to 8 bits.
+rasterio (the extra `geo`) reads all other files, strip by strip; without it, Pillow reads 16-bit and float32 TIFF.
+Pixels are turned upright (orientation.py).
 """
 
 import contextlib
@@ -35,10 +35,10 @@ from perilune_train.detect.images.stretch import LARGEST_VALUE, SAMPLE, Stretch,
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".img", ".cub", ".lbl")
 _KINDS = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000", "ISIS3": "ISIS cube", "PDS": "PDS3"}
 LARGEST_PIXELS = 2**29
-"""Largest number of pixels of an image: twice a whole Narrow Angle Camera image. The header of a small file can state
-any size."""
+"""Largest number of pixels of an image: twice a whole Narrow Angle Camera image. A limit is needed, because the header
+of a small file can state any size."""
 LARGEST_DECODED = 2**30
-"""Largest size, bytes, of a picture that is decoded as a whole; only rasterio reads larger ones."""
+"""Largest size, bytes, of a picture that is decoded as a whole; only rasterio reads larger pictures."""
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _BITS_TAG, _PHOTOMETRIC_TAG, _SAMPLE_FORMAT_TAG, _NODATA_TAG = 258, 262, 339, 42113
 _WHITE_IS_ZERO, _SIGNED = 0, 2
@@ -62,7 +62,7 @@ class _Picture:
     is_upright: bool
     """Whether the decoder turns the pixels upright, as Pillow does for TIFF."""
     white_is_zero: bool
-    """Whether larger values are darker, and the decoder has not inverted them."""
+    """Whether larger values are darker in the decoder's output."""
     nodata: float | None
     """The value of pixels without data, as the file states it."""
     strips: Callable[[], Iterator[NDArray]]
@@ -75,14 +75,16 @@ class _Picture:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of the upright picture, pixels, from the header. Raises UserError if it is not a picture or too
-    large."""
+    """Width and height of the upright picture, pixels, from the header.
+
+    Raises UserError if the file is not a picture or too large.
+    """
     with _opened(path) as picture:
         return picture.size_px(upright=True)
 
 
 def stored_from_upright(path: Path) -> NDArray[np.float64]:
-    """The matrix (2, 3) from pixel coordinates of the upright picture to those of the file (orientation.py)."""
+    """The matrix (2, 3) from pixel coordinates of the upright to the stored picture (orientation.py)."""
     with _opened(path) as picture:
         return stored_coordinates(picture.orientation, *picture.size_px(upright=False))
 
@@ -94,13 +96,15 @@ def stored_size(path: Path) -> tuple[int, int]:
 
 
 def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> NDArray[np.uint8]:
-    """The upright picture's pixels (height, width) as 8-bit grey.
+    """Read the upright picture's pixels (height, width) as 8-bit grey.
 
-    8-bit grey is not changed. Colours become their luma; of other bands the first is used. Deeper images (16 bits and
-    more, float) are stretched so that 99.9 % of their values are within 0..255: the network removes mean and deviation
-    anyway, and 16-bit files often use a small part of their range. Left out of the stretch, and 0, are values that are
-    not finite, beyond 1e30, equal to the file's no-data value or to `nodata`, and, if neither is given, values that
-    stretch.py takes as missing data; a line names these unless `quiet`. Raises UserError on a damaged file.
+    8-bit grey is not changed. Colours become their luma; of other bands, the first is used. Deeper images (16 bits and
+    more, float) are stretched so that 99.9 % of their values are within 0..255. The stretch loses little: the network
+    removes mean and deviation anyway, and 16-bit files often use a small part of their range.
+
+    Values without data do not affect the stretch and become 0. These are values that are not finite, beyond 1e30, or
+    equal to the file's no-data value or to `nodata`. If neither is given, they are also the values that stretch.py
+    takes as missing data; a message names these values unless `quiet`. Raises UserError on a damaged file.
     """
     with _opened(path) as picture:
         grey = np.empty((picture.height_px, picture.width_px), np.uint8)
@@ -118,9 +122,9 @@ def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> N
 
 
 def grey_of_array(pixels: NDArray, where: object = "image") -> NDArray[np.uint8]:
-    """Pixels in memory, (height, width) or (height, width, 1, 3 or 4), as 8-bit grey, as `read_grey` makes it.
+    """Convert pixels (height, width) or (height, width, 1, 3 or 4) to 8-bit grey, as `read_grey` does.
 
-    Colours are red, green, blue; a fourth band is left out. Raises UserError on anything else.
+    Colours are red, green, blue; a fourth band is ignored. Raises UserError on other shapes or types.
     """
     kind = pixels.dtype.kind
     if kind not in "buif" or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
@@ -153,7 +157,7 @@ def _grey_of(bands: NDArray, picture: _Picture, nodata: float | None, stretch: S
 
 
 def _stretch(picture: _Picture, nodata: float | None) -> Stretch:
-    """The stretch of all pixels, from a sample of them."""
+    """The stretch of a picture, computed from a sample of its pixels."""
     step = max(picture.width_px * picture.height_px // SAMPLE, 1)
     sample, start = [], 0
     for bands in picture.strips():
@@ -169,7 +173,7 @@ def _values(bands: NDArray, picture: _Picture, nodata: float | None) -> NDArray:
     """Bands (1 or 3, rows, width) as float grey (rows, width), larger brighter, NaN where there is no data."""
     if bands.dtype.kind == "c":
         raise UserError(picture.path, "image", "complex numbers", "real numbers")
-    # float32 holds all values of 16 bits; those of 32 bits need float64.
+    # float32 holds all 16-bit values; 32-bit values need float64.
     small = bands.dtype.itemsize <= 2 or bands.dtype == np.float32
     values = bands.astype(np.float32 if small else np.float64)
     values[~(np.abs(values) <= LARGEST_VALUE)] = np.nan
@@ -186,7 +190,10 @@ def _luma(bands: NDArray) -> NDArray:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Picture]:
-    """Open a picture by its content. Raises UserError on other files, and on damage that is found within the block."""
+    """Open a picture by its content.
+
+    Raises UserError if the file is not a picture, or if reading within the block finds damage.
+    """
     driver = raster_files(path, PICTURE_DRIVERS, "image").driver
     by_pillow = driver in ("GTiff", "PNG", "JPEG")
     has_rasterio = importlib.util.find_spec("rasterio") is not None
@@ -208,13 +215,12 @@ def _opened(path: Path) -> Iterator[_Picture]:
 
 
 def _pillow_image(path: Path, stack: contextlib.ExitStack) -> Any:
-    """An image opened by Pillow; None if Pillow does not decode its kind."""
+    """Open an image with Pillow; None if Pillow does not support this kind of image."""
     stack.enter_context(warnings.catch_warnings())
     # Serious errors raise an exception; warnings concern metadata only.
     warnings.simplefilter("ignore")
     Image.MAX_IMAGE_PIXELS = None
-    # Open from a file object: Pillow would memory-map an uncompressed TIFF given by name, and read a rotated one
-    # wrongly.
+    # Pass a file object: given a path, Pillow memory-maps uncompressed TIFF files, and reads rotated ones wrongly.
     file = stack.enter_context(path.open("rb"))
     try:
         return stack.enter_context(Image.open(file, formats=_FORMATS))
@@ -272,7 +278,7 @@ def _by_pillow(path: Path, opened: Any, tags: dict[int, Any]) -> _Picture:
 
 def _deep_colours(path: Path) -> NDArray:
     """16-bit colours (height, width, 3 or 4), blue first, as OpenCV reads them."""
-    # Pillow has loaded the file before: it raises an error on damage, whereas OpenCV only prints to standard error.
+    # Pillow has already loaded the file and would have raised an error on damage; OpenCV only prints to standard error.
     deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
         raise ValueError("16-bit colours that cannot be decoded")
@@ -293,7 +299,7 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
         is_colour = all(colour in kinds for colour in colours)
         indexes = [kinds.index(colour) + 1 for colour in colours] if is_colour else [1]
         width, height = raster.width, raster.height
-        # OpenJPEG decodes whole tiles, of which there may be only one, at 4 bytes per pixel.
+        # OpenJPEG decodes whole tiles at 4 bytes per pixel, and the whole image may be one tile.
         _check_size(path, width, height, 4 if driver == "JP2OpenJPEG" else 1)
         block_rows = raster.block_shapes[0][0]
         n_rows = max(_STRIP_PIXELS // width, 1)

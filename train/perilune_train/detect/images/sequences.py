@@ -1,4 +1,4 @@
-"""Videos, and TIFF files of several pages: their frames as pictures in a folder. Both are untrusted input."""
+"""Unpack videos, and TIFF files of several pages, into pictures in a folder. Both are untrusted input."""
 
 import contextlib
 import os
@@ -13,17 +13,18 @@ from perilune_train.detect.images.read import LARGEST_PIXELS
 
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
 _MOST_PIXELS = 2**32
-"""Maximum number of pixels of all frames: 2000 of 1920 x 1080, 65,000 of 256 x 256."""
+"""Maximum number of pixels of all frames: 2000 frames of 1920 x 1080, or 65,000 frames of 256 x 256."""
 _MOST_PAGES, _NEW_SUBFILE_TYPE = 65_536, 254
 _STARTS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1aE\xdf\xa3"))
-"""Beginnings of MP4, QuickTime, AVI and Matroska. FFmpeg would also read lists of other files and addresses."""
+"""First bytes of MP4, QuickTime, AVI and Matroska files. Other files are refused, because FFmpeg would also read lists
+of other files and of network addresses."""
 
 
 def frames_of(path: Path, folder: Path) -> list[Path] | None:
     """Write the frames of a video, or the pages of a TIFF, into a folder as <file name>.<index>.png (or .tif).
 
-    Returns None if the file is a single picture. Raises UserError on a video that OpenCV cannot decode, and on more
-    than _MOST_PIXELS.
+    Returns None if the file is a single picture. Raises UserError if OpenCV cannot decode a video, or if all frames
+    together have more than _MOST_PIXELS.
     """
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _of_video(path, folder)
@@ -40,7 +41,7 @@ def _of_video(path: Path, folder: Path) -> list[Path]:
         raise UserError(path, "video", error.strerror or "no such file", expected) from None
     if not any(start[offset:].startswith(text) for offset, text in _STARTS):
         raise UserError(path, "video", "another kind of file", expected)
-    # Its messages are not in one line.
+    # Silence FFmpeg: it prints messages of several lines.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
@@ -63,12 +64,15 @@ def _of_video(path: Path, folder: Path) -> list[Path]:
 
 
 def _pages(path: Path) -> list[int]:
-    """Numbers of the pages of a TIFF that are pictures of their own; none if it cannot be read, as `read_grey` says."""
+    """Numbers of the pages of a TIFF that are separate pictures.
+
+    Returns [] for an unreadable file; `read_grey` later reports the error.
+    """
     pages: list[int] = []
     with contextlib.suppress(OSError, ValueError, SyntaxError, EOFError), Image.open(path, formats=("TIFF",)) as image:
         for number in range(_MOST_PAGES):
             image.seek(number)
-            # Bits 0 and 2: a smaller copy of another page, as of a GeoTIFF with overviews, or a mask.
+            # Bit 0 marks a smaller copy of another page, such as a GeoTIFF overview; bit 2 marks a mask.
             if not int(image.tag_v2.get(_NEW_SUBFILE_TYPE, 0)) & 0b101:  # type: ignore[attr-defined]
                 pages.append(number)
     return pages

@@ -1,4 +1,4 @@
-"""Stretch deep pixels (more than 8 bits, float) to 8 bits, and find values that mark missing data."""
+"""Stretch deep pixels (more than 8 bits, or float) to 8 bits, and find values that mark missing data."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ PERCENT = (0.05, 99.95)
 """The percentiles between which 99.9 % of the values lie."""
 SAMPLE = 1_000_000
 LARGEST_VALUE = 1e30
-"""Larger values are not measurements: ISIS marks missing data by values near the end of float32's range."""
+"""Larger values are not measurements: ISIS marks missing data with values near the end of float32's range."""
 _FILL_SHARE = PERCENT[0] / 100
 """A fill value with a smaller share does not affect the stretch."""
 _MOST_FILLS = 8
@@ -17,19 +17,19 @@ _MOST_FILLS = 8
 
 @dataclass(frozen=True)
 class Stretch:
-    """How the values of a picture become grey."""
+    """The mapping from the values of a picture to grey levels."""
 
     low: float
     """The value that becomes 0."""
     high: float
     """The value that becomes 255."""
     fills: tuple[float, ...] = ()
-    """Values taken as missing data, although the file does not say so."""
+    """Values taken as missing data that the file does not declare."""
     fill_share: float = 0.0
     """Share of the pixels that have one of these values."""
 
     def grey(self, values: NDArray) -> NDArray[np.uint8]:
-        """Values as 0..255, 0 where there is no data."""
+        """Map values to 0..255; pixels without data become 0."""
         known = np.isfinite(values)
         for fill in self.fills:
             known &= values != fill
@@ -40,14 +40,14 @@ class Stretch:
 def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
     """The stretch of a sample of finite values.
 
-    Up to a few values at an end of the range that many pixels share, and that are far from all others (-9999, 65535,
-    the special pixels of ISIS), count as missing data if the file declares none: as measurements they would leave no
-    range for the ground.
+    With `find_fills`, used if the file declares no missing data, a few values at an end of the range may count as
+    missing data: many pixels must share them, and they must be far from all other values (-9999, 65535, the special
+    pixels of ISIS). As measurements, such values would leave no range for the ground.
     """
     fills: list[float] = []
     rest = sample
     if find_fills:
-        # Fill values at one end can hide those at the other, so the first end is checked twice.
+        # Fill values at one end can hide fill values at the other, so check the first end twice.
         for sign in (1, -1, 1):
             end = _isolated_end(sign * rest, len(sample))
             fills += [sign * value for value in end]
@@ -58,8 +58,10 @@ def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
 
 
 def _isolated_end(values: NDArray, n_all: int) -> list[float]:
-    """The smallest values, at most _MOST_FILLS, if many pixels share them and the others are farther away than their
-    range."""
+    """The smallest values, at most _MOST_FILLS, if they are fill values; otherwise [].
+
+    Many pixels must share them, and their distance to all other values must exceed the range of the others.
+    """
     distinct, counts = np.unique(values, return_counts=True)
     for n_fills in range(min(_MOST_FILLS, len(distinct) - 2), 0, -1):
         if counts[:n_fills].sum() < max(_FILL_SHARE * n_all, 2):

@@ -1,4 +1,4 @@
-"""A trained detector: its network, settings and device."""
+"""Load a trained detector, and run its network on a device."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -32,7 +32,7 @@ class Detector:
     device: str
     """cpu or cuda."""
     bf16: bool
-    """Whether it computes in bfloat16."""
+    """Whether the network computes in bfloat16."""
     threads: FairThreads = field(default_factory=FairThreads)
     """Number of threads on a CPU, adapted to other work on the machine."""
 
@@ -54,7 +54,7 @@ def load_detector(path: Path) -> YOLOv3:
 
 
 def check_detector(content: Mapping[str, Any], path: Path) -> None:
-    """Raise UserError unless a checkpoint contains a detector; builds nothing that takes memory."""
+    """Raise UserError unless a checkpoint contains a detector; the check allocates no memory for weights."""
     architecture = content["architecture"]
     if set(architecture) != set(DetectorArchitecture.model_fields):
         raise UserError(path, "architecture", sorted(map(str, architecture)), "a detect run's checkpoint")

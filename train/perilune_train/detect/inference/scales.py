@@ -1,4 +1,4 @@
-"""Detection on resized frames: enlarging brings small craters to the sizes that a network finds best."""
+"""Detection on resized frames: enlargement brings small craters to the sizes that a network detects best."""
 
 import time
 
@@ -24,16 +24,16 @@ def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[
     """Resize an image (height, width); returns the input if it has this size."""
     if image.shape == (height_px, width_px):
         return image
-    # Area averaging, when shrinking, avoids aliased noise, which looks like craters.
+    # When an image is shrunk, area averaging avoids aliased noise, which looks like craters.
     how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
 
 
 class Enlarged:
-    """An image (height, width) as if enlarged; only the pixels of a slice are computed.
+    """An enlarged view of an image (height, width) that computes only the pixels of the requested slice.
 
-    For images that do not fit into memory when enlarged. Values differ from those of `resized` by rounding, since
-    OpenCV interpolates here at 32 positions between two pixels.
+    Use it for images that do not fit into memory when enlarged. The values differ slightly from those of `resized`,
+    because OpenCV interpolates here at only 32 positions between two pixels.
     """
 
     def __init__(self, image: NDArray[np.uint8], width_px: int, height_px: int):
@@ -57,7 +57,7 @@ class Enlarged:
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:
-    """Height and width, pixels, that the network accepts, nearest to `factor` times those of a frame."""
+    """Height and width, pixels, that the network accepts and that are nearest to `factor` times the frame's."""
     if factor == 1:
         return height_px, width_px
     height, width = (max(1, round(side * factor / COARSEST_STRIDE)) for side in (height_px, width_px))
@@ -65,7 +65,7 @@ def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]
 
 
 def multiply_adds_of_a_frame(network: YOLOv3, config: DetectConfig, height_px: int, width_px: int) -> int:
-    """Multiply-adds of the network for one frame, all scales together."""
+    """Multiply-adds of the network for one frame, summed over all scales."""
     sizes = [scaled_size(height_px, width_px, factor) for factor in config.evaluation.scales]
     return sum(multiply_adds(network, (1, config.in_channels, *size)) for size in sizes)
 

@@ -1,4 +1,4 @@
-"""Detections of whole batches: minimum score, aspect limit, non-maximum suppression."""
+"""Select the detections of a batch: minimum score, aspect limit, non-maximum suppression."""
 
 import torch
 from torch import Tensor
@@ -9,14 +9,14 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.models.boxes import iou
 
 _BLOCK = 256
-"""Number of boxes of a block: a larger one computes more overlaps, a smaller one needs more steps."""
+"""Number of boxes in a block: larger blocks compute more overlaps, smaller blocks need more steps."""
 
 
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
     """Detections of each frame from all predictors' boxes (N, K, 4) and scores (N, K).
 
-    On a GPU the whole batch is suppressed there; on a CPU frame by frame, which is faster (`make bench-suppress`).
-    Both keep the boxes that OpenCV keeps, in its order.
+    On a GPU, suppression runs there on the whole batch; on a CPU it runs frame by frame, which is faster
+    (`make bench-suppress`). Both keep the boxes that OpenCV keeps, in OpenCV's order.
     """
     strong = scores >= settings.min_score
     if settings.max_aspect is not None:
@@ -25,7 +25,7 @@ def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -
     if boxes.device.type == "cpu":
         return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, strict=True)]
     kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
-    # One transfer for the whole batch.
+    # Transfer the whole batch at once.
     found_boxes, found_scores, kept = (part.cpu() for part in (boxes, scores, kept))
     detections = []
     for frame_boxes, frame_scores, chosen in zip(found_boxes, found_scores, kept, strict=True):
@@ -42,15 +42,15 @@ def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: Evaluatio
 
 @torch.no_grad()
 def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou: float) -> Tensor:
-    """Non-maximum suppression of N frames at once, on the tensors' device; keeps the same boxes as `suppress`.
+    """Non-maximum suppression of N frames at once, on the tensors' device; keeps the boxes that `suppress` keeps.
 
     Takes boxes (N, K, 4), scores (N, K) and a mask (N, K) of the boxes to consider. Returns indices (N, M) of the kept
     boxes of each frame, best first, padded with -1.
 
-    Boxes are processed in blocks by decreasing score. Within a block the greedy rule is a fixed point: a box is kept
-    unless a kept box of a higher score overlaps it. The overlap matrix is strictly triangular, so an iteration
-    converges to it. The kept boxes of a block then remove others, and the remaining boxes move up, so that later blocks
-    contain no removed box.
+    Boxes are processed in blocks by decreasing score. Within a block, the result of the greedy rule is a fixed point: a
+    box is kept unless a kept box of a higher score overlaps it. An iteration converges to this fixed point, because the
+    overlap matrix is strictly triangular. The kept boxes of a block then remove later boxes, and the remaining boxes
+    move up, so that later blocks contain no removed box.
     """
     rows = torch.arange(len(boxes), device=boxes.device)[:, None]
     # Use float32 scores like OpenCV; equal scores keep their order.
@@ -70,7 +70,7 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
                 break
             chosen = updated
         kept.append(torch.where(chosen, order[:, :_BLOCK], -1))
-        # Kept boxes first, so that overlaps are computed only for these.
+        # Put kept boxes first, so that overlaps are computed only for them.
         first = chosen.byte().argsort(dim=1, descending=True, stable=True)[:, : int(chosen.sum(1).amax())]
         removed = (_overlap(block[rows, first], corners[:, _BLOCK:]) > threshold_iou) & chosen.gather(1, first)[
             ..., None

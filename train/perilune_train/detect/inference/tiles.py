@@ -1,9 +1,9 @@
 """Detection in images of any size: overlapping tiles, several scales, one list of boxes.
 
-The network was trained on frames of one size, each normalised by its own mean and standard deviation. So an image is
-cut into tiles of that size, each normalised separately. Where tiles overlap, a box is taken from the tile whose borders
-are farthest from it. Near a border the network does not see whole craters, and keeping the boxes of both tiles would
-add false positives.
+The network was trained on frames of one size, each normalised by its mean and standard deviation. So an image is cut
+into tiles of that size, and each tile is normalised separately. Where tiles overlap, a box is taken from the tile whose
+borders are farthest from the box: near a border the network does not see whole craters, and keeping the boxes of both
+tiles would add false positives.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,16 +21,16 @@ from perilune_train.detect.inference.tiling import Tiling
 
 Array = NDArray[np.float64]
 _MAX_TOGETHER = 5_000
-"""Largest number of boxes that are suppressed together; above it, block by block."""
+"""Largest number of boxes that are suppressed together; more boxes are suppressed block by block."""
 _MOST_ENLARGED_PIXELS = 2**27
-"""Images with more pixels after enlarging are enlarged tile by tile."""
+"""An image that would have more pixels when enlarged is enlarged tile by tile."""
 _TOLERANCE_PX = 2.0
 """Tolerance of the distance to a tile's border. Two tiles detect a crater at slightly different positions; without a
 tolerance both could drop it."""
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
-    """Starts of the tiles along a side: evenly spaced, the first at 0, the last tile ending at the end of the side."""
+    """Starts of the tiles along a side, evenly spaced: the first is 0, and the last tile ends at the image edge."""
     if length_px <= tile_px:
         return np.zeros(1, np.intp)
     count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
@@ -60,7 +60,7 @@ def detect_image(
 ) -> Detections:
     """Craters of an image (height, width) of any size, best first; `advance(n)` is called after n more tiles.
 
-    For an image of the size of one tile the result is that of `detect_at_scales` at scale 1.
+    For an image of the size of one tile, the result equals that of `detect_at_scales` at scale 1.
     """
     height, width = image.shape
     boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
@@ -83,12 +83,12 @@ def detect_image(
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:
-    """Non-maximum suppression of any number of boxes (N, 4): indices of the kept ones, best first.
+    """Non-maximum suppression of any number of boxes (N, 4): indices of the kept boxes, best first.
 
-    The time of `suppress` grows with the square of the number. Many boxes are therefore suppressed by blocks of the
-    image, each with the boxes centred within a margin around it: half a block, or half the largest box (boxes with
-    centres farther apart do not overlap by half). Only long chains of boxes that suppress each other could give another
-    result.
+    The time of `suppress` grows with the square of the number of boxes. Many boxes are therefore suppressed block by
+    block of the image. Each block also includes the boxes centred within a margin around it: half a block or half the
+    side of the largest box, whichever is larger (boxes with centres farther apart do not overlap by half). Only long
+    chains of boxes that suppress each other could change the result.
     """
     if len(boxes) <= _MAX_TOGETHER:
         return suppress(boxes, scores, threshold_iou, len(boxes))

@@ -15,8 +15,8 @@ class Tiling:
     overlap_px: int = 64
     """Minimum overlap of two neighbouring tiles, pixels: craters up to this size are whole in at least one tile."""
     scales: tuple[float, ...] = (1.0,)
-    """Factors by which the image is resized before it is cut; detections at all scales are merged. Above 1 for smaller
-    craters than those trained on, below 1 for larger ones."""
+    """Factors by which the image is resized before it is cut; detections at all scales are merged. Use factors above 1
+    for craters smaller than those in training, and factors below 1 for larger craters."""
     box_margin_px: float = 0.0
     """Margin added to the detected boxes at every side, pixels. Our boxes end at the crest of the rim, with subpixel
     accuracy; the smallest box of whole pixels around a crater is on average half a pixel larger at every side."""

@@ -20,8 +20,9 @@ def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator, plain:
     """`count` anchors (count, 2), width and height in pixels, sorted by area, for sizes (N, 2) > 0.
 
     Clusters 20,000 sizes drawn with `rng`, weighted by the inverse square root of the frequency of each size. Without
-    the weights (`plain`) most anchors would go to small craters: craters of 40 px are a hundred times rarer than those
-    of 5 px. Starts from evenly spaced logarithms of the area. An empty cluster takes the size with the worst fit.
+    the weights (`plain`), most anchors fit small craters, because craters of 40 px are a hundred times rarer than
+    craters of 5 px. The first anchors have evenly spaced logarithms of the area. An empty cluster takes the size with
+    the worst fit.
     """
     sizes = np.asarray(sizes_px, np.float64)
     if len(sizes) == 0:

@@ -1,7 +1,8 @@
 """Training steps as a CUDA graph: one launch instead of thousands.
 
-Forward and backward pass of Darknet53 with 23 attention modules are some 2,700 operations. A GPU finishes each one
-sooner than a process can start the next, so it idles for most of a step. A captured step is started as a whole.
+The forward and backward passes of Darknet53 with 23 attention modules have some 2,700 operations. A GPU finishes each
+operation before the process can start the next one, so the GPU idles for most of a step. A captured step starts all
+operations at once.
 """
 
 from collections.abc import Callable
@@ -11,15 +12,15 @@ from torch import Tensor
 
 Losses = tuple[Tensor, ...]
 _WARM_UP = 3
-"""Steps before the capture: they allocate the optimizer's state and choose algorithms."""
+"""Number of steps before the capture; these steps allocate the optimizer's state and choose algorithms."""
 
 
 class CapturedStep:
     """A training step over a batch of constant size.
 
-    `step` maps the numbers of the frames of a batch (B,), on the device, to losses; it computes gradients and updates
-    weights. It must not depend on values, including shapes, and must use the same tensors in every call. The first
-    steps run one operation at a time; on a CPU, all steps do.
+    `step` maps the frame numbers of a batch (B,), on the device, to losses; it computes gradients and updates weights.
+    Its operations and shapes must not depend on values, and it must use the same tensors in every call. The first steps
+    run one operation at a time; on a CPU, all steps do.
     """
 
     def __init__(self, step: Callable[[Tensor], Losses], batch_size: int, device: torch.device):

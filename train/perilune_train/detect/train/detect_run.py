@@ -56,8 +56,8 @@ def run_detect(
 ) -> runs.RunFolder:
     """Train and evaluate a detector; all output is in the returned folder.
 
-    Resumes an interrupted run with equal settings and dataset, and leaves a finished one unchanged; `overwrite`
-    replaces both.
+    Resumes an interrupted run with equal settings and dataset, and leaves a finished run unchanged; `overwrite`
+    replaces either run.
 
     Raises UserError if the existing run has other settings or another dataset; if its last state is damaged; if the
     dataset or the initial weights are unsuitable; or if the network of the initial weights or the teacher was fitted to
@@ -101,7 +101,7 @@ def _run(
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
         say("detect.frozen_epochs is ignored without detect.init_from: the whole network is trained from the start")
-    # The anchors of a resumed run are in its state and may differ.
+    # A resumed run loads its anchors later from its state, and they may differ from these.
     if not resume:
         say_page(anchor_report(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
@@ -182,7 +182,7 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> 
 
 
 def load_teacher(path: Path, config: DetectConfig) -> Teacher:
-    """Load the teacher. Raises UserError if its input channels or strides differ from the student's."""
+    """Load the teacher network. Raises UserError if its input channels or strides differ from the student's."""
     network = load_detector(path)
     expected = {"in_channels": config.in_channels, "strides": list(config.strides)}
     runs.check_architecture(path, runs.load_weights(path)["architecture"], expected)
@@ -195,7 +195,7 @@ def anchor_sizes(network: YOLOv3) -> np.ndarray:
 
 
 def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
-    """State how well a network's anchors fit label sizes (N, 2), and so the best recall that training can reach."""
+    """Text: how well anchors fit label sizes (N, 2), which limits the recall that training can reach."""
     recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
     return (
         f"anchors: best possible recall {recall:.4f}, the fraction of training labels with an anchor within a factor "

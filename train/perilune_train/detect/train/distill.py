@@ -10,7 +10,7 @@ from perilune_train.detect.train.loss import ciou_loss
 from perilune_train.models.yolo import YOLOv3, decode_grid
 
 _MIN_TEACHER_SCORE = 0.1
-"""Minimum teacher score of the predictors whose boxes are learned; below it the teacher's boxes are meaningless."""
+"""Minimum teacher score of the predictors whose boxes are learned; below it, the teacher's boxes mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ def distill_loss(
 
     Boxes: mean CIoU loss against the teacher's boxes, over predictors with a teacher score of at least 0.1, weighted by
     that score. Objectness: mean over all predictors of the Kullback-Leibler divergence of the student's score from the
-    teacher's. Both are 0 for equal outputs. The teacher gets no gradient. No shape depends on values, so that a GPU
-    never makes the process wait. Both networks have the same anchors (3, 3, 2) and strides, so that their predictors
+    teacher's. Both are 0 for equal outputs. The teacher gets no gradient. No shape depends on values, so the process
+    never waits for a GPU. Both networks must have equal anchors (3, 3, 2) and strides, so that their predictors
     correspond.
     """
     box, weights, confidence, predictors = student[0].new_zeros(()), student[0].new_zeros(()), [], 0
@@ -46,7 +46,7 @@ def distill_loss(
         losses = ciou_loss(predicted.flatten(0, 3), expected.flatten(0, 3), "standard")
         box = box + (weight.flatten() * losses).sum()
         weights = weights + weight.sum()
-        # Cross-entropy minus the teacher's own entropy.
+        # Kullback-Leibler divergence: cross-entropy minus the teacher's entropy.
         logits = target[..., 4]
         confidence.append(F.binary_cross_entropy_with_logits(raw[..., 4].float(), score, reduction="sum"))
         confidence.append(-F.binary_cross_entropy_with_logits(logits, score, reduction="sum"))

@@ -9,10 +9,10 @@ from perilune_train.detect.data.assign import Targets
 GUIDED = ("B_11", "B_22", "B_38")
 """The last gates of the stages of stride 2, 4 and 8."""
 _REACHES, _LEVELS = (1.0, 1.1, 1.2, 1.3, 1.4), (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
-"""Outer radii of crater and rings, divided by the crater's radius, and 1 - G of the paper's mask G inside each and
-beyond."""
+"""Outer radii of the crater and of its rings, divided by the crater's radius; then 1 - G inside each radius and beyond
+the last, where G is the paper's mask."""
 _WINDOWS = (4.0, 16.0)
-"""Largest radii, pixels of the map, of craters that are painted together."""
+"""Largest radii, in map pixels, of the groups of craters that are painted together."""
 _TINY = 1e-6
 
 
@@ -20,17 +20,17 @@ _TINY = 1e-6
 def craterness(targets: Targets, frames: int, height: int, width: int, stride: int) -> Tensor:
     """1 - G (frames, 1, height, width): 1 in craters, steps down to 0.2 in rings around them, 0 elsewhere.
 
-    Craters are ellipses in the boxes, pixels, of all labels that predictors of any scale learn. A pixel of the map is
-    `stride` pixels wide; values are taken at pixel centres.
+    G is the paper's mask. Craters are the ellipses in the label boxes that predictors of any scale learn. A pixel of
+    the map is `stride` image pixels wide; values are computed at pixel centres.
     """
     boxes = torch.cat([painted.boxes for painted in targets]).float()
     frame = torch.cat([painted.predictors[0] for painted in targets])
-    # Several predictors learn a label.
+    # Several predictors learn one label; paint it once.
     rows = torch.unique(torch.cat([frame[:, None].float(), boxes], 1), dim=0)
     rows = torch.cat([rows[:, :1], rows[:, 1:] / stride], 1)
     painted = torch.zeros(frames, height, width, device=boxes.device)
     reach = (rows[:, 3:] - rows[:, 1:3]).amax(1) / 2 * _REACHES[-1]
-    # Most craters are small, so small windows save nearly all of the work; a training step waits for it.
+    # Most craters are small, so small windows save nearly all of the work, for which a training step waits.
     smaller = torch.zeros_like(reach, dtype=torch.bool)
     for largest in (*_WINDOWS, float("inf")):
         fitting = (reach <= largest) & ~smaller
@@ -41,7 +41,10 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
 
 
 def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
-    """Paint craters (N, 5), frame and box in pixels of the map, into `painted`, each in a window of `side` pixels."""
+    """Paint craters into `painted`, each in a window of `side` pixels.
+
+    `rows` (N, 5) are the frame and the box of each crater, in map pixels.
+    """
     _, height, width = painted.shape
     centre, half = (rows[:, 1:3] + rows[:, 3:]) / 2, ((rows[:, 3:] - rows[:, 1:3]) / 2).clamp(min=_TINY)
     first = (centre - side / 2).ceil().long()
@@ -57,9 +60,10 @@ def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
 
 
 def guide_loss(masks: dict[str, Tensor], targets: Targets, size_px: tuple[int, int]) -> Tensor:
-    """Mean over frames and GUIDED gates of 1 - the Pearson correlation of the mask with the craterness.
+    """Guidance loss: 1 - Pearson correlation of mask and craterness, averaged over frames and GUIDED gates.
 
-    `masks` are the spatial masks (N, 1, h, w) of images (height, width). A frame without craters counts 1.
+    `masks` are the spatial masks (N, 1, h, w), by gate; `size_px` is the height and width of the images. The loss of a
+    frame without craters is 1.
     """
     frames, _, height, width = masks[GUIDED[0]].shape
     target = craterness(targets, frames, height, width, size_px[1] // width)

@@ -54,13 +54,13 @@ def detection_loss(
     With `reduction` "sums", the paper's form: both are plain sums over all predictors of all scales, divided by the
     number of frames.
 
-    With "means", our deviation: for each scale, L_ciou is the mean over its positive predictors, 0 if there are none.
+    With "means", our deviation: for each scale, L_ciou is the mean over its positive predictors, or 0 without them.
     L_obj is the sum of the binary cross-entropy of the objectness over positive and (times lambda_noobj) negative
     predictors, divided by the number of all predictors of the scale. The scales are averaged with weights 1 / stride.
     With means, both parts train with the paper's weights 0.05 and 1. The weights 1 / stride raise the coarse scales
     relative to a plain sum, because their craters are a hundred times rarer.
 
-    No shape depends on values, so that a GPU never makes the process wait.
+    No shape depends on values, so the process never waits for a GPU.
 
     The objectness target of a positive predictor is 1 (`hard`, YOLOv3) or the IoU of its box with its label (`iou`).
     With `iou` the score measures how well a box fits, and suppression keeps the best box on a crater.

@@ -18,10 +18,10 @@ _LABEL, _DETECTION = (240, 228, 66), (86, 180, 233)
 def preview_images(
     split: DetectSplit, detections: Sequence[Detections], threshold: float, count: int = COUNT
 ) -> dict[str, NDArray[np.uint8]]:
-    """Images (height, width, 3), red, green, blue, of at most `count` frames, evenly spaced over a split, by frame_id.
+    """RGB images (height, width, 3) by frame_id, of at most `count` frames evenly spaced over a split.
 
-    Selected labels are yellow ellipses, detections of at least `threshold` blue boxes. Frames below 512 px are enlarged
-    by a whole factor, so that lines do not hide craters of a few pixels.
+    Selected labels are yellow ellipses; detections with a score of at least `threshold` are blue boxes. Frames below
+    512 px are enlarged by a whole factor, so that lines do not hide craters of a few pixels.
     """
     chosen = np.unique(np.linspace(0, len(split) - 1, min(count, len(split))).astype(int))
     names = split.frames.table["frame_id"].tolist()
@@ -32,7 +32,7 @@ def preview_images(
         image = cv2.cvtColor(grey.repeat(factor, 0).repeat(factor, 1), cv2.COLOR_GRAY2RGB)
         labels = split.labels[number]
         for cx, cy, a, b, theta in labels.ellipses[labels.selected].tolist():
-            # The centre of the first pixel is 0 for OpenCV and 0.5 for us.
+            # The centre of the first pixel has the coordinate 0 in OpenCV, but 0.5 here.
             centre = _sixteenths(factor * cx - 0.5), _sixteenths(factor * cy - 0.5)
             axes = _sixteenths(factor * a), _sixteenths(factor * b)
             cv2.ellipse(image, centre, axes, np.degrees(theta), 0, 360, _LABEL, 1, cv2.LINE_AA, 4)
@@ -44,5 +44,5 @@ def preview_images(
 
 
 def _sixteenths(value_px: float) -> int:
-    """OpenCV takes integers; four fractional bits keep a sixteenth of a pixel."""
+    """Convert pixels to OpenCV's integers with four fractional bits: sixteenths of a pixel."""
     return round(16 * value_px)

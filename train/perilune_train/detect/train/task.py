@@ -28,8 +28,8 @@ from perilune_train.records.provenance import RECORD
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100
 _STEPS_BETWEEN_AVERAGES = 4
-"""Steps between updates of the average. Updating all weights takes a twentieth of a small network's step; updating at
-every fourth step gives equal results."""
+"""Steps between updates of the average. An update of all weights takes a twentieth of the time of a small network's
+step; updating at every fourth step gives equal results."""
 
 
 def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> float:
@@ -45,7 +45,7 @@ TensorPairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
 
 
 def paired_tensors(average: nn.Module, network: nn.Module) -> TensorPairs:
-    """Pairs of tensors of an average and of its network: first the floats, then the counters."""
+    """Matching tensors of average and network: floats of both, then counters of both."""
     old, new = list(average.state_dict().values()), list(network.state_dict().values())
     floats = [value.is_floating_point() for value in old]
     return (
@@ -69,9 +69,10 @@ def update_average(tensors: TensorPairs, decay: float) -> None:
 
 
 class DetectTask(lightning.LightningModule):
-    """Training with AdamW, warm-up and cosine; a moving average of the weights is evaluated in their place.
+    """Training with AdamW, warm-up and cosine schedule; a moving average of the weights is evaluated.
 
-    A frozen backbone keeps its weights and batch statistics, except the weights of its attention gates.
+    While the backbone is frozen, its weights and batch statistics do not change, except the weights of its attention
+    gates.
 
     `train` and `val` are the shares of this process.
     """
@@ -117,7 +118,7 @@ class DetectTask(lightning.LightningModule):
         return may_reside(self.config) and fits(self.train_split, self.device)
 
     def train_dataloader(self) -> Any:
-        # The current epoch is one too low here if the run is resumed after a whole epoch.
+        # Do not use current_epoch: here it is one too low if the run is resumed after a whole epoch.
         epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
         resumed_epoch, batches = self.resumed
         start = batches if epoch == resumed_epoch else 0
@@ -152,7 +153,7 @@ class DetectTask(lightning.LightningModule):
     def configure_optimizers(self) -> Any:
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
         plain = [p for p in self.network.parameters() if p.ndim <= 1]
-        # A captured step reads the learning rate from the device.
+        # A captured step reads the learning rate from the device, so make it a tensor.
         rate = self.config.learning_rate
         optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
@@ -160,7 +161,7 @@ class DetectTask(lightning.LightningModule):
             fused=True,
             capturable=self.resides,
         )
-        # Lightning's own count would load the batches of an epoch before it knows the position of a resumed run.
+        # Lightning's step count would load the batches of an epoch before the position of a resumed run is known.
         total = self.config.epochs * len(self.train_dataloader())
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: learning_rate_factor(step, self.config.warmup_steps, total)
@@ -175,7 +176,7 @@ class DetectTask(lightning.LightningModule):
             part.requires_grad_(not frozen)
             part.train(not frozen)
         if self.resides and (self.captured is None or self.current_epoch == self.frozen_epochs):
-            # A captured step computes the gradients of the stage in which it was captured.
+            # Capture again after unfreezing: a captured step computes gradients only of the weights trained then.
             self.captured = CapturedStep(self.whole_step, self.config.batch_size, self.device)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
@@ -211,15 +212,15 @@ class DetectTask(lightning.LightningModule):
         return loss
 
     def resident_batch(self, numbers: Tensor) -> Batch:
-        """The batch of the frames `numbers` (B,) of the resident frames."""
+        """The batch of the resident frames with the numbers `numbers` (B,)."""
         assert self.resident is not None
         return self.resident.batch(numbers, self.config.in_channels)
 
     def whole_step(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses of a batch of resident frames; updates the weights. No value is read, so that it may be captured."""
+        """Losses of a batch of resident frames; updates the weights. Reads no value, so that it can be captured."""
         optimizer: Any = self.optimizers(use_pl_optimizer=False)
         optimizer.zero_grad(set_to_none=True)
-        # A cache would keep casts of the weights, which the step changes.
+        # Disable the cache: it would keep casts of weights that the step changes.
         kind = self.device.type
         enabled, dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
         with torch.autocast(kind, dtype, enabled, cache_enabled=False):
@@ -243,11 +244,11 @@ class DetectTask(lightning.LightningModule):
             super().optimizer_zero_grad(*args)
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
-        # Lightning's own clipping raises an error for fused optimisers because of float16's scaled gradients, which are
-        # not used here.
+        # Lightning's clipping refuses fused optimisers because of the scaled gradients of float16, which are not used
+        # here.
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         norm = nn.utils.get_total_norm(gradients, foreach=True)
-        # On a CPU reading the norm is free, and most steps need no second pass over all gradients.
+        # On a CPU, reading the norm is free and saves most steps a second pass over all gradients.
         if norm.is_cuda or norm > self.config.gradient_clip:
             nn.utils.clip_grads_with_norm_(self.network.parameters(), self.config.gradient_clip, norm, foreach=True)
 
@@ -258,7 +259,7 @@ class DetectTask(lightning.LightningModule):
         assert isinstance(self.train_split, DetectSplit)
         self.resident = ResidentFrames.of(self.train_split, self.config, self.network.anchors, self.device)
         for group in self.optimizers(use_pl_optimizer=False).param_groups:
-            # The state of a resumed run is read to the CPU.
+            # The state of a resumed run was loaded to the CPU.
             group["lr"] = group["lr"].to(self.device)
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
@@ -268,8 +269,8 @@ class DetectTask(lightning.LightningModule):
             self.replays = False
         else:
             super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
-        # Update here, not after the batch: a checkpoint in between would lack it. The decay is smaller in early steps;
-        # otherwise the random start would dominate the average in a short training.
+        # Update the average here, not after the batch: a checkpoint saved in between would lack the update. The decay
+        # is smaller in early steps; otherwise the random initial weights would dominate in a short training.
         steps = self.global_step + 1
         every = 1 if steps <= _EVERY_STEP_UNTIL else _STEPS_BETWEEN_AVERAGES
         if steps % every == 0:
@@ -286,7 +287,7 @@ class DetectTask(lightning.LightningModule):
     def on_validation_epoch_start(self) -> None:
         self.detections = []
         if self.process[1] > 1:
-            # Weights are equal in all processes; batch statistics differ, and those of the first process are used.
+            # Weights are equal in all processes, but batch statistics differ: use the statistics of the first process.
             for value in self.evaluated.buffers():
                 torch.distributed.broadcast(value, 0)
 

@@ -1,5 +1,7 @@
-"""Choose the score threshold of a detector on validation frames, optionally also with varied contrast, blur and
-noise."""
+"""Choose the score threshold of a detector on validation frames, optionally also on varied copies of them.
+
+The copies have other contrast, blur and noise.
+"""
 
 from dataclasses import replace
 
@@ -14,16 +16,16 @@ from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import detect_split
 
 VARIED = AugmentSettings(flips_and_turns=False, gain=0.3, gamma=0.6, stretch=0.1, blur_px=0.6, noise=5.0)
-"""Variations of the copies of validation frames: wider than in training, to cover published images."""
+"""Variation of the copies of validation frames; it is wider than in training, to cover published images."""
 _STREAM = 7
 
 
 def threshold_on_validation(
     detector: Detector, split: DetectSplit, plain_detections: list[Detections]
 ) -> tuple[float, str]:
-    """Choose the threshold as `detect.evaluation` says; returns it and a description.
+    """Choose the threshold by the rule in `detect.evaluation`; return the threshold and a description.
 
-    With `detect.evaluation.varied_frames` each frame counts twice: as it is and varied.
+    With `detect.evaluation.varied_frames`, each frame counts twice: unchanged and varied.
     """
     config = detector.config
     labels, detections, frames = list(split.labels), list(plain_detections), "val"

@@ -1,4 +1,4 @@
-"""Effects of removed craters by size, freshness and Sun: tables, pictures, figures of metrics.json."""
+"""Effects of removing craters, by size, freshness and Sun elevation: tables, pictures and metrics."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -27,7 +27,7 @@ BINS = {
 OUTSIDE = "outside"
 """Name of the bin for values outside all other bins; it is not drawn."""
 MOST_ROWS = 6
-"""Largest number of gates that are drawn as bars, one row of panels each; more are drawn as a heat map."""
+"""Largest number of gates drawn as bars, in one row of panels per gate; more gates are drawn as a heat map."""
 
 
 def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
@@ -45,9 +45,10 @@ def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
 
 
 def bin_metrics(table: pd.DataFrame, prefix: str) -> Metrics:
-    """Figures of `binned` for metrics.json: means <prefix>/<version>[/<map>]/<property>/<bin>, and numbers of views.
+    """Figures of `binned` for metrics.json: means, and numbers of crater views.
 
-    The number of crater views, the same for all maps, is <prefix>/<version>/<property>/<bin>_n.
+    Means have keys <prefix>/<version>[/<map>]/<property>/<bin>. Numbers of views have keys
+    <prefix>/<version>/<property>/<bin>_n, because they do not depend on the map.
     """
     names = {label: name for name, (label, _) in BINS.items()}
     metrics: Metrics = {}
@@ -60,9 +61,9 @@ def bin_metrics(table: pd.DataFrame, prefix: str) -> Metrics:
 
 
 def draw_bins(path: Path, tables: Mapping[str, pd.DataFrame]) -> None:
-    """Draw the means of `binned` as bars: one row of panels for each table, by label, one column for each property.
+    """Draw the means of `binned` as bars: one row of panels per table, one column per property.
 
-    The number of crater views is below each bin.
+    The keys of `tables` label the rows. The number of crater views stands below each bin.
     """
     figure = Figure(figsize=(12, 0.8 + 2.8 * len(tables)), layout="constrained")
     axes = figure.subplots(len(tables), len(BINS), sharey="row", squeeze=False)
@@ -77,7 +78,10 @@ def draw_bins(path: Path, tables: Mapping[str, pd.DataFrame]) -> None:
 
 
 def draw_gate_bins(path: Path, table: pd.DataFrame) -> None:
-    """Draw the changes of all gates (the table of `binned` with the column map): bars, or a heat map of many gates."""
+    """Draw the changes of all gates as bars, or of many gates as a heat map.
+
+    `table` is the result of `binned` with the column map.
+    """
     gates = list(dict.fromkeys(table["map"]))
     if len(gates) <= MOST_ROWS:
         draw_bins(path, {f"change of {gate},\ndeviations of the gate": table[table["map"] == gate] for gate in gates})

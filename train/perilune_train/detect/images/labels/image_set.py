@@ -1,4 +1,4 @@
-"""Labelled images, and how the objects of a label file become such images."""
+"""Labelled images, and their construction from the objects of a label file."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ class LabelledImage:
 
     @property
     def sizes_px(self) -> Array:
-        """Side of the square of equal area, sqrt(w h), pixels (M,): the size of a crater here."""
+        """Size of each crater, sqrt(w h), pixels (M,): the side of the square of equal area."""
         return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
 
     def selected(self, min_size_px: float) -> NDArray[np.bool_]:
@@ -53,11 +53,11 @@ class ImageSet:
     """All labelled images of a folder or a label file."""
 
     images: list[LabelledImage]
-    """Sorted by name, or in the order of the file."""
+    """Images, sorted by name or in the order of the file."""
     clipped: bool
     """Whether boxes are clipped at the image's edge, so that detections must be clipped before matching."""
     categories: str = ""
-    """Text that names the categories taken as craters; "" if there was no choice."""
+    """Text that names the categories taken as craters; "" if the file left no choice."""
     split: str = ""
     """Text that names the split, if the source has several; else ""."""
 
@@ -69,11 +69,11 @@ class LabelledObject:
     box: Box
     """x0, y0, x1, y1, pixels."""
     category: str = ""
-    """Id of its category, a key of `LabelFile.categories`."""
+    """Id of the object's category, a key of `LabelFile.categories`."""
     ignored: bool = False
-    """Whether its source marks it as not counting (`ignore`, `difficult`)."""
+    """Whether the source marks the object as ignored (`ignore`, `difficult`)."""
     crowd: bool = False
-    """Whether it is a region of many objects (`iscrowd`)."""
+    """Whether the object is a region of many objects (`iscrowd`)."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class LabelFile:
 
 
 def image_set(label_file: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
-    """Check the pictures, choose the craters among the objects, clip their boxes. Raises UserError."""
+    """Check the pictures, select the objects that are craters, and clip their boxes; may raise UserError."""
     chosen, text = choose_categories(label_file.categories, wanted, label_file.source)
     check_names([entry.path for entry in label_file.entries], [entry.name for entry in label_file.entries])
     check_names(
@@ -140,9 +140,9 @@ def choose_categories(
 ) -> tuple[set[str] | None, str]:
     """The ids of the categories that are craters, and a text that names them.
 
-    Without `wanted`, these are all categories named crater or craters, in upper or lower case; there may be several,
-    since exports of Roboflow also have a placeholder category. With fewer than two categories every object is a crater:
-    None.
+    Without `wanted`, these are all categories named crater or craters, in upper or lower case; a file may have several,
+    since exports of Roboflow also have a placeholder category. Without `wanted`, and with fewer than two categories,
+    every object is a crater, and the ids are None.
     """
     names = {key: " ".join(name.split()) for key, name in categories.items()}
     asked = [name.strip().lower() for name in wanted]

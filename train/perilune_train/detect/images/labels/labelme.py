@@ -14,7 +14,7 @@ _WITHOUT_AREA = ("point", "points", "line", "linestrip")
 
 
 def read_labelme(path: Path, picture: Path, name: str) -> tuple[Entry, int]:
-    """The objects of one file, and the number of shapes without an area, which are left out."""
+    """Read the objects of one file; also return how many shapes were omitted because they have no area."""
     content = read_json(path, _EXPECTED, _without_pixels)
     shapes = content.get("shapes") if isinstance(content, dict) else None
     if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
@@ -37,7 +37,7 @@ def _box(shape: dict[str, Any], path: Path, field: str) -> Box:
     points = shape.get("points")
     box = around(points if isinstance(points, list) else [], path, field)
     if shape.get("shape_type") == "circle":
-        # The centre, and a point on the circle.
+        # A circle is stored as its centre and a point on it.
         if not isinstance(points, list) or len(points) != 2:
             raise UserError(path, field, points, "the centre of a circle and a point on it")
         (x, y), (edge_x, edge_y) = ((float(p[0]), float(p[1])) for p in points)

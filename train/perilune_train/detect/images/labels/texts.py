@@ -1,4 +1,4 @@
-"""Read label files as text, JSON or XML, within limits of size and of the memory that parsing takes."""
+"""Read label files as text, JSON or XML; limit the file size and the memory that parsing takes."""
 
 import json
 import xml.etree.ElementTree as ET
@@ -11,7 +11,7 @@ from perilune_shared.errors import UserError
 
 _LARGEST_TEXT, _LARGEST_XML, _LARGEST_JSON = 2**26, 2**26, 2**29
 _MOST_BRACKETS = 2**22
-"""Objects, lists and elements take 50 to 250 bytes of memory each, and as few as 3 bytes in a file."""
+"""Limit on objects, lists and elements: each takes 50 to 250 bytes of memory, but as few as 3 bytes in a file."""
 _DOCUMENT_TYPES = ("<!DOCTYPE", "<!ENTITY")
 
 
@@ -29,7 +29,7 @@ def read_text(path: Path, field: str, largest: int = _LARGEST_TEXT) -> str:
 
 
 def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = None) -> Any:
-    """The content of a JSON file; `hook` replaces each object, so that less of it is kept."""
+    """The content of a JSON file; `hook` replaces each object, for example to drop parts of it."""
     text = read_text(path, "JSON", _LARGEST_JSON)
     if text.count("[") + text.count("{") > _MOST_BRACKETS:
         raise UserError(path, "JSON", f"more than {_MOST_BRACKETS} lists and objects", "fewer, in several files")
@@ -67,11 +67,11 @@ def below(folder: Path, name: Any, path: Path, field: str) -> Path:
 
 
 def find_picture(path: Path, name: Any, field: str, image_folder: Path | None) -> Path:
-    """Path of the picture that a label file names, in the first possible folder that contains it.
+    """Path of the picture that a label file names, in the first searched folder that contains it.
 
-    These are `image_folder` alone if it is given, else the file's folder, ../images, ../images/NAME and ../NAME, where
-    NAME is the last part of the file's name (train2017 for instances_train2017.json). An export in the folder of its
-    perilune dataset names frames of that dataset.
+    Searches only `image_folder` if it is given. Otherwise searches the file's folder, its subfolder images, ../images,
+    ../images/NAME and ../NAME, where NAME is the last part of the file's name (train2017 for
+    instances_train2017.json). A file in a folder of a perilune dataset may also name the dataset's frames.
     """
     root = path.resolve().parent
     ending = path.stem.rpartition("_")[2]

@@ -1,7 +1,7 @@
 """Pascal VOC (an XML file per image) and CVAT for images (one XML file).
 
-Corners are taken as written, from the outer corner of the top-left pixel: labelImg and Roboflow write edges. The
-development kit of Pascal VOC numbers pixels from 1, so its boxes are a pixel narrower here at the left and the top.
+Corners are used as written, counted from the outer corner of the top-left pixel: labelImg and Roboflow write edges.
+The development kit of Pascal VOC numbers pixels from 1, so here its boxes lack one pixel at the left and at the top.
 """
 
 import xml.etree.ElementTree as ET
@@ -16,7 +16,7 @@ _CORNERS = ("xmin", "ymin", "xmax", "ymax")
 
 
 def read_voc(path: Path, picture: Path, name: str) -> Entry:
-    """The objects of one Pascal VOC file; `difficult` ones are ignored."""
+    """Read the objects of one Pascal VOC file; objects marked `difficult` are ignored."""
     root = read_xml(path, "a Pascal VOC file")
     if root.tag != "annotation":
         raise UserError(path, "XML", f"<{root.tag}>", "<annotation>, as in Pascal VOC")
@@ -35,7 +35,7 @@ def read_voc(path: Path, picture: Path, name: str) -> Entry:
 
 
 def read_cvat(path: Path, image_folder: Path | None = None) -> LabelFile:
-    """Read a file of CVAT for images: boxes, polygons, ellipses and masks. Other shapes are left out and counted."""
+    """Read a file of CVAT for images: boxes, polygons, ellipses and masks. Other shapes are counted and omitted."""
     root = read_xml(path, "a file of CVAT for images")
     if root.tag != "annotations" or root.find("track") is not None:
         found = "tracks of CVAT for video" if root.find("track") is not None else f"<{root.tag}>"

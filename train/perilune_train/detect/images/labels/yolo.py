@@ -1,7 +1,7 @@
-"""YOLO: a text file per image, a line `class cx cy w h` per object, as fractions of the image size.
+"""YOLO labels: one text file per image, one line `class cx cy w h` per object, in fractions of the image size.
 
-Rows of segmentation (`class x1 y1 x2 y2 ...`) become the boxes around their polygons; a sixth number (a score) is
-ignored. Numbers are separated by spaces, tabs or commas. An empty file is an image without objects.
+A line with a polygon (`class x1 y1 x2 y2 ...`) becomes the box around the polygon. A sixth number (a score) is ignored.
+Numbers are separated by spaces, tabs or commas. The image of an empty file has no objects.
 """
 
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ from perilune_train.detect.images.read import picture_size
 
 SPLIT_KEYS = {"train": ("train",), "val": ("val", "valid", "validation"), "test": ("test",)}
 _FRACTIONS = -1.0, 2.0
-"""Boxes may extend beyond the image; pixels are mostly larger than this."""
+"""Range of accepted fractions. Boxes may extend beyond the image, but larger values are probably pixels."""
 _LISTED_SUFFIX = ".txt"
 
 
 def is_yolo(text: str) -> bool:
-    """Whether the text of a label file is YOLO: its first line has numbers only, or it has none."""
+    """Whether the text of a label file is YOLO: the first line contains only numbers, or the text is empty."""
     first = next((line for line in text.splitlines() if line.strip()), "")
     try:
         return all(float(cell) is not None for cell in _cells(first))
@@ -60,7 +60,7 @@ def read_yolo_text(path: Path, picture: Path) -> list[LabelledObject]:
 
 
 def label_of(picture: Path) -> Path:
-    """The text file of a picture: labels/a/b.txt for images/a/b.png, else beside it."""
+    """The text file of a picture: labels/a/b.txt for images/a/b.png, otherwise a file beside the picture."""
     parts = list(picture.parts)
     for level in range(len(parts) - 2, -1, -1):
         if parts[level].lower() == "images":
@@ -85,7 +85,7 @@ def class_names(content: Mapping[str, Any]) -> dict[str, str]:
 
 
 def pictures_of_split(path: Path, value: Any) -> list[Path]:
-    """The pictures to which a split of a data.yaml points: folders, or lists of paths. All below its folder."""
+    """The pictures of a split of a data.yaml, which names folders or lists of paths, all below its own folder."""
     root = path.resolve().parent
     images = []
     for name in value if isinstance(value, list) else [value]:
@@ -101,7 +101,7 @@ def pictures_of_split(path: Path, value: Any) -> list[Path]:
 
 
 def listed_pictures(path: Path) -> list[Path]:
-    """The pictures that a list names, one path in each line, relative to its folder."""
+    """The pictures that a list names: one path per line, relative to the folder of the list."""
     root = path.resolve().parent
     lines = enumerate(read_text(path, "list").splitlines(), 1)
     images = [below(root, line.strip(), path, f"line {n}") for n, line in lines if line.strip()]
