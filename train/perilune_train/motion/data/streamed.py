@@ -1,8 +1,9 @@
 """Training sequences over new ground, rendered by an image server during training.
 
 A rendered sequence shows a scene of the server from the poses of a training trajectory. These poses are rotated about
-the vertical through the site by a random angle; attitudes relative to the path do not change. So positions, motions and
-attitudes are distributed as in the training trajectories, except for the azimuth, which is uniform.
+the vertical through the site by a random angle. Attitudes relative to the path do not change, because the camera axes
+relative to the path are equal in a descent from another azimuth. So positions, motions and attitudes are distributed as
+in the training trajectories, except for the azimuth, which is uniform.
 """
 
 from collections.abc import Iterator
@@ -60,7 +61,7 @@ class StreamedSequences(TrainingSequences):
         return 1 + before * self.n_pairs // settings.pairs_per_scene % settings.n_scenes
 
     def poses(self, key: Key) -> tuple[Trajectory, np.ndarray, int]:
-        """Poses of a rendered sequence, without images, with their velocities (n, 3), O_L, and the first noise index."""
+        """Poses of a rendered sequence, without images; their velocities (n, 3), O_L; and the first noise index."""
         epoch, position, number, start = key
         rng = np.random.default_rng([self.stream.settings.seed, epoch, position])
         angle, index = rng.uniform(0, 2 * np.pi), int(rng.integers(_INDICES))

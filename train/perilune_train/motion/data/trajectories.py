@@ -81,7 +81,7 @@ class Trajectory:
         return -self.nominal_rotation_camera_from_site[:, 2]
 
     def shrunk(self, size_px: int) -> "Trajectory":
-        """This trajectory with images shrunk to a width of `size_px` by area averaging; itself if they have this width."""
+        """Shrink the images to a width of `size_px` by area averaging; returns self if they have this width."""
         height, width = self.images.shape[1:]
         if width == size_px:
             return self

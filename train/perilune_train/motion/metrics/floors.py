@@ -19,7 +19,7 @@ _PENALTIES = np.logspace(-6, 2, 17)
 
 
 def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Pose]]:
-    """For every test trajectory, the mean pose of the training set, and the mean pose of the training set per frame."""
+    """Poses by method for every test trajectory: the mean training pose, and the mean training pose at each frame."""
     position_m, rotation_camera_from_site = (
         np.concatenate([trajectory.pose[i] for trajectory in training]) for i in range(2)
     )
