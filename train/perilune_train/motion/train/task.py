@@ -362,8 +362,8 @@ class NavigationTask(lightning.LightningModule):
             groups.append({"params": own_values, "lr": factor * rate, "weight_decay": 1e-3})
         optimizer = torch.optim.AdamW(
             groups,
-            # Fused: one pass over memory. On a CPU this is ten times as fast; there the unfused optimizer takes half
-            # the time of a step on stored features.
+            # Fused: one pass over memory, ten times as fast on a CPU. There the optimizer takes half the time of a step
+            # on stored features.
             fused=True,
         )
         settings = self.own
