@@ -58,7 +58,7 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
     tracks = list(frames.groupby("trajectory_id").indices.items())[:_MOST_TRACKS]
     with drawing(height_in=5.0) as figure:
         axes = figure.subplots()
-        # Reverse both axes, so that north is up.
+        # Columns run west and rows south, so reverse both.
         image = shaded_ground(drawn, sun / np.linalg.norm(sun), half_m)[::-1, ::-1]
         axes.imshow(image, cmap="gray", vmin=0, vmax=255, origin="lower", extent=(-half_m, half_m, -half_m, half_m))
         for number, (trajectory, rows) in enumerate(tracks):

@@ -173,7 +173,7 @@ def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | No
 
 
 def _metrics_of(folder: Path) -> Metrics:
-    """Metrics of a folder; empty if the folder is older than the metrics format."""
+    """Metrics of a folder; empty if an older version wrote the folder without metrics.json."""
     return read_metrics(folder) if (folder / METRICS_FILE).is_file() else {}
 
 

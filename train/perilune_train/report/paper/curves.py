@@ -58,7 +58,10 @@ def learning_curve(run: Path, key: str) -> list[float]:
 
 
 def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]]]) -> bool:
-    """Draw the learning curves of the runs of each panel, by title; return whether there are any curves."""
+    """Draw learning curves, one panel per title; return whether there are any curves.
+
+    A panel has the key of its metric, and the folder of each run by name.
+    """
     values = {
         title: {name: heights for name, run in runs.items() if (heights := learning_curve(run, key))}
         for title, (key, runs) in panels.items()

@@ -19,7 +19,7 @@ _PIXELS = {
     "_all_pixels": "all pixels, 0 where the other half is not seen",
     "": "pixels that both halves see",
 }
-"""Keys of PCC3 and PCC4, by the set of pixels over which they are computed."""
+"""Pixels over which PCC3 and PCC4 are computed, by the suffix of their keys."""
 _CORRELATIONS = {
     "pcc1_craterness": "PCC1: mask and craters",
     "pcc2": "PCC2: masks of two frames",
