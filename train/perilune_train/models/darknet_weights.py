@@ -36,7 +36,7 @@ _TENSORS_WITHOUT = ("bias", "weights")
 
 @dataclass(frozen=True)
 class DarknetFile:
-    """Content of a file; `write_darknet` writes the same bytes."""
+    """Content of a file. `write_darknet` reproduces the file byte for byte."""
 
     header: bytes
     """Version and number of images seen, 16 or 20 bytes."""

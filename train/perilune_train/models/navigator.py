@@ -47,7 +47,7 @@ class Recurrent(nn.Module):
         return torch.autocast(values.device.type, enabled=False) if self.exact else nullcontext()
 
     def over_time(self, summaries: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        """`forward` from the outputs of `summary`, each of which depends on one pair only."""
+        """Run `forward` without the layer `summary`, from the outputs of this layer (batch, pairs, values)."""
         with self.precision(summaries):
             hidden, state = self.lstm(self.dropout(summaries), state)
             return self.output(self.dropout(hidden)).float(), state

@@ -72,7 +72,7 @@ def information_of(network: WarpNavigator, architecture: dict[str, Any], traject
 
 
 def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
-    """Fit the five numbers by maximum likelihood of the errors of these motions, as Gaussian errors."""
+    """Fit the five numbers by maximum likelihood, with Gaussian errors of these motions."""
     errors = np.concatenate(
         [signed_errors(trajectory, motion) for trajectory, motion in zip(trajectories, motions, strict=True)]
     )

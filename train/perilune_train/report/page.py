@@ -51,7 +51,7 @@ _VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinj
 
 @dataclass(frozen=True)
 class _Opened:
-    """Datasets and runs that exist."""
+    """The datasets and runs of a report that exist, and the names of the others."""
 
     datasets: dict[Path, Dataset]
     """Complete datasets with frames, by folder."""

@@ -21,9 +21,9 @@ from perilune_train.motion.data.undistort import undistorted
 from perilune_train.motion.geometry import relative_poses
 
 Motion = tuple[Array, Array]
-"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one trajectory."""
+"""Motions of one trajectory: translation_m (n - 1, 3), O_C of the earlier frame; rotation_c2_from_c1 (n - 1, 3, 3)."""
 Pose = tuple[Array, Array]
-"""position_m (n - 1, 3) in O_L and rotation_camera_from_site (n - 1, 3, 3) at the later frame of each pair."""
+"""Poses at the later frame of each pair: position_m (n - 1, 3), O_L; rotation_camera_from_site (n - 1, 3, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Trajectory:
     nominal_position_m: Array
     """Positions (n, 3), metres, on the nominal curve at the frames' times, O_L."""
     nominal_rotation_camera_from_site: Array
-    """Nominal attitude (3, 3): the camera on a level body, the same for all frames."""
+    """Nominal attitude (3, 3) of the camera on a level body, equal for all frames."""
     gyroscopes: Mapping[InertialGrade, GyroscopeTurns] = field(default_factory=dict)
     """Rotations measured by a gyroscope, by its grade. Grades that the dataset lacks are absent; empty in training."""
 

@@ -89,7 +89,7 @@ def _judged(
 
 
 def gate_table(explained: Metrics) -> list[str]:
-    """Ranges of PCC1 to PCC4 over all gates, with the ranges of each null, as lines of Markdown."""
+    """Table of the ranges of PCC1 to PCC4 and their nulls over all gates, as lines of Markdown."""
     rows = []
     for measure, title in _CORRELATIONS.items():
         names = [key.removeprefix(f"{measure}/") for key in explained if key.startswith(f"{measure}/B_")]
