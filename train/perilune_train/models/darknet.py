@@ -53,10 +53,10 @@ class ResidualUnit(nn.Module):
 class AttentionDarknet53(nn.Module):
     """The backbone of all networks: the first `stages` of Darknet53's five stages.
 
-    At width 1, with 3 input channels, 5 stages and no attention, it has 52 convolutions and 40,620,640 floats. Darknet
-    counts the weights, and the scale, bias, mean and variance of each batch norm. Names follow the paper: residual unit
-    j of stage i is `units["B_ij"]` and its CBAM is `attentions["B_ij"]`, with i = 1..5 and j from 1 to 1, 2, 8, 8, 4.
-    The form cbam_last has a CBAM only after the last unit of each stage: B_11, B_22, B_38, B_48, B_54.
+    At width 1, with 3 input channels, 5 stages and no attention, it has 52 convolutions and 40,620,640 floats in
+    Darknet's count (weights, and scale, bias, mean and variance of each batch norm). Names follow the paper: residual
+    unit j of stage i is `units["B_ij"]` and its CBAM is `attentions["B_ij"]`, with i = 1..5 and j from 1 to 1, 2, 8, 8,
+    4. The form cbam_last has a CBAM only after the last unit of each stage: B_11, B_22, B_38, B_48, B_54.
 
     Deviation from the original at widths other than 1: channels are rounded to multiples of 8.
     """

@@ -18,7 +18,7 @@ class FusionConfig(Section):
     size_px: Annotated[int, Field(ge=32, le=4096, multiple_of=32)]
     """Width to which frames are shrunk for the network, pixels."""
     width: Annotated[float, Field(gt=0, le=2)]
-    """Factor on the backbone's numbers of channels; 1 is the paper's network."""
+    """Factor on the channel counts of the backbone; 1 is the paper's network."""
     attention: Attention = "cbam_identity"
     """Attention after every residual unit."""
     hidden: Annotated[int, Field(ge=1, le=4096)]
