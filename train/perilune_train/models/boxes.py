@@ -1,4 +1,4 @@
-"""Intersection over union in torch. A box is x0, y0, x1, y1 in pixels; detect/evaluate/boxes.py has the NumPy form."""
+"""Intersection over union in torch. A box is x0, y0, x1, y1 in pixels. NumPy version: detect/evaluate/boxes.py."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,7 @@ _MIN_UNION = 1e-7
 
 
 def iou(first: Tensor, second: Tensor) -> Tensor:
-    """Intersection over union (...) of boxes (..., 4) that are broadcast against each other; differentiable."""
+    """Differentiable intersection over union (...) of two sets of boxes (..., 4), which are broadcast."""
     areas = _area(first) + _area(second)
     sides = torch.minimum(first[..., 2:], second[..., 2:]) - torch.maximum(first[..., :2], second[..., :2])
     intersection = _product(sides.clamp(min=0))
@@ -20,5 +20,5 @@ def _area(boxes: Tensor) -> Tensor:
 
 
 def _product(sides: Tensor) -> Tensor:
-    # The gradient of `prod` makes the process wait for the GPU, to count zeros.
+    # The gradient of `prod` counts zeros, for which the process waits for the GPU.
     return sides[..., 0] * sides[..., 1]

@@ -36,7 +36,10 @@ def conv_block(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Se
 
 
 class ResidualUnit(nn.Module):
-    """x + f(x), where f is a 1 x 1 convolution to half the channels and a 3 x 3 one back. (N, C, H, W) to the same."""
+    """x + f(x), where f is a 1 x 1 convolution to half the channels, then a 3 x 3 convolution back to all of them.
+
+    Shape: (N, C, H, W) to (N, C, H, W).
+    """
 
     def __init__(self, channels: int):
         super().__init__()
@@ -50,10 +53,10 @@ class ResidualUnit(nn.Module):
 class AttentionDarknet53(nn.Module):
     """The backbone of all networks: the first `stages` of Darknet53's five stages.
 
-    At width 1 with 3 input channels and 5 stages it has 52 convolutions and 40,620,640 floats in Darknet's count
-    (weights, and scale, bias, mean and variance of each batch norm), without attention. Residual unit j of stage i is
-    `units["B_ij"]`, its CBAM `attentions["B_ij"]` (i = 1..5, j = 1..1, 2, 8, 8, 4), named as in the paper. The form
-    cbam_last has a CBAM after the last unit of each stage only: B_11, B_22, B_38, B_48, B_54.
+    At width 1, with 3 input channels, 5 stages and no attention, it has 52 convolutions and 40,620,640 floats in
+    Darknet's count (weights, and scale, bias, mean and variance of each batch norm). Names follow the paper: residual
+    unit j of stage i is `units["B_ij"]` and its CBAM is `attentions["B_ij"]`, with i = 1..5 and j from 1 to 1, 2, 8, 8,
+    4. The form cbam_last has a CBAM only after the last unit of each stage: B_11, B_22, B_38, B_48, B_54.
 
     Deviation from the original at widths other than 1: channels are rounded to multiples of 8.
     """
@@ -63,7 +66,7 @@ class AttentionDarknet53(nn.Module):
         if not 1 <= stages <= len(UNITS):
             raise ValueError(f"stages is {stages}, not 1 to {len(UNITS)}")
         self.channels = [scaled(_STEM_CHANNELS * 2**i, width) for i in range(1, stages + 1)]
-        """Channels of the feature map after each stage; its stride is 2, 4, 8, 16, 32."""
+        """Channels of the feature map after each stage. The strides of these maps are 2, 4, 8, 16, 32."""
         stem = scaled(_STEM_CHANNELS, width)
         self.stem = conv_block(in_channels, stem, 3)
         self.downs = nn.ModuleList(
@@ -80,7 +83,10 @@ class AttentionDarknet53(nn.Module):
                     self.attentions[name] = CBAM(channels, form=_FORMS[attention])
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """Images (N, in_channels, H, W) to the stages' feature maps (N, channels[i], H / 2^(i+1), W / 2^(i+1))."""
+        """Convert images (N, in_channels, H, W) to one feature map per stage.
+
+        Map i has the shape (N, channels[i], H / 2^(i+1), W / 2^(i+1)).
+        """
         return self._run(x, None)
 
     def attention_masks(self, x: Tensor) -> dict[str, Tensor]:

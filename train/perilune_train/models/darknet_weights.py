@@ -1,10 +1,11 @@
 """Darknet's weight files: `darknet53.conv.74` (the backbone) and `yolov3.weights` (the whole network).
 
-A file has a header and then float32 values, little endian, for each convolution in the order of the network's cfg. A
-convolution with batch norm has bias, scale, mean, variance, weights (out, in, k, k); one without has bias, weights. The
-header is int32 major, minor, revision, then the number of images seen: 8 bytes if major * 10 + minor >= 2 (and both <
-1000), else 4.
-Source: the files that Redmon & Farhadi 2018 (arXiv 1804.02767) published, as Darknet reads them.
+A file has a header, then little-endian float32 values for each convolution in the order of the network's cfg. A
+convolution with batch norm stores bias, scale, mean, variance, weights (out, in, k, k). A convolution without batch
+norm stores bias, weights. The header has major, minor and revision as int32, then the number of images seen. This
+number has 8 bytes if major * 10 + minor >= 2 and both are below 1000, otherwise 4.
+
+Source: the weight files of Redmon & Farhadi 2018 (arXiv 1804.02767), in the format that Darknet reads.
 """
 
 import struct
@@ -35,7 +36,7 @@ _TENSORS_WITHOUT = ("bias", "weights")
 
 @dataclass(frozen=True)
 class DarknetFile:
-    """Content of a file; `write_darknet` writes the same bytes."""
+    """Content of a file. `write_darknet` reproduces the file byte for byte."""
 
     header: bytes
     """Version and number of images seen, 16 or 20 bytes."""
@@ -45,14 +46,14 @@ class DarknetFile:
 
 @dataclass(frozen=True)
 class Slot:
-    """A position in the file, and the tensor of a network that belongs there."""
+    """A position in the file, and the network's tensor that is stored there."""
 
     name: str
-    """Name for messages: number of the convolution, from 0, and kind of tensor."""
+    """Name for messages: number of the convolution, counted from 0, and kind of tensor."""
     tensor: Tensor
-    """The network's own tensor."""
+    """The tensor in the network, not a copy."""
     floats: int
-    """Length in the file; that of an output layer depends on the number of classes."""
+    """Number of floats in the file. For an output layer it depends on the number of classes."""
 
 
 def backbone_slots(backbone: AttentionDarknet53) -> list[Slot]:
@@ -63,8 +64,9 @@ def backbone_slots(backbone: AttentionDarknet53) -> list[Slot]:
 def network_slots(network: YOLOv3, filters: int = _FILTERS) -> list[Slot]:
     """All tensors of a network with strides 8, 16, 32, in the order of yolov3.cfg.
 
-    `filters` is the number of channels of the output layers. The order is that of execution: the backbone, then for
-    strides 32, 16 and 8 the branch, the head and, except for the last, the lateral convolution to the next stride.
+    `filters` is the number of channels of the output layers. The layers are in the order of execution. The backbone
+    comes first. Then each of the strides 32, 16 and 8 has its branch, its head and, except for stride 8, the lateral
+    convolution to the next stride.
     Raises ValueError for other strides.
     """
     if network.strides != (8, 16, 32):
@@ -78,12 +80,15 @@ def network_slots(network: YOLOv3, filters: int = _FILTERS) -> list[Slot]:
 
 
 def count_floats(slots: Sequence[Slot]) -> int:
-    """Number of floats in a file of these slots."""
+    """Number of floats in a file with these slots."""
     return sum(slot.floats for slot in slots)
 
 
 def is_darknet(path: Path) -> bool:
-    """Whether a file is Darknet's: not a torch checkpoint, and named like one or with a plausible version."""
+    """Whether a file is a Darknet weight file.
+
+    It is one if it is not a torch checkpoint, and has either the name of a Darknet file or a plausible version.
+    """
     start = b""
     if path.is_file():
         with path.open("rb") as stream:
@@ -96,9 +101,9 @@ def is_darknet(path: Path) -> bool:
 
 
 def read_darknet(path: Path, expected: Sequence[int]) -> DarknetFile:
-    """Read a file that holds one of the `expected` numbers of floats; checks its size before reading.
+    """Read a file whose number of floats is one of `expected`; checks the size before reading.
 
-    Raises UserError if it is missing, has another size, or holds a number that is not finite.
+    Raises UserError if the file is missing, has another size, or holds a number that is not finite.
     """
     if not path.is_file():
         raise UserError(path, "weights", "no such file", "darknet53.conv.74 or yolov3.weights")
@@ -127,7 +132,7 @@ def write_darknet(path: Path, content: DarknetFile) -> None:
 
 @torch.no_grad()
 def fill_slots(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
-    """Copy the first floats of a file into a network; output layers with another number of channels are not changed.
+    """Copy the first floats of a file into a network. Output layers with a different number of channels stay unchanged.
 
     Raises UserError (`path` is for its message) and copies nothing if a variance is negative.
     """
@@ -166,7 +171,7 @@ def _backbone_blocks(backbone: AttentionDarknet53) -> list[Any]:
 
 
 def _numbered(blocks: Sequence[Any], filters: int = _FILTERS) -> list[Slot]:
-    """Slots of convolutions with batch norm (`conv_block`) and without (an output layer)."""
+    """Slots of convolutions with batch norm (`conv_block`) and without batch norm (output layers)."""
     slots = []
     for number, block in enumerate(blocks):
         if hasattr(block, "norm"):

@@ -8,7 +8,10 @@ from perilune_train.models.attention import AMPLITUDE, CBAM
 
 
 class FlightCBAM(nn.Module):
-    """CBAM in standard operations, the channel gate's linear layers as 1 x 1 convolutions. (N, C, H, W) to the same."""
+    """CBAM in standard operations: the linear layers of the channel gate become 1 x 1 convolutions.
+
+    Shape: (N, C, H, W) to (N, C, H, W).
+    """
 
     def __init__(self, cbam: CBAM):
         super().__init__()

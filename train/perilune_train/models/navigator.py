@@ -1,4 +1,4 @@
-"""Two networks over pairs of consecutive frames of a trajectory: their motion, or the pose at the later frame."""
+"""Two networks that estimate the motion between consecutive frames, or the pose at the later frame."""
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -11,20 +11,21 @@ from perilune_train.config import Attention
 from perilune_train.models.darknet import AttentionDarknet53, conv_block
 
 OUTPUTS = 9
-"""3 of the translation and 6 of the continuous rotation (see motion/geometry.py)."""
+"""Number of outputs: 3 for the translation and 6 for the continuous rotation (see motion/geometry.py)."""
 State = tuple[Tensor, Tensor]
 """Hidden and cell state of the LSTM, each (2 layers, batch, hidden)."""
 
 
 class Recurrent(nn.Module):
-    """Two LSTM layers (as in DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
+    """Two LSTM layers (as in DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9 values.
 
     The last linear layer starts at zero, so that an untrained network outputs the reference motion. With `summary`, a
-    linear layer to that number of values comes before the LSTM. `dropout` acts on the LSTM's input and output. `exact`
-    computes in float32 under autocast too: positions vary over hundreds of metres, of which bfloat16 resolves a 256th.
+    linear layer to `summary` values comes before the LSTM. `dropout` acts on the LSTM's input and output. With `exact`,
+    the layers compute in float32 even under autocast, because positions vary over hundreds of metres and bfloat16
+    resolves only 1/256 of that.
 
-    Shape: features (batch, pairs, inputs) to (batch, pairs, 9) and the state after the last pair. `state` is that after
-    the pair before the first; None at the start of a trajectory.
+    Shape: features (batch, pairs, inputs) to (batch, pairs, 9) and the LSTM's state after the last pair. The argument
+    `state` is the LSTM's state before the first pair; None at the start of a trajectory.
     """
 
     def __init__(self, inputs: int, hidden: int, summary: int | None = None, dropout: float = 0.0, exact: bool = False):
@@ -42,11 +43,11 @@ class Recurrent(nn.Module):
             return self.over_time(self.summary(features), state)
 
     def precision(self, values: Tensor) -> AbstractContextManager:
-        """Float32 if the layers are exact, otherwise as the caller computes."""
+        """Context in which the layers compute: float32 if they are exact, otherwise the caller's precision."""
         return torch.autocast(values.device.type, enabled=False) if self.exact else nullcontext()
 
     def over_time(self, summaries: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        """`forward` from the outputs of `summary`, each of which depends on one pair only."""
+        """Run `forward` without the layer `summary`, from the outputs of this layer (batch, pairs, values)."""
         with self.precision(summaries):
             hidden, state = self.lstm(self.dropout(summaries), state)
             return self.output(self.dropout(hidden)).float(), state
@@ -54,18 +55,17 @@ class Recurrent(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class StackOptions:
-    """Deviations of a stack network from the paper's."""
+    """Options by which a stack network can differ from the paper's network."""
 
     pool: int = 1
-    """Cells along each side of a grid over each frame: features are averaged over each cell, and a linear layer to at
-    most `StackNavigator.SUMMARY` values follows. 1 averages over both frames, without a linear layer."""
+    """Number of cells along each side of a grid over each frame. Features are averaged over each cell, then a linear
+    layer reduces them to at most `StackNavigator.SUMMARY` values. 1: average over both frames, no linear layer."""
     stages: int = 5
     """Stages of the backbone."""
     dropout: float = 0.0
-    """Share of the LSTM's inputs and outputs that a training step sets to 0."""
+    """Fraction of the LSTM's inputs and outputs that a training step sets to 0."""
     standardised: bool = False
-    """Whether to subtract the mean of each feature over the training pairs and divide by its spread; `measure` sets
-    both."""
+    """Whether to standardise each feature by its mean and spread over the training pairs; `measure` computes them."""
 
 
 AS_PAPER = StackOptions()
@@ -73,14 +73,14 @@ AS_PAPER = StackOptions()
 
 
 class StackNavigator(nn.Module):
-    """The paper's network: the pair stacked in height, attention-Darknet53, global average pool, LSTM.
+    """The paper's network: two frames stacked in height, attention-Darknet53, global average pool, LSTM.
 
     Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9) and the state of
     the LSTM.
     """
 
     SUMMARY = 512
-    """Largest number of inputs of the LSTM behind a grid of cells."""
+    """Largest number of inputs of the LSTM if the features come from a grid of cells."""
     feature_mean: Tensor
     feature_spread: Tensor
 
@@ -112,19 +112,19 @@ class StackNavigator(nn.Module):
         """The backbone's last features, averaged over the pair or over each cell (batch, pairs, inputs)."""
         features = self.backbone(self.stacked(first, second))[-1]
         grid = (1, 1) if self.pool == 1 else (2 * self.pool, self.pool)
-        # An average has more digits than the bfloat16 of the features.
+        # Average in float32, because bfloat16, the type of the features, is too coarse for an average.
         return cell_means(features.float(), *grid).flatten(1).unflatten(0, first.shape[:2])
 
     def features(self, first: Tensor, second: Tensor) -> Tensor:
-        """The recurrent part's input (batch, pairs, inputs)."""
+        """The input of the recurrent part (batch, pairs, inputs)."""
         return self.scaled(self.pooled(first, second))
 
     def scaled(self, pooled: Tensor) -> Tensor:
-        """Averages (..., inputs), standardised if the network is."""
+        """Averages (..., inputs), standardised if the network has this option."""
         return (pooled - self.feature_mean) / self.feature_spread if self.standardised else pooled
 
     def measure(self, pooled: Tensor) -> None:
-        """Standardise features by the mean and spread of the averages (pairs, inputs) of training pairs."""
+        """Set the mean and spread for standardising from the averages (pairs, inputs) of training pairs."""
         spread = pooled.std(0)
         self.feature_mean.copy_(pooled.mean(0))
         # Features that hardly vary would otherwise be amplified without limit.
@@ -141,22 +141,22 @@ def cell_means(features: Tensor, rows: int, columns: int) -> Tensor:
     height, width = (int(size) for size in features.shape[2:])
     if height % rows or width % columns:
         return functional.adaptive_avg_pool2d(features, (rows, columns))
-    # Unlike adaptive pooling, the gradient of this is deterministic on a GPU.
+    # Unlike adaptive pooling, this has a deterministic gradient on a GPU.
     return features.unflatten(3, (columns, -1)).unflatten(2, (rows, -1)).mean((3, 5))
 
 
 class WarpNavigator(nn.Module):
-    """Network for pairs stacked in channels, the later frame warped onto the earlier one by the nominal motion.
+    """Network for two frames stacked in channels; the later frame is warped onto the earlier one by the nominal motion.
 
     The channels are both frames and, at three levels of blur, the local shift between them (`local_shift`, Lucas &
     Kanade). Without the shift, training needs hundreds of steps to learn the product of brightness change and gradient.
-    The backbone ends at stride 8. A head estimates, for every cell of that grid, the residual flow after the nominal
-    motion and its weight, from the features and the mean local shifts. A least-squares fit with a prior gives the
-    motion that explains the flow over the ground plane. The LSTM's output is added as a correction.
+    The backbone ends at stride 8. From the features and the mean local shifts, a head estimates the residual flow after
+    the nominal motion, and the weight of this flow, for every cell of the feature map. A least-squares fit with a prior
+    gives the motion that explains the flow over the ground plane. The LSTM's output is added as a correction.
 
-    Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
-    pairs) in metres, to the motion (batch, pairs, 9) in the units of motion/network.py, the flow (batch, pairs,
-    height / 8, width / 8, 2), pixels, and the LSTM's state.
+    Inputs: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
+    pairs) in metres. Outputs: the motion (batch, pairs, 9) in the units of motion/network.py, the flow (batch, pairs,
+    height / 8, width / 8, 2) in pixels, and the LSTM's state.
     """
 
     BLURS_PX = (3, 5, 9)
@@ -210,7 +210,7 @@ class WarpNavigator(nn.Module):
         return motion + correction, flow_px.unflatten(0, first.shape[:2]), state
 
     def flow(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features (N, channels, h, w), flows (N, h, w, 2), pixels, and their weights (N, h, w) of all N pairs."""
+        """Features (N, channels, h, w), flows (N, h, w, 2) in pixels, and flow weights (N, h, w) of all N pairs."""
         stacked = self.stacked(first, second)
         features = self.mix(self.backbone(stacked)[-1])
         with torch.autocast(features.device.type, enabled=False):
@@ -221,8 +221,8 @@ class WarpNavigator(nn.Module):
     def information(self, first: Tensor, second: Tensor, altitude_m: Tensor) -> Tensor:
         """Inverse covariance of translation and rotation vector, in units of their spreads (batch, pairs, 6, 6).
 
-        It comes from the flows alone, without the prior, for independent flows whose variances are 1 / weight
-        times the mean weighted square of their residuals.
+        It is computed from the flows alone, without the prior. The flows are assumed to be independent, and the
+        variance of each is 1 / weight times the mean weighted square of the residuals.
         """
         _, flow_px, weight = self.flow(first, second)
         altitude, width_px = altitude_m.flatten(), int(first.shape[-1])
@@ -234,11 +234,11 @@ class WarpNavigator(nn.Module):
         return (from_flows / residual[:, None, None]).unflatten(0, first.shape[:2])
 
     def equations(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> tuple[Tensor, Tensor]:
-        """Equations (N, 6, 6) and (N, 6) of translation and rotation vector, in units of their spreads.
+        """Normal equations (N, 6, 6), (N, 6) for translation and rotation vector, in units of their spreads.
 
-        They minimise the sum of weight |J m - flow|^2 and prior |m|^2 over flows (N, h, w, 2), weights (N, h, w) in
-        1 / px^2, at altitudes (N,) in metres. The prior decides between tilt and sideways shift, which look alike from
-        above.
+        Their solution m minimises the sum of weight |J m - flow|^2 over all flows, plus prior |m|^2. Flows are
+        (N, h, w, 2) in pixels, weights (N, h, w) in 1 / px^2, altitudes (N,) in metres. The prior decides between tilt
+        and sideways shift, which look alike from above.
         """
         jacobian = self.jacobian(flow_px, altitude_m, width_px)
         weighted = jacobian * weight[..., None, None]
@@ -249,26 +249,29 @@ class WarpNavigator(nn.Module):
         return normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px)
 
     def jacobian(self, flow_px: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
-        """Derivatives (N, h, w, 2, 6) of flows by translation and rotation vector, in units of their spreads.
+        """Derivatives (N, h, w, 2, 6) of flows with respect to the motion.
 
-        It is the flow of a plane perpendicular to the
-        view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), to first order in the motion; it neglects the
-        nominal step compared with the altitude.
+        The motion is translation and rotation vector, in units of their spreads. The model is the flow of a plane
+        perpendicular to the view, to first order in the motion (Longuet-Higgins & Prazdny 1980, doi
+        10.1098/rspb.1980.0057). It neglects the nominal step compared with the altitude.
         """
         focal_px = self.focal_over_width * width_px
         over_altitude = torch.stack([1 / altitude_m] * 3 + [torch.ones_like(altitude_m)] * 3, dim=-1)
         unit = focal_px * self.unit * over_altitude
-        # `int`: an exporter would take sizes for part of the graph.
+        # Convert to `int`, because an exporter would make the sizes part of the graph.
         rows, columns = (int(size) for size in flow_px.shape[1:3])
         return self.plane_flow(rows, columns, width_px) * unit[:, None, None, None]
 
     def solved(self, normal: Tensor, right: Tensor) -> Tensor:
-        """Solutions (N, 6) of equations (N, 6, 6), (N, 6). An export without this operator replaces it."""
-        # `solve` would make the process wait for the GPU, to find singular matrices, which the prior excludes.
+        """Solutions (N, 6) of equations (N, 6, 6), (N, 6). Exports to formats without this operator replace it."""
+        # `solve` looks for singular matrices and so makes the process wait for the GPU. The prior excludes them.
         return torch.linalg.solve_ex(normal, right)[0]
 
     def plane_flow(self, rows: int, columns: int, width_px: int) -> Tensor:
-        """Derivatives (rows, columns, 2, 6) of flow / focal length by translation / altitude and by rotation vector."""
+        """Derivatives (rows, columns, 2, 6) of flow / focal length with respect to the motion.
+
+        The motion is translation / altitude, then the rotation vector.
+        """
         focal = self.focal_over_width * width_px / self.STRIDE
         x = ((torch.arange(columns, device=self.unit.device) + 0.5 - columns / 2) / focal).expand(rows, columns)
         y = ((torch.arange(rows, device=self.unit.device) + 0.5 - rows / 2) / focal)[:, None].expand(rows, columns)
@@ -279,7 +282,7 @@ class WarpNavigator(nn.Module):
 
 
 def blurred(images: Tensor, size_px: int) -> Tensor:
-    """Box blur: means over squares `size_px` wide (odd) of images (N, C, H, W), cropped at the edge."""
+    """Box blur of images (N, C, H, W): means over squares of `size_px` (odd), which are cropped at the edge."""
     half = size_px // 2
     rows = functional.avg_pool2d(images, (size_px, 1), stride=1, padding=(half, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, size_px), stride=1, padding=(0, half), count_include_pad=False)
@@ -295,11 +298,11 @@ def slope(images: Tensor, dim: int) -> Tensor:
 
 
 def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
-    """Shift from the first to the second of two images (N, 2, H, W): (N, 2, H, W), pixels along x and y.
+    """Shift (N, 2, H, W) from the first to the second of two images (N, 2, H, W), in pixels along x and y.
 
     For a square window around each pixel, one least-squares step (Lucas & Kanade 1981) explains the change of
-    brightness by the gradient. It is damped where gradients are small. Valid for shifts below the width of the images'
-    finest features.
+    brightness by the gradient. The step is damped where gradients are small. The result is valid for shifts smaller
+    than the finest features of the images.
     """
     mean = pair.mean(1, keepdim=True)
     grad_y, grad_x = slope(mean, 2), slope(mean, 3)

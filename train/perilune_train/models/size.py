@@ -10,10 +10,10 @@ from torch.utils.flop_counter import FlopCounterMode
 def multiply_adds(network: nn.Module, shape: tuple[int, ...]) -> int:
     """Number of multiply-adds of all convolutions and matrix products, for an input of this shape.
 
-    Half of torch's count of floating-point operations. It leaves out biases, norms, activations, products of gates and
-    pooling, as usual.
+    It is half of torch's count of floating-point operations. As usual, the count leaves out biases, norms, activations,
+    products of gates and pooling.
     """
-    # On torch's `meta` device shapes are propagated and nothing is computed.
+    # On torch's `meta` device only shapes are computed.
     on_meta = copy.deepcopy(network).to("meta").eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         on_meta(torch.empty(shape, device="meta"))

@@ -23,9 +23,9 @@ class YOLOv3(nn.Module):
 
     A cell predicts, for each of its 3 anchors, raw numbers (t_x, t_y, t_w, t_h, t_o); `decode` converts them to boxes.
 
-    Deviations from the original: no class outputs (craters are the only class, so objectness is the score). The heads
-    may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than 6 px; then the neck
-    still starts at stride 32, with one 1 x 1 convolution. `width` scales the neck too.
+    Deviations from the original: There are no class outputs, because craters are the only class; the score is the
+    objectness. The heads may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than
+    6 px. The neck then still starts at stride 32, with one 1 x 1 convolution. `width` scales the neck too.
     """
 
     anchors: Tensor
@@ -38,7 +38,7 @@ class YOLOv3(nn.Module):
         attention: Attention = "none",
         strides: Sequence[int] = (8, 16, 32),
     ):
-        """Anchors are (3, 3, 2), width and height in pixels, finest stride first; None if loaded later."""
+        """`anchors` (3, 3, 2) are widths and heights in pixels, finest stride first; None if they are loaded later."""
         super().__init__()
         if tuple(strides) not in ((8, 16, 32), (4, 8, 16)):
             raise ValueError(f"strides are {tuple(strides)}, not (8, 16, 32) or (4, 8, 16)")
@@ -67,9 +67,9 @@ class YOLOv3(nn.Module):
                 self.laterals[str(stride)] = nn.Sequential(conv_block(inputs, above, 1), nn.Upsample(scale_factor=2))
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """Images (N, in_channels, H, W) to raw outputs (N, 3 anchors, h, w, 5) in float32, finest stride first.
+        """Convert images (N, in_channels, H, W) to raw outputs (N, 3 anchors, h, w, 5) in float32, finest stride first.
 
-        H and W are multiples of 32.
+        H and W must be multiples of 32.
         """
         return self._outputs(self.backbone(images))
 
@@ -96,7 +96,10 @@ class YOLOv3(nn.Module):
 
     @torch.no_grad()
     def detect(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Boxes (N, K, 4) as x0, y0, x1, y1 in pixels and scores (N, K) of all K predictors, before suppression."""
+        """Boxes (N, K, 4) and scores (N, K) of all K predictors, before non-maximum suppression.
+
+        A box is x0, y0, x1, y1 in pixels.
+        """
         boxes, scores = [], []
         for raw, anchors, stride in zip(self(images), self.anchors, self.strides, strict=True):
             boxes.append(decode_grid(raw, anchors, stride).flatten(1, 3))
@@ -105,7 +108,7 @@ class YOLOv3(nn.Module):
 
 
 def _output(channels: int) -> nn.Conv2d:
-    """Last layer of a head; its initial boxes are the anchors, its initial objectness is the prior."""
+    """Last layer of a head. Its initial boxes are the anchors; its initial objectness is `_PRIOR`."""
     layer = nn.Conv2d(channels, ANCHORS_PER_SCALE * OUTPUTS, 1)
     nn.init.normal_(layer.weight, std=0.01)
     bias = torch.zeros(ANCHORS_PER_SCALE, OUTPUTS)
@@ -115,12 +118,12 @@ def _output(channels: int) -> nn.Conv2d:
 
 
 def decode(raw: Tensor, cells: Tensor, anchors: Tensor, stride: int) -> Tensor:
-    """Boxes (..., 4) as x0, y0, x1, y1 in pixels of raw outputs (..., 4 or more).
+    """Convert raw outputs (..., 4 or more) to boxes (..., 4), x0, y0, x1, y1 in pixels.
 
-    `cells` (..., 2) are column and row of the predicting cell, `anchors` (..., 2) width and height in pixels. Centre:
-    (cell + 2 s(t) - 0.5) stride with the sigmoid s; size: anchor exp(t). Deviation from YOLOv3, which has only s(t):
-    the centre can be up to half a cell outside the cell, because neighbouring cells are trained on a crater too
-    (detect/data/assign.py).
+    `cells` (..., 2) are column and row of the predicting cell, `anchors` (..., 2) width and height in pixels. The
+    centre is (cell + 2 s(t) - 0.5) stride with the sigmoid s; the size is anchor exp(t). YOLOv3 has cell + s(t)
+    instead. Here the centre can be up to half a cell outside the cell, because neighbouring cells are also trained on
+    a crater (detect/data/assign.py).
     """
     centre = (cells + 2 * raw[..., :2].sigmoid() - 0.5) * stride
     half = anchors * raw[..., 2:4].clamp(-_MAX_LOG_SCALE, _MAX_LOG_SCALE).exp() / 2
@@ -128,7 +131,7 @@ def decode(raw: Tensor, cells: Tensor, anchors: Tensor, stride: int) -> Tensor:
 
 
 def decode_grid(raw: Tensor, anchors: Tensor, stride: int) -> Tensor:
-    """Boxes (N, 3, h, w, 4) of one scale's raw outputs (N, 3, h, w, 5) with its anchors (3, 2)."""
+    """Convert the raw outputs (N, 3, h, w, 5) of one scale, with anchors (3, 2), to boxes (N, 3, h, w, 4)."""
     h, w = raw.shape[2:4]
     rows, columns = torch.meshgrid(
         torch.arange(h, device=raw.device), torch.arange(w, device=raw.device), indexing="ij"

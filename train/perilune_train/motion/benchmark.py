@@ -1,4 +1,7 @@
-"""Score a navigator on the locked benchmark: all methods by region, altitude and Sun, with intervals over scenes."""
+"""Score a navigator and the other methods on the locked benchmark, by region, altitude and Sun elevation.
+
+Intervals are over scenes.
+"""
 
 import itertools
 from dataclasses import replace
@@ -26,7 +29,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
 HEADLINE = "position_rmse_vector_m"
-"""The least favourable RMSE of position: over lengths of the error vector, not over components."""
+"""The strictest RMSE of position: over lengths of the error vector, not over components."""
 _COLUMNS = {
     HEADLINE: "position RMSE, vector (m)",
     "position_rmse_per_component_m": "per component (m)",
@@ -36,16 +39,16 @@ _COLUMNS = {
     "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is correct)",
 }
 _OF_BINS = tuple(_COLUMNS)[:3]
-"""Figures that are also computed by region, altitude and Sun."""
+"""Figures that are also computed by region, altitude and Sun elevation."""
 _ALTITUDES_M = (200, 500, 1000, 1600)
 _SUNS_DEG = (0, 15, 30, 45, 60, 90)
 
 
 def score_navigator(run: Path, data: Address, manifests: Address, out: Path, allow_overlap: bool = False) -> Metrics:
-    """Score a run's best weights, the classical methods and the nominal motion, and return the figures.
+    """Score a run's best weights, the classical methods and the nominal motion; return the figures.
 
-    Writes page, figures, tables and pictures. Raises UserError if the benchmark is missing or changed, or if the
-    network was fitted to its terrain, unless `allow_overlap`.
+    Writes the page, figures, tables and pictures. Raises UserError if the benchmark is missing or was changed. Unless
+    `allow_overlap`, also raises it if the network was fitted to terrain of the benchmark.
     """
     parts = open_parts("nav", data, manifests)
     best = RunFolder(run).best
@@ -87,7 +90,7 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
 
 
 def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str, float]]:
-    """All trajectories, with the part in the scene's name; region and Sun (degrees) of each scene."""
+    """All trajectories, and region and Sun elevation (degrees) of each scene. Scene names contain the part."""
     trajectories, regions, suns = [], {}, {}
     for part in parts:
         for row in part.dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist():
@@ -99,7 +102,11 @@ def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str
 
 
 def _figures(errors: dict[str, pd.DataFrame], regions: dict[str, str], suns: dict[str, float]) -> Metrics:
-    """Flat keys: <method>/<figure>, <method>/region/<name>/..., <method>/altitude/<bin>/..., <method>/sun/<bin>/..."""
+    """Flat figures by method, and by method and region, altitude_m or sun_deg.
+
+    Keys: <method>/<figure>, <method>/region/<name>/<figure>, <method>/altitude_m/<bin>/<figure>,
+    <method>/sun_deg/<bin>/<figure>.
+    """
     figures: Metrics = {}
     for method, pairs in errors.items():
         figures |= {f"{method}/{key}": value for key, value in summary(pairs).items()}

@@ -1,8 +1,9 @@
-"""The covariance that a warp network states for its motions.
+"""Calibrated covariance of the motions that a warp network estimates.
 
-The network fits a motion to flows, with weights and a prior of its own, so the fit has a covariance. By itself it is
-wrong: weights of neighbouring cells are not independent, the ground is not a plane, and the recurrent part corrects the
-fit. So five numbers are fitted to the errors on validation descents, by maximum likelihood.
+The network fits a motion to flows, with learnt weights and a prior, so the fit gives a covariance. This covariance is
+wrong without a correction: flows of neighbouring cells are not independent, the ground is not a plane, and the
+recurrent part changes the fitted motion. Five numbers correct it; they are fitted to the errors on validation
+descents by maximum likelihood.
 """
 
 import json
@@ -26,26 +27,26 @@ from perilune_train.motion.network import Collate, Scales, predict
 
 FILE = "covariance.json"
 NAMES = ("flow", "flow_by_altitude", "prior", "turn", "along")
-"""Logarithms of: the factor on the information of the flows; its growth with the logarithm of the altitude over 1000 m;
-the factor on the prior; the factors on the standard deviations of the rotation about z and of the translation along
-z."""
+"""Names of the five numbers, which are logarithms. flow: factor on the information of the flows. flow_by_altitude:
+growth of this factor with the logarithm of altitude / 1000 m. prior: factor on the prior. turn, along: factors on the
+standard deviations of the rotation about z and of the translation along z."""
 _ALTITUDE_M, _LARGEST = 1000.0, 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class MotionInformation:
-    """Information on the motions of one trajectory of n frames, from a network's flows and its prior."""
+    """Inverse covariances of the motions of one trajectory of n frames, from a network's flows and prior."""
 
     information: Array
-    """Information of the flows (n - 1, 6, 6), without factors: turn, radians, and shift, metres, as in
+    """Information of the flows (n - 1, 6, 6), before correction, on turn (radians) and shift (metres) as in
     `EstimatedMotion`."""
     prior: Array
-    """Inverse variances of the network's own prior (6,)."""
+    """Inverse variances of the network's prior (6,)."""
     altitude_m: Array
     """Nominal altitudes (n - 1,)."""
 
     def covariance(self, numbers: Sequence[float] | Array) -> Array:
-        """Covariances (n - 1, 6, 6), with the five numbers of `NAMES`."""
+        """Covariances (n - 1, 6, 6), corrected by the five numbers of `NAMES`."""
         flow, by_altitude, prior, turn, along = numbers
         factor = np.exp(flow + by_altitude * np.log(self.altitude_m / _ALTITUDE_M))
         inverse = factor[:, None, None] * self.information + np.exp(prior) * np.diag(self.prior)
@@ -54,7 +55,7 @@ class MotionInformation:
 
 
 def information_of(network: WarpNavigator, architecture: dict[str, Any], trajectory: Trajectory) -> MotionInformation:
-    """Information on the motions of a trajectory, from the flows and the prior of a warp network."""
+    """Compute the information on the motions of a trajectory from the flows and the prior of a warp network."""
     shrunk, scales = trajectory.shrunk(architecture["size_px"]), Scales(**architecture["scales"])
     network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=True)
@@ -62,7 +63,8 @@ def information_of(network: WarpNavigator, architecture: dict[str, Any], traject
     with torch.no_grad():
         information = network.information(batch.first, batch.second, batch.altitude_m)[0].cpu().double().numpy()
         prior = network.log_prior.exp().cpu().double().numpy()
-    # The turn leads from the estimate to the truth, the shift from the truth to the estimate (`EstimatedMotion`).
+    # The signs differ: the turn is from the estimate to the truth, the shift from the truth to the estimate
+    # (`EstimatedMotion`).
     unit = np.array([*scales.spread_m, *[-scales.rotation_rad] * 3])
     order = np.r_[3:6, 0:3]
     arranged = (information / unit[:, None] / unit)[:, order][:, :, order]
@@ -70,7 +72,7 @@ def information_of(network: WarpNavigator, architecture: dict[str, Any], traject
 
 
 def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
-    """The five numbers that make the errors of these motions most likely under a Gaussian distribution."""
+    """Fit the five numbers by maximum likelihood, with Gaussian errors of these motions."""
     errors = np.concatenate(
         [signed_errors(trajectory, motion) for trajectory, motion in zip(trajectories, motions, strict=True)]
     )
@@ -80,7 +82,7 @@ def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], 
         squared = np.einsum("ni,ni->n", errors, np.linalg.solve(stated, errors[:, :, None])[:, :, 0])
         return float(np.mean(np.linalg.slogdet(stated)[1] + squared))
 
-    # Bounds, since the flows of a barely trained network carry no information.
+    # Bound the numbers, since the flows of a barely trained network carry no information.
     start, bounds = np.array([-4.0, 0.0, 0.0, 0.0, 0.0]), [(-_LARGEST, _LARGEST)] * len(NAMES)
     options = {"maxfev": 4000, "maxiter": 4000}
     return minimize(cost, start, method="Nelder-Mead", bounds=bounds, options=options).x.tolist()
@@ -89,7 +91,7 @@ def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], 
 def calibrate(
     folder: Path, network: WarpNavigator, architecture: dict[str, Any], trajectories: list[Trajectory]
 ) -> None:
-    """Fit the five numbers to validation trajectories, and write covariance.json to a run's folder."""
+    """Fit the five numbers to validation trajectories and write covariance.json into a run's folder."""
     motions = [predict(network, architecture, trajectory) for trajectory in trajectories]
     numbers = fit_numbers(
         [information_of(network, architecture, trajectory) for trajectory in trajectories], trajectories, motions
@@ -104,7 +106,7 @@ def write_numbers(folder: Path, numbers: list[float], n_pairs: int) -> None:
 
 
 def read_numbers(folder: Path) -> list[float] | None:
-    """The five numbers of a run, or None. Raises UserError if the file is damaged."""
+    """The five numbers of a run; None if it has no covariance.json. Raises UserError if the file is damaged."""
     path = folder / FILE
     if not path.is_file():
         return None
@@ -120,7 +122,7 @@ def read_numbers(folder: Path) -> list[float] | None:
 def stated_covariances(
     folder: Path, network: Any, architecture: dict[str, Any], trajectories: list[Trajectory]
 ) -> list[Array] | None:
-    """Covariances of a run's motions over trajectories, as in `EstimatedMotion`; None if the run states none."""
+    """Covariances of a run's motions in each trajectory, as in `EstimatedMotion`; None without covariance.json."""
     numbers = read_numbers(folder)
     if numbers is None or not isinstance(network, WarpNavigator):
         return None

@@ -1,8 +1,8 @@
-"""Relative poses of a moving camera, the ground plane's homography, and dead reckoning.
+"""Relative poses of a moving camera, homographies of the ground plane, and dead reckoning.
 
 The motion from frame 1 to frame 2 is given in O_C of frame 1: `translation_m` = R1 (p2 - p1) and
 `rotation_c2_from_c1` = R2 R1^T, with R = rotation_camera_from_site and p = position_m in O_L.
-A point X1 of camera 1 is X2 = rotation_c2_from_c1 (X1 - translation_m) in camera 2.
+A point X1 in O_C of frame 1 has the coordinates X2 = rotation_c2_from_c1 (X1 - translation_m) in O_C of frame 2.
 """
 
 import numpy as np
@@ -46,10 +46,11 @@ def plane_homography(
     plane_normal_c1: ArrayLike,
     plane_distance_m: float,
 ) -> Array:
-    """Homography (3, 3) from image coordinates of frame 1 to those of frame 2 over a plane.
+    """Homography (3, 3) of a plane, from image coordinates of frame 1 to image coordinates of frame 2.
 
-    The plane is all X1 with plane_normal_c1 . X1 = plane_distance_m: for the ground, the downward unit vector in
-    O_C of frame 1 and the altitude. H = K R (I - t n^T / d) K^-1 (Hartley & Zisserman, 2nd ed., section 13.1).
+    The plane contains all points X1 with plane_normal_c1 . X1 = plane_distance_m. For the ground these are the downward
+    unit vector in O_C of frame 1 and the altitude. H = K R (I - t n^T / d) K^-1 (Hartley & Zisserman, 2nd ed., section
+    13.1).
     """
     k, t, n = (np.asarray(values, np.float64) for values in (camera_matrix, translation_m, plane_normal_c1))
     induced = np.eye(3) - np.outer(t, n) / plane_distance_m
@@ -57,9 +58,10 @@ def plane_homography(
 
 
 def ground_homography(camera_matrix: ArrayLike, position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> Array:
-    """Homographies (n, 3, 3) from points (x, y, 1), metres, of the ground plane z = 0 of O_L to image coordinates.
+    """Homographies (n, 3, 3) from points (x, y, 1) of the ground plane to image coordinates.
 
-    The camera at position_m (n, 3) with rotation_camera_from_site (n, 3, 3) sees X in O_C at R (X - p).
+    x and y are in metres; the plane is z = 0 in O_L. A camera at p = position_m (n, 3) with
+    R = rotation_camera_from_site (n, 3, 3) sees a point X at R (X - p) in O_C.
     """
     p, r = np.asarray(position_m, np.float64), np.asarray(rotation_camera_from_site, np.float64)
     offset = -np.einsum("nij,nj->ni", r, p)
@@ -67,7 +69,7 @@ def ground_homography(camera_matrix: ArrayLike, position_m: ArrayLike, rotation_
 
 
 def pixel_index_homography(homography: ArrayLike) -> Array:
-    """The homography (3, 3) in OpenCV's coordinates, which are 0 instead of 0.5 at the centre of the first pixel."""
+    """Convert a homography (3, 3) to OpenCV's coordinates: the centre of the first pixel is at 0 instead of 0.5."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     return np.linalg.inv(shift) @ np.asarray(homography) @ shift
 

@@ -1,4 +1,4 @@
-"""The navigation networks: build, load, batches of their input, and motions from their nine outputs."""
+"""Build and load navigation networks, make batches of their input, and convert their nine outputs to motions."""
 
 import time
 from collections.abc import Callable
@@ -25,23 +25,25 @@ Fusion = Literal["warp", "stack"]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """Scales that convert a network's standardised output to a motion, or to a pose (motion/pose.py).
+    """Scales that convert a network's standardised output y to a motion, or to a pose (motion/pose.py).
 
-    stack: translation = mean_m + spread_m * y. warp: translation = nominal + spread_m * y. Both: rotation_c2_from_c1 =
-    the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the nominal motion has no
-    rotation. pose: position = mean_m + spread_m * y, and the rotation from the mean attitude to the attitude likewise.
+    Translation of stack: mean_m + spread_m * y. Translation of warp: nominal translation + spread_m * y. For both,
+    rotation_c2_from_c1 is the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the
+    nominal motion has no rotation. Position of a pose: mean_m + spread_m * y. The rotation from the mean attitude to
+    the attitude of a pose is computed as for motions.
     """
 
     mean_m: list[float]
-    """Mean translation of the training set, metres, O_C of the earlier frame (3,); zeros for warp. pose: mean position,
-    O_L."""
+    """Mean translation of the training set, metres, O_C of the earlier frame (3,); zeros for warp. For poses: mean
+    position, O_L."""
     spread_m: list[float]
-    """Standard deviation of the translation about the mean (stack) or the nominal one (warp), metres (3,). pose: of the
-    position."""
+    """Standard deviation of the translation from the mean (stack) or from the nominal translation (warp), metres (3,).
+    For poses: standard deviation of the position."""
     rotation_rad: float
-    """Root mean square of a motion's rotation about one axis, radians. pose: of the attitude about the mean one."""
+    """Root mean square of a motion's rotation about one axis, radians. For poses: of the rotation from the mean
+    attitude."""
     mean_rotation: list[list[float]] | None = None
-    """pose: mean rotation_camera_from_site of the training set (3, 3)."""
+    """For poses: mean rotation_camera_from_site of the training set (3, 3)."""
 
     @classmethod
     def measured(cls, trajectories: list[Trajectory], fusion: Fusion, target: Target = "motion") -> "Scales":
@@ -60,7 +62,7 @@ class Scales:
             return cls(translation.mean(0).tolist(), np.maximum(translation.std(0), 1e-3).tolist(), rotation_rad)
         residual = translation - np.concatenate([trajectory.nominal_motion[0] for trajectory in trajectories])
         across, along = np.sqrt(np.mean(residual[:, :2] ** 2)), np.sqrt(np.mean(residual[:, 2] ** 2))
-        # x and y have one number, because mirroring a pair may exchange them.
+        # x and y share one spread, because mirroring a pair may exchange them.
         return cls([0.0] * 3, [max(float(value), 1e-3) for value in (across, across, along)], rotation_rad)
 
 
@@ -73,7 +75,7 @@ def build(architecture: dict[str, Any]) -> StackNavigator | WarpNavigator:
             a["width"],
             a["attention"],
             a["hidden"],
-            # Checkpoints of older versions have none of these.
+            # Checkpoints of older versions lack these settings.
             StackOptions(a.get("pool", 1), a.get("stages", 5), a.get("dropout", 0.0), target_of(a) == "pose"),
         )
     scales = a["scales"]
@@ -95,7 +97,7 @@ def check_motion(path: Path, architecture: dict[str, Any]) -> None:
 
 
 def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
-    """Load a trained network and its architecture. Raises UserError if the file is of another network."""
+    """Load a trained network and its architecture. Raises UserError if the file has another kind of network."""
     content = load_weights(path)
     architecture = content["architecture"]
     check_architecture(path, architecture, {"fusion": fusion})
@@ -108,42 +110,42 @@ def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Batch:
-    """Sequences of equal length as tensors, with what the network should output for them."""
+    """Sequences of equal length as tensors: the input of the network and the true output."""
 
     first: Tensor
     """Earlier frames, normalised (batch, pairs, height, width)."""
     second: Tensor
-    """Later frames, for warp resampled onto the earlier ones (batch, pairs, height, width)."""
+    """Later frames, normalised (batch, pairs, height, width); for warp they are resampled onto the earlier frames."""
     altitude_m: Tensor
     """Nominal altitudes, metres (batch, pairs)."""
     translation: Tensor
-    """True translations in the network's units, see Scales (batch, pairs, 3)."""
+    """True translations in the network's units (`Scales`) (batch, pairs, 3)."""
     angles: Tensor
     """True rotations as Euler angles, divided by `rotation_rad` of Scales (batch, pairs, 3)."""
     flow_px: Tensor | None
-    """For warp: true flow, pixels (batch, pairs, height / 8, width / 8, 2)."""
+    """True flow, pixels (batch, pairs, height / 8, width / 8, 2); None for stack."""
 
     def pin_memory(self) -> "Batch":
-        """The batch in page-locked memory; a DataLoader calls this."""
+        """The batch in page-locked memory; the DataLoader calls this method."""
         return self.each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Batch":
-        """The batch on another device; from page-locked memory without waiting."""
+        """The batch on another device. The copy from page-locked memory is asynchronous."""
         return self.each(lambda part: part.to(device, non_blocking=True))
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Batch":
-        """The batch with each tensor changed."""
+        """The batch with `change` applied to each tensor."""
         return replace(self, **{name: change(part) for name, part in vars(self).items() if part is not None})
 
 
 @dataclass(frozen=True)
 class Collate:
-    """Makes a batch of sequences. A class, so that `spawn` can pickle it."""
+    """Makes a batch from sequences. It is a class so that `spawn` can pickle it."""
 
     scales: Scales
     """Scales of the network."""
     fusion: Fusion
-    """Which network."""
+    """The kind of network."""
 
     def __call__(self, sequences: list[Sequence]) -> Batch:
         reference, unit = translation_units(sequences, self.scales, self.fusion)
@@ -162,9 +164,9 @@ class Collate:
 def predict(
     network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory, features: Tensor | None = None
 ) -> Motion:
-    """Motions of a whole trajectory, in one pass of the network in evaluation mode.
+    """Estimate the motions of a whole trajectory in one pass, with the network in evaluation mode.
 
-    `features` (pairs, channels) are the features of a stack network's backbone, if they are already computed.
+    `features` (pairs, channels) are the backbone's features of a stack network, if they are already computed.
     """
     shrunk = trajectory.shrunk(architecture["size_px"])
     motion, _ = _predicted(network, architecture, shrunk, range(shrunk.n_pairs), None, features)
@@ -172,9 +174,10 @@ def predict(
 
 
 def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Motion, float]:
-    """Motions of a trajectory, pair by pair with the LSTM's state carried, as in flight; and mean seconds per pair.
+    """Estimate the motions of a trajectory pair by pair, as in flight; return them and the mean seconds per pair.
 
-    The time is from frames in memory to the motion, without shrinking the frames.
+    The LSTM's state is passed from each pair to the next. The time is from frames in memory to the motion; it does not
+    include shrinking the frames.
     """
     shrunk, state = trajectory.shrunk(architecture["size_px"]), None
     translations, rotations = [], []
@@ -195,11 +198,11 @@ def _predicted(
     state: State | None,
     features: Tensor | None = None,
 ) -> tuple[Motion, State]:
-    """Motions of consecutive pairs of a shrunk trajectory, and the LSTM's state after them."""
+    """Motions of consecutive pairs of a shrunk trajectory, and the LSTM's state after the last one."""
     sequence = pair_sequence(shrunk, pairs.start, len(pairs), warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
     if architecture["fusion"] == "warp":
-        # Fit the motion with the camera of these frames, which may differ from the camera of the training.
+        # Fit the motion with the camera of these frames, which may differ from the camera used in training.
         network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     batch = Collate(scales, architecture["fusion"])([sequence]).to(next(network.parameters()).device)
     with torch.no_grad():
@@ -214,8 +217,10 @@ def _predicted(
 
 
 def network_output(network: nn.Module, batch: Batch, state: State | None = None) -> tuple[Tensor, Tensor | None, State]:
-    """Outputs (batch, pairs, 9); for warp also the flow (batch, pairs, height / 8, width / 8, 2); and the LSTM's
-    state."""
+    """Outputs (batch, pairs, 9), the flow, and the LSTM's state.
+
+    The flow is (batch, pairs, height / 8, width / 8, 2), pixels, for warp; None for stack.
+    """
     if isinstance(network, WarpNavigator):
         return network(batch.first, batch.second, batch.altitude_m, state)
     output, state = network(batch.first, batch.second, state)
@@ -230,12 +235,12 @@ def translation_units(sequences: list[Sequence], scales: Scales, fusion: Fusion)
 
 
 def decoded_rotation(output: Tensor, scales: Scales) -> Tensor:
-    """Rotations (..., 3, 3) of outputs (..., 9)."""
-    # The first two columns. `torch.tensor` would make the process wait for the GPU.
+    """Convert outputs (..., 9) to rotations (..., 3, 3)."""
+    # First two columns of the identity. Made on the device, because `torch.tensor` would wait for the GPU.
     identity = torch.eye(2, 3, device=output.device).flatten()
     return rotation_from_sixd(identity + scales.rotation_rad * output[..., 3:].float())
 
 
 def stacked(arrays: list[Array]) -> Tensor:
-    """Arrays of equal shape as one float32 tensor."""
+    """Stack arrays of equal shape into one float32 tensor."""
     return torch.from_numpy(np.stack(arrays)).float()

@@ -1,8 +1,8 @@
-"""Poses in O_L from a stack network: features of pairs, causal windows over a trajectory, pair by pair as in flight.
+"""Poses in O_L from a stack network: features of pairs, causal windows, and evaluation pair by pair as in flight.
 
-The network is trained on sequences of `sequence_pairs` pairs that start from the zero state of the LSTM. It is
-evaluated in the same way: the pose at each pair comes from the window of the last `sequence_pairs` pairs, which is
-shorter at the start.
+The network is trained on sequences of `sequence_pairs` pairs that start from the zero state of the LSTM. Evaluation
+does this too: the pose at each pair is computed from a window of the last `sequence_pairs` pairs. At the start of a
+trajectory the window is shorter.
 """
 
 import time
@@ -20,27 +20,28 @@ from perilune_train.motion.data.trajectories import Pose, Trajectory
 from perilune_train.motion.network import Scales, decoded_rotation
 
 _PAIRS = {"cpu": 16, "cuda": 32}
-"""Pairs that pass the backbone together, to bound memory. More on a GPU, which would otherwise wait for kernel
-launches."""
+"""Number of pairs that pass the backbone together, by device. It bounds the memory. A GPU takes more pairs, because it
+would otherwise wait for kernel launches."""
 
 
 def normalised_frames(frames: Tensor) -> Tensor:
-    """8-bit frames (..., height, width), normalised on their device as by `perilune_train.data.frames.normalised`."""
+    """Normalise 8-bit frames (..., height, width) on their device, like `perilune_train.data.frames.normalised`."""
     pixels = frames.float()
     deviation, mean = torch.std_mean(pixels, dim=(-2, -1), correction=0, keepdim=True)
     return (pixels - mean) / deviation.clamp(min=1.0)
 
 
 def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
-    """8-bit frames (n, height, width), resampled by homographies (n, 3, 3) from output to input image coordinates.
+    """Resample 8-bit frames (n, height, width) by homographies (n, 3, 3) from output to input image coordinates.
 
-    Float, between 0 and 255. Bicubic, because bilinear resampling blurs more, which a network would take for another
-    altitude. Beyond the edge the frame is reflected: no level of grey or edge appears that no camera sees.
+    Returns floats between 0 and 255. Resampling is bicubic, because bilinear resampling blurs more, and a network could
+    mistake blur for another altitude. Beyond the edge the frame is reflected, so that no artificial grey level or edge
+    appears.
     """
     height, width = (int(size) for size in frames.shape[1:])
     x = torch.arange(width, device=frames.device) + 0.5
     y = (torch.arange(height, device=frames.device) + 0.5)[:, None]
-    # Not as a matrix product, which autocast would compute in bfloat16.
+    # Avoid a matrix product, which autocast would compute in bfloat16.
     rows = homographies[:, :, :, None, None]
     u, v, w = (rows[:, i, 0] * x + rows[:, i, 1] * y + rows[:, i, 2] for i in range(3))
     grid = torch.stack([2 * u / (w * width) - 1, 2 * v / (w * height) - 1], dim=-1)
@@ -50,9 +51,10 @@ def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
 
 
 def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tensor | None = None) -> Iterator[Tensor]:
-    """Averages of the backbone's features (pairs, inputs) of the pairs of consecutive 8-bit frames (n, height, width).
+    """Yield averaged backbone features (pairs, inputs) of all pairs of consecutive 8-bit frames (n, height, width).
 
-    In portions, on the network's device. With homographies (n, 3, 3) the frames are warped first (`warped_frames`).
+    They are yielded in portions, on the network's device. If homographies (n, 3, 3) are given, the frames are warped
+    first (`warped_frames`).
     """
     device = next(network.parameters()).device
     at_once = _PAIRS.get(device.type, 16)
@@ -66,9 +68,10 @@ def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tenso
 
 
 def causal_outputs(recurrent: Recurrent, summaries: Tensor, n_pairs: int) -> Tensor:
-    """Outputs (pairs, 9), each from the last `n_pairs` of the summaries (pairs, inputs) up to it, from the zero state.
+    """Compute outputs (pairs, 9) from summaries (pairs, inputs), each from a window that ends at its pair.
 
-    The first window also gives the outputs of the shorter windows before its end.
+    A window has the last `n_pairs` summaries and starts from the zero state. The first full window also gives the
+    outputs of the shorter windows at the start.
     """
     windows = summaries.unfold(0, min(n_pairs, len(summaries)), 1).transpose(1, 2).contiguous()
     outputs, _ = recurrent.over_time(windows)
@@ -76,7 +79,7 @@ def causal_outputs(recurrent: Recurrent, summaries: Tensor, n_pairs: int) -> Ten
 
 
 def pose_of(output: Tensor, scales: Scales) -> Pose:
-    """Poses of outputs (n, 9): positions (n, 3), metres, O_L, and rotation_camera_from_site (n, 3, 3)."""
+    """Convert outputs (n, 9) to poses: positions (n, 3), metres, O_L, and rotation_camera_from_site (n, 3, 3)."""
     output = output.float().cpu()
     position_m = np.array(scales.mean_m) + np.array(scales.spread_m) * output[:, :3].double().numpy()
     return position_m, decoded_rotation(output, scales).double().numpy() @ np.array(scales.mean_rotation)
@@ -86,7 +89,7 @@ def pose_of(output: Tensor, scales: Scales) -> Pose:
 def predict_pose(
     network: Any, architecture: dict[str, Any], trajectory: Trajectory, features: Tensor | None = None
 ) -> Pose:
-    """Poses at the later frames of a trajectory's pairs, with the network in evaluation mode.
+    """Estimate the poses at the later frames of a trajectory's pairs, with the network in evaluation mode.
 
     `features` (pairs, inputs) are the output of `StackNavigator.features`, if they are already computed.
     """
@@ -101,10 +104,10 @@ def predict_pose(
 
 @torch.no_grad()
 def predict_pose_by_pairs(network: Any, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Pose, float]:
-    """Poses of a trajectory, pair by pair as in flight, and mean seconds per pair.
+    """Estimate the poses of a trajectory pair by pair, as in flight; return them and the mean seconds per pair.
 
-    The last `sequence_pairs` summaries of pairs are kept, as in flight. The time is from frames in memory to the pose,
-    without shrinking the frames.
+    The last `sequence_pairs` summaries of pairs are kept in memory. The time is from frames in memory to the pose; it
+    does not include shrinking the frames.
     """
     frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)
     scales, last = Scales(**architecture["scales"]), deque[Tensor](maxlen=architecture["sequence_pairs"])

@@ -16,7 +16,7 @@ REGIONS = {
     "npb": "elevation model",
     "npc": "elevation model",
 }
-"""Regions of the parts, by the end of their names."""
+"""Region of each part, by the end of the part's name."""
 _POSE = ("position_m", "rotation_wxyz", "sun_direction")
 
 
@@ -29,7 +29,7 @@ class Part:
     dataset: Dataset
     """The rendered frames."""
     n_locked: int
-    """Number of frames of the shared manifest; the dataset may have fewer."""
+    """Number of frames in the shared manifest; the dataset may have fewer."""
 
     @property
     def region(self) -> str:
@@ -43,9 +43,9 @@ def part_names(kind: str) -> list[str]:
 
 
 def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
-    """Open the datasets of a kind below `data` that belong to the benchmark; compare them with the shared manifests.
+    """Open the benchmark's datasets of a kind in the folder `data`, and compare them with the shared manifests.
 
-    Raises UserError if there is none, or if a scene or a frame differs from its manifest.
+    Raises UserError if there is no such dataset, or if a scene or a frame differs from the manifest.
     """
     store, locked = open_store(data), open_store(manifests)
     parts = []

@@ -1,4 +1,4 @@
-"""Visible marks on the output of an evaluation on terrain that the network was trained, selected or calibrated on."""
+"""Mark the output of an evaluation visibly if the network was trained, selected or calibrated on its terrain."""
 
 import textwrap
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ _CHARACTER_PX, _LINE_PX = 9, 22
 
 
 def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
-    """Write `mark` on pictures (a red band above), Markdown pages and Parquet tables (metadata) of a folder.
+    """Mark pictures (in a red band at the top), Markdown pages and Parquet tables (in their metadata) of a folder.
 
     Skips files that do not exist. Does nothing if `mark` is empty.
     """
@@ -29,7 +29,7 @@ def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
             _mark_file(unmarked[0], mark)
             del unmarked[0]
     finally:
-        # If writing fails, for example on a full disk, no file without its mark may remain.
+        # If writing fails, for example on a full disk, no file may remain without its mark.
         for path in unmarked:
             path.unlink(missing_ok=True)
 
@@ -44,7 +44,7 @@ def _mark_file(path: Path, mark: str) -> None:
 
 
 def mark_table(path: Path, mark: str) -> None:
-    """Put `mark` into the metadata of a Parquet file's schema, as `terrain_mark`."""
+    """Write `mark` into the schema metadata of a Parquet file, under the key `terrain_mark`."""
     table = pq.read_table(path)
     metadata = {**(table.schema.metadata or {}), _METADATA_KEY: mark.encode()}
     with written_aside(path) as aside:
@@ -52,7 +52,7 @@ def mark_table(path: Path, mark: str) -> None:
 
 
 def mark_picture(path: Path, mark: str) -> None:
-    """Put `mark` in white on a red band above a PNG. Raises OSError if it cannot be read or written."""
+    """Add a red band with `mark` in white above a PNG. Raises OSError if the file cannot be read or written."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise OSError(f"{path}: cannot be read")
@@ -65,7 +65,7 @@ def mark_picture(path: Path, mark: str) -> None:
 
 
 def marked_page(text: str, mark: str) -> str:
-    """Add the mark below the title of a Markdown page, and the mark's first words to the heading of each section."""
+    """Add the mark below the title of a Markdown page, and the first words of the mark to each section heading."""
     short = mark.split(":")[0].split(",")[0]
     lines: list[str] = []
     for line in text.split("\n"):

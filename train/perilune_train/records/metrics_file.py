@@ -18,11 +18,11 @@ Metrics = dict[str, float | int | str | None]
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None], name: str = METRICS_FILE) -> None:
-    """Write metrics.json, or `name`; values that are not finite become null.
+    """Write metrics.json, or the file `name`. Values that are not finite become null.
 
-    Adds run/...: commit, hardware, load, command, date, GPU and versions.
+    Adds the entries run/...: commit, hardware, load, command, date, GPU and versions.
     """
-    # Imported here, so that reading metrics does not need torch.
+    # Imported here, so that reading metrics does not require torch.
     import numpy as np
     import torch
 
@@ -38,9 +38,9 @@ def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None],
 
 
 def read_metrics(folder: Path, name: str = METRICS_FILE) -> Metrics:
-    """Read metrics.json, or `name`, of a run or of an evaluation.
+    """Read metrics.json, or the file `name`, of a run or an evaluation.
 
-    Raises UserError if it is missing or not a flat JSON object.
+    Raises UserError if the file is missing or is not a flat JSON object.
     """
     path = folder / name
     if not path.is_file():
@@ -59,7 +59,7 @@ def read_metrics(folder: Path, name: str = METRICS_FILE) -> Metrics:
 
 
 def has_metrics(folder: Path, name: str = METRICS_FILE) -> bool:
-    """Whether the metrics.json of a folder is a whole file; False if it is missing, empty or truncated."""
+    """Whether a folder has a complete metrics.json; False if the file is missing, empty or truncated."""
     try:
         return bool(read_metrics(folder, name))
     except UserError:

@@ -1,9 +1,10 @@
-"""Which terrain a network was fitted to, and whether a test split shares it.
+"""Record which terrain a network was fitted to, and check whether a test split shares it.
 
-Every checkpoint has a record of the terrain that the network was trained, selected or calibrated on, by content hash
-(`perilune_shared.content`). The record includes the terrain of the network's parents: the network that gave the initial
-weights, and the teacher. A test on such terrain measures memorisation, not generalisation. It raises an error, unless
-the splits of the dataset share terrain by protocol or the user allows it. If the user allows it, all output is marked.
+Every checkpoint records the terrain on which the network was trained, selected or calibrated, by content hash
+(`perilune_shared.content`). The record includes the terrain of the network's parents: the network that provided the
+initial weights, and the teacher. A test on recorded terrain measures memorisation, not generalisation. Such a test
+raises an error, unless the splits of the dataset share terrain by protocol or the user allows it. If the user allows
+it, all output is marked.
 """
 
 import re
@@ -44,32 +45,33 @@ class TerrainUse:
     dataset: str
     """Name of the dataset."""
     scene_id: str
-    """The scene in it."""
+    """Identifier of the scene in the dataset."""
     use: str
-    """trained, selected (validation: best epoch, threshold), calibrated (threshold, int8), or tested."""
+    """trained, selected (best epoch or threshold, on validation), calibrated (threshold or int8), or tested."""
     sha256: str
-    """Content hash of the terrain, see `terrain_of`."""
+    """Content hash of the terrain (`terrain_of`)."""
     group: str
     """Name of the group of datasets that share terrain by protocol; otherwise the dataset's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """All terrain that a network was fitted to: trained, selected or calibrated on."""
+    """All terrain that a network was fitted to, by training, selection or calibration."""
 
     uses: frozenset[TerrainUse] = frozenset()
-    """Also the test scenes of its own dataset (`tested`), which later calibration must avoid."""
+    """The terrain and its uses. Includes the test scenes of the training dataset (`tested`), which later calibration
+    must avoid."""
     known: bool = True
     """False if a parent has no record."""
 
     def joined(self, parents: Iterable["Provenance"]) -> "Provenance":
-        """This record together with those of the parents, without the parents' test terrain."""
+        """This record joined with the parents' records, without the parents' test terrain."""
         parents = list(parents)
         inherited = {use for parent in parents for use in parent.uses if use.use != "tested"}
         return Provenance(self.uses | inherited, self.known and all(parent.known for parent in parents))
 
     def plain(self) -> dict[str, Any]:
-        """The record as lists and text, for a checkpoint or a JSON file."""
+        """The record as plain lists and strings, for a checkpoint or a JSON file."""
         rows = [[use.dataset, use.scene_id, use.use, use.sha256, use.group] for use in sorted(self.uses)]
         return {"known": self.known, "uses": rows}
 
@@ -78,7 +80,7 @@ UNKNOWN = Provenance(known=False)
 
 
 def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
-    """Read the record in a checkpoint's content; `UNKNOWN` if it has none. Raises UserError on a malformed one."""
+    """Read the record in a checkpoint's content; `UNKNOWN` if it is missing. Raises UserError if it is malformed."""
     if RECORD not in content:
         return UNKNOWN
     record, expected = content[RECORD], "a record of scenes, as training writes it"
@@ -97,7 +99,7 @@ def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
 
 
 def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUse]:
-    """The terrain under the frames of a split; empty if it has none. Raises UserError on an invalid scene_id."""
+    """The terrain under the frames of a split; empty without frames. Raises UserError on an invalid scene_id."""
     scene_ids = set(dataset.table("frames", ["scene_id"], split=split)["scene_id"].to_pylist())
     rows = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
     for row in rows:
@@ -112,9 +114,9 @@ def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUs
 
 
 def served_terrain(where: object, dataset: str, scene: int, dem_source: str, content_sha256: str) -> TerrainUse:
-    """The terrain of a scene that an image server rendered for training, as the server states it.
+    """The terrain of a scene that an image server rendered for training, from the values that the server sent.
 
-    Raises UserError if a record cannot hold it.
+    Raises UserError if a value is not valid in a record.
     """
     name, sha256 = f"{dataset} (served)", terrain_of(dem_source, content_sha256)
     if not _NAME.fullmatch(name):
@@ -125,7 +127,7 @@ def served_terrain(where: object, dataset: str, scene: int, dem_source: str, con
 
 
 def training_provenance(dataset: Dataset) -> Provenance:
-    """The record of a network that is trained, selected and tested on a dataset's splits."""
+    """The record of a network that is trained, selected and tested on the splits of one dataset."""
     return Provenance(frozenset().union(*(split_terrain(dataset, *part) for part in _USE_OF_SPLIT.items())))
 
 
@@ -139,7 +141,7 @@ def _group(info: DatasetInfo) -> str:
         for recipe in info.recipes.values()
     }
     (name,) = names if len(names) == 1 else ("",)
-    # Recipes are untrusted input: ignore a name that a record cannot hold.
+    # Recipes are untrusted input: ignore a name that is not valid in a record.
     return f"landing area of {name}" if name and _NAME.fullmatch(f"landing area of {name}") else info.name
 
 
@@ -157,7 +159,7 @@ class EvaluatedSplit:
     split: str = "test"
     """train, val or test."""
     allow_overlap: bool = False
-    """Whether terrain that a network was fitted to is accepted; all output is then marked."""
+    """Whether to accept terrain that a network was fitted to. If so, all output is marked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,14 +167,14 @@ class TerrainCheck:
     """Result of comparing the terrain of a test split with a network's record."""
 
     status: Status
-    """disjoint; by protocol: shared with other splits of the dataset by its protocol; overlap: any other shared
-    terrain, allowed by the user; unknown: the record is missing or incomplete."""
+    """disjoint: no shared terrain. by protocol: the splits of the dataset share terrain by its protocol. overlap: any
+    other shared terrain, which the user allowed. unknown: the record is missing or incomplete."""
     scenes: tuple[str, ...] = field(default=())
-    """Overlapping scenes, each with the scene and use in the record; only the first few are named."""
+    """Overlapping scenes, each with the recorded scene and use. Only the first few are named."""
 
     @property
     def mark(self) -> str:
-        """Text that marks all output; empty for disjoint terrain and for terrain shared by protocol."""
+        """Text to mark all output with; empty if the terrain is disjoint or shared by protocol."""
         if self.status == "overlap":
             return f"TERRAIN OVERLAP, no test of unseen terrain: {', '.join(self.scenes)}"
         return "TRAINING TERRAIN UNKNOWN: the checkpoint has no record of it" if self.status == "unknown" else ""
@@ -187,11 +189,11 @@ def check_terrain(
 ) -> TerrainCheck:
     """Compare a record with the terrain of a split.
 
-    A dataset that is split by frame or trajectory shares terrain between its splits by design. Raises UserError naming
-    the scenes of any other overlap with a test split, unless `allow_overlap`.
+    A dataset that is split by frame or trajectory shares terrain between its splits by design. Any other overlap with a
+    test split raises UserError with the names of the scenes, unless `allow_overlap`.
     """
     fitted = frozenset(use for use in provenance.uses if use.use != "tested")
-    # Training and validation frames are evaluated on purpose: the report names the split.
+    # Users evaluate training and validation frames on purpose, and the report names the split.
     by_design = dataset.info.split_by != "scene" or split != "test"
     tested = split_terrain(dataset, split, "tested")
     return _compared(fitted, tested, dataset, by_design, provenance.known, allow_overlap or split != "test")
@@ -202,7 +204,7 @@ def check_calibration(
 ) -> TerrainCheck:
     """Compare the terrain of a calibration on `dataset` with the test terrain of the dataset and of the run.
 
-    Raises UserError naming the scenes of any overlap, like `check_terrain`, unless `allow_overlap`.
+    Like `check_terrain`, any overlap raises UserError with the names of the scenes, unless `allow_overlap`.
     """
     tested = frozenset(use for use in provenance.uses if use.use == "tested") | split_terrain(dataset, "test", "tested")
     by_design = dataset.info.split_by != "scene"
@@ -217,7 +219,7 @@ def _compared(
     known: bool,
     allow_overlap: bool,
 ) -> TerrainCheck:
-    """Check two sets of terrain for overlap; `by_design`: scenes of one group may be in both."""
+    """Check two sets of terrain for overlap. With `by_design`, scenes of one group may be in both."""
     used: dict[str, list[TerrainUse]] = {}
     for use in sorted(fitted):
         used.setdefault(use.sha256, []).append(use)

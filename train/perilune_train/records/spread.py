@@ -1,8 +1,8 @@
-"""Spread of a metric: a 95 % interval by bootstrap over independent units, or the values of the units.
+"""Spread of a metric: a 95 % bootstrap interval over independent units, or the value of each unit.
 
-Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene; the trajectory in a
-split with one scene; the image if neither is known. With fewer than five units there is no interval; the value of each
-unit is given instead.
+Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene. In a split with one
+scene, the unit is the trajectory. If neither is known, the unit is the image. With fewer than five units there is no
+interval; the value of each unit is given instead.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ _PERCENTILES = (2.5, 97.5)
 
 @dataclass(frozen=True)
 class Resamples:
-    """How often each unit is in each resample."""
+    """Bootstrap resamples: how often each of them contains each unit."""
 
     unit: str
     """scene, trajectory or image."""
@@ -32,7 +32,7 @@ class Resamples:
     of_row: Rows
     """Index of the unit of each row (N,); a row is a frame or a pair of frames."""
     weights: Array
-    """Weight of each unit in each resample (resamples, U)."""
+    """Weight of each unit in each resample (R, U), for R resamples."""
 
     @property
     def count(self) -> int:
@@ -40,17 +40,17 @@ class Resamples:
         return len(self.names)
 
     def of_units(self, units: Rows) -> "Resamples":
-        """One resample for each of these units, which contains the unit once."""
+        """Make one resample for each of these units; it contains this unit once and no other."""
         return replace(self, weights=np.eye(self.count)[units])
 
     def totals(self, rows: Rows, values: Array | None = None) -> Array:
-        """Sum over `rows` (L,) of `values` (L,), or of 1, in every resample (R,)."""
+        """Sum of `values` (L,) over `rows` (L,) in every resample (R,); without values, the number of rows."""
         return self.weights @ np.bincount(self.of_row[rows], weights=values, minlength=self.count)
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Spread of one metric among units."""
+    """Spread of one metric over units."""
 
     unit: str
     """scene, trajectory or image."""
@@ -60,7 +60,7 @@ class Spread:
     """Value of each unit; only if there is no interval."""
 
     def text(self, value: float | None, shown: Callable[[object], str] = for_markdown) -> str:
-        """The value, and its spread if known; a dash if the value is undefined. `shown` makes names of units safe."""
+        """The value with its spread, if known; a dash if the value is undefined. `shown` escapes the names of units."""
         if value is None or not np.isfinite(value):
             return "-"
         known = {name: value_of_unit for name, value_of_unit in self.by_unit.items() if np.isfinite(value_of_unit)}
@@ -75,7 +75,10 @@ class Spread:
         return f"{value:.3f}"
 
     def keys(self, key: str) -> dict[str, float | None]:
-        """Keys for metrics.json: <key>_low and _high; or <key>_interval, null, and <key>/by_<unit>/<name>."""
+        """Entries for metrics.json.
+
+        With an interval: <key>_low and <key>_high. Without: <key>_interval, which is null, and <key>/by_<unit>/<name>.
+        """
         if self.interval is not None:
             return {f"{key}_low": self.interval[0], f"{key}_high": self.interval[1]}
         by_unit = {f"{key}/by_{self.unit}/{name}": value for name, value in self.by_unit.items()}
@@ -83,7 +86,7 @@ class Spread:
 
 
 def read_spread(figures: Mapping[str, object], key: str) -> Spread:
-    """Read the output of `Spread.keys` from flat metrics; no interval and no units if there is none."""
+    """Read the entries of `Spread.keys` from flat metrics. If they are missing, the spread has no interval or units."""
     low, high = figures.get(f"{key}_low"), figures.get(f"{key}_high")
     if isinstance(low, float) and isinstance(high, float):
         return Spread("", (low, high))
@@ -97,9 +100,9 @@ def read_spread(figures: Mapping[str, object], key: str) -> Spread:
 def draw_resamples(
     scenes: Sequence[str], trajectories: Sequence[str], images: Sequence[str], rng: np.random.Generator
 ) -> Resamples:
-    """Draw RESAMPLES resamples of the units of N rows, from the names of their scenes, trajectories and images.
+    """Draw RESAMPLES resamples of the units of N rows.
 
-    An unknown name is "".
+    The N names of scenes, trajectories and images define the units; an unknown name is "".
     """
     unit, names = "scene", scenes
     if len(set(scenes)) < 2:
@@ -111,9 +114,9 @@ def draw_resamples(
 
 
 def spreads(statistics: Callable[[Resamples], dict[str, Array]], rows: Rows, resamples: Resamples) -> dict[str, Spread]:
-    """The spread of each metric that `statistics` computes for every resample (R,).
+    """Spread of each metric that `statistics` computes for every resample (R,).
 
-    `rows` are the rows that the metrics use; units without any of them are left out.
+    `rows` are the rows that the metrics use. Units without any of these rows are left out.
     """
     units = np.unique(resamples.of_row[rows])
     if len(units) >= MIN_UNITS:

@@ -1,4 +1,4 @@
-"""The section of a dataset: counts, histograms of altitude, size and Sun, shaded map, labelled frames."""
+"""The report's section on a dataset: counts, histograms of altitude, size and Sun, shaded map, labelled frames."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ _LABELLED = 4
 
 
 def dataset_section(dataset: Dataset, key: str, split: DetectSplit | None) -> Section:
-    """Describe a dataset. `split` are its test frames with labels; None if it has no labels."""
+    """Describe a dataset. `split` has its test frames with labels; None if the dataset has no labels."""
     info, provenance = dataset.info, provenance_of_dataset(dataset)
     counts = {name: value for name, value in info.counts.model_dump().items() if value}
     table = Table(
@@ -48,7 +48,7 @@ def _title(dataset: Dataset) -> str:
 
 
 def labelled_pictures(frames: LabelledFrames) -> list[FramePicture]:
-    """Four frames of the test split from the highest to the lowest, of different trajectories where there are."""
+    """Four frames of the test split, from the highest to the lowest, from different trajectories if possible."""
     altitude = np.array([position[2] for position in frames.split.frames.table["position_m"]])
     trajectory = frames.split.frames.table["trajectory_id"].to_numpy()
     scene = frames.split.frames.table["scene_id"].to_numpy()
@@ -97,7 +97,7 @@ def _histograms(dataset: Dataset) -> list[Figure]:
 
 
 def _histogram(axes: Axes, values: Mapping[str, Array], *, on_logarithms: bool) -> None:
-    """Stacked bars of each group; on logarithms lines beside each other, since stacked bars would mislead there."""
+    """Draw stacked bars by group. With `on_logarithms`, draw lines instead, because stacked bars would mislead."""
     own = {name: one[np.isfinite(one) & ((one > 0) | (not on_logarithms))] for name, one in values.items()}
     known = np.concatenate(list(own.values()))
     low, high = (known.min(), known.max()) if len(known) else (1.0, 2.0)

@@ -1,4 +1,4 @@
-"""The section of crater detection: figures, curves, bins, best and worst frames."""
+"""The report's section on crater detection: figures, curves, bins, best and worst frames."""
 
 import re
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _COLUMNS = ("score", "precision", "recall")
 
 
 def detection_section(runs: Sequence[Run], frames: LabelledFrames | None) -> Section:
-    """Show the runs of detection; `frames` are the test frames with the detections of the last one."""
+    """Show the detection runs. `frames` are the test frames with the detections of the last run."""
     pictures = () if frames is None else tuple(extremes(frames))
     return _section(runs, "test/", "detection", "Crater detection", pictures)
 
@@ -52,7 +52,7 @@ def scores_section(scores: Sequence[Run]) -> Section:
 
 
 def headline(run: Run, prefix: str = "test/") -> str:
-    """How good a run is, in one sentence."""
+    """One sentence with the main figures of a run."""
     precision, recall = (run.metrics.get(prefix + key) for key in ("precision", "recall"))
     ap, f1 = (_value(run, prefix + key) for key in ("ap50_paper", "f1"))
     who = "The installed detector" if run.name.endswith(INSTALLED) else f"The detector {run.name}"
@@ -65,7 +65,10 @@ def headline(run: Run, prefix: str = "test/") -> str:
 
 
 def extremes(frames: LabelledFrames) -> list[FramePicture]:
-    """The two frames of highest and the two of lowest F1, each two of different trajectories where possible."""
+    """The two frames with the highest and the two with the lowest F1.
+
+    The two frames of a pair are from different trajectories if possible.
+    """
     f1 = frames.f1()
     order = [int(place) for place in np.argsort(f1, kind="stable") if np.isfinite(f1[place])]
     table = frames.split.frames.table
@@ -108,7 +111,7 @@ def _section(
 
 
 def _starts(runs: Sequence[Run]) -> list[str]:
-    """A line for each run that did not start from random weights, and for an evaluation of the installed detector."""
+    """One line for each run that did not start from random weights or that evaluates the installed detector."""
     lines = []
     for run in runs:
         start = run.metrics.get("train/start", "random weights")
@@ -131,7 +134,7 @@ def _value(run: Run, key: str, *, spread: bool = False) -> str:
 
 
 def _curves(runs: Sequence[Run], prefix: str) -> list[Figure]:
-    """Precision against recall of all runs in one figure; runs without a curve are left out."""
+    """Draw precision against recall for all runs in one figure. Runs without a curve are left out."""
     folder = {"visible/": "visible"}.get(prefix, ".")
     drawn = [run for run in runs if (run.folder / folder / _CURVE).is_file()]
     if not drawn:
@@ -161,7 +164,7 @@ def read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _bins(runs: Sequence[Run], prefix: str) -> list[Figure]:
-    """AP by radius, altitude and Sun elevation, as bars beside each other for the runs."""
+    """Draw AP by radius, altitude and Sun elevation, with the bars of the runs side by side."""
     found: dict[str, dict[str, tuple[float, float, str]]] = {by: {} for by in _PANELS}
     for run in runs:
         for key in run.metrics:

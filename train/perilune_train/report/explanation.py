@@ -1,4 +1,4 @@
-"""The section of explanation: claims with verdicts, mosaics, bars with nulls, interventions; and the paper's page."""
+"""The report's sections on explanations and the paper's claims: verdicts, mosaics, bars with nulls, interventions."""
 
 import re
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ _ORDER = ("masks_", "pcc_", "gates_", "removal_", "before_after_")
 
 
 def explanation_section(run: Run, key: str, title: str) -> Section:
-    """Show an explain run: its headline, its claims as a table, all of its pictures with their captions."""
+    """Show an explain run: its headline, a table of its claims, and all its pictures with captions."""
     claims = read_claims(run.folder / CLAIMS_FILE)
     captions = _captions(run.folder / CAPTIONS_FILE)
     pictures = {path.name: f"{key}-picture-{number}" for number, path in enumerate(_ordered(run.folder))}
@@ -39,9 +39,9 @@ def explanation_section(run: Run, key: str, title: str) -> Section:
 
 
 def headline_of(run: Run) -> str:
-    """What the run found on the gates, one text; empty for a run without one, as of rendered interventions.
+    """The run's finding on the gates, as one text; empty if there is none, for example for rendered interventions.
 
-    If too few scenes leave every claim of it undecided, the text says this once.
+    If every claim is undecided because there are too few scenes, the text says this once.
     """
     found = run.metrics.get("headline")
     if not isinstance(found, str):
@@ -54,7 +54,10 @@ def headline_of(run: Run) -> str:
 
 
 def paper_section(folder: Path, run: Run) -> Section:
-    """The paper's claims with verdicts and pictures, from paper.json (`run`) in the folder of the experiment."""
+    """Show the paper's claims with verdicts and pictures.
+
+    `folder` is the folder of the experiment; `run` has the content of its paper.json.
+    """
     rows, place = [], 1
     while f"verdict/{place}/claim" in run.metrics:
         rows.append(tuple(str(run.metrics.get(f"verdict/{place}/{part}")) for part in ("claim", "measured", "answer")))
@@ -76,15 +79,16 @@ def paper_section(folder: Path, run: Run) -> Section:
 
 
 def _counted(verdicts: list[str]) -> str:
-    """Number of claims, and of each verdict."""
+    """The number of claims and the number of each verdict, as text."""
     counts = {verdict: verdicts.count(verdict) for verdict in dict.fromkeys(verdicts)}
     return f"{len(verdicts)}; {', '.join(f'{verdict}: {count}' for verdict, count in counts.items())}"
 
 
 def read_claims(path: Path) -> list[dict[str, str]]:
-    """Read claims.json: a list of objects of texts; empty if there is no such file. Raises UserError on other content.
+    """Read claims.json, a list of objects whose values are strings; an empty list if there is no such file.
 
-    Keys: claim, figure, interval, nulls, verdict, picture; a missing one is "-".
+    The keys are claim, figure, interval, nulls, verdict, picture; a missing value becomes "-". Raises UserError on
+    other content.
     """
     if not path.is_file():
         return []
@@ -109,12 +113,12 @@ def _claims_table(claims: list[dict[str, str]], pictures: Mapping[str, str], pro
 
 
 def _link(name: str, pictures: Mapping[str, str]) -> str:
-    """A link to the picture of a claim; its name if there is no such picture."""
+    """A link to the picture of a claim; the picture's name if there is no such picture."""
     return Markup('<a href="#{}">{}</a>').format(pictures[name], name) if name in pictures else name
 
 
 def _ordered(folder: Path) -> list[Path]:
-    """All pictures of the folder: masks, bars, gates, removal, interventions, then others, each by name."""
+    """All pictures of the folder: masks, bars, gates, removal, interventions, then others; within these, by name."""
 
     def rank(path: Path) -> tuple[int, str]:
         return next((k for k, start in enumerate(_ORDER) if path.name.startswith(start)), len(_ORDER)), path.name

@@ -1,4 +1,4 @@
-"""Frames with labels and detections, and the descent of the viewer with its attention masks."""
+"""Frames with labels and detections, and the descent that the viewer shows with attention masks."""
 
 import io
 import zipfile
@@ -29,30 +29,30 @@ _KINDS = {FOUND: "matched", FALSE: "false"}
 
 @dataclass(frozen=True)
 class LabelledFrames:
-    """The test frames of a dataset with labels, and with a run's detections if there is one."""
+    """The test frames of a dataset with labels and, if there is a run, with its detections."""
 
     split: DetectSplit
     """Frames and labels."""
     found: list[Detections]
-    """Detections above the threshold, one entry for each frame; all empty without a run."""
+    """Detections above the threshold, one entry per frame; all entries are empty without a run."""
     matches: Matches
     """Detections matched at IoU 0.5."""
     first_label: NDArray[np.intp]
     """Row of the first label of each frame in the matches (N,)."""
     has_detections: bool
-    """Whether there is a run."""
+    """Whether the detections come from a run; False if there is no run."""
     provenance: Provenance
-    """Of the run, or of the dataset without one."""
+    """Provenance of the run; of the dataset if there is no run."""
 
     def f1(self) -> NDArray[np.float64]:
-        """F1 of each frame (N,) at the run's threshold; NaN without selected labels."""
+        """F1 of each frame (N,) at the run's threshold; NaN for frames without selected labels."""
         count = len(self.split)
         hits, false = (np.bincount(self.matches.frame[self.matches.outcome == k], minlength=count) for k in _KINDS)
         labels = np.bincount(self.matches.selected_frame, minlength=count)
         return np.divide(2 * hits, hits + false + labels, out=np.full(count, np.nan), where=labels > 0)
 
     def picture(self, index: int, first_words: str = "") -> FramePicture:
-        """One frame with its marks."""
+        """One frame with the marks of its labels and detections."""
         own = self.split.labels[index]
         rows = np.flatnonzero(self.matches.frame == index)
         missed = own.selected.copy()
@@ -64,7 +64,7 @@ class LabelledFrames:
             labels.append(Mark(kind, (_px(cx), _px(cy), _px(a), _px(b), _px(np.degrees(theta)))))
         labels = [mark for mark, labelled in zip(labels, own.labelled, strict=True) if labelled]
         detections = []
-        # Rows of the matches are in the order of the detections of each frame.
+        # The rows of the matches have the order of the detections of each frame.
         for (x0, y0, x1, y1), score, outcome in zip(
             self.found[index].boxes, self.found[index].scores, self.matches.outcome[rows], strict=True
         ):
@@ -101,20 +101,20 @@ class LabelledFrames:
 
 
 def labelled_frames(split: DetectSplit, found: list[Detections] | None, provenance: Provenance) -> LabelledFrames:
-    """Match a run's detections, above its threshold, to the labels of a split; None without a run."""
+    """Match the labels of a split to a run's detections above the threshold; `found` is None without a run."""
     nothing = Detections(np.empty((0, 4)), np.empty(0))
     detections = [nothing] * len(split) if found is None else found
     height, width = split.frames.images.shape[1:]
     overlaps = find_overlaps(detections, list(split.labels), np.tile([width, height], (len(split), 1)))
     matches = overlaps.match(_MATCH_IOU, split.radius_px)
     first = np.searchsorted(overlaps.label_frame, np.arange(len(split)))
-    # `found` is in the order of each frame's scores, as the matches are.
+    # Order each frame's detections by score, as in the matches.
     ordered = [_best_first(own) for own in detections]
     return LabelledFrames(split, ordered, matches, first, found is not None, provenance)
 
 
 def frame_uri(image: NDArray[np.uint8]) -> str:
-    """A frame as a data URI: an exact PNG up to 512 px, else reduced to 512 px as WebP."""
+    """A frame as a data URI: a lossless PNG up to 512 px; larger frames are reduced to 512 px, as WebP."""
     if max(image.shape) <= _LARGEST_SIDE_PX:
         return _png(Image.fromarray(image))
     picture = Image.fromarray(image)
@@ -123,9 +123,9 @@ def frame_uri(image: NDArray[np.uint8]) -> str:
 
 
 def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Provenance | None) -> Viewer:
-    """The descent of the viewer: that of the masks, else the first test trajectory; at most 60 frames of it.
+    """The descent that the viewer shows, at most 60 frames: the masks' descent, otherwise the first test trajectory.
 
-    Raises UserError if the file of masks is damaged or of other frames.
+    Raises UserError if the file of masks is damaged or contains other frames.
     """
     names = frames.split.frames.table["frame_id"].tolist()
     content = None if masks is None else read_masks(masks)
@@ -146,9 +146,9 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
 
 
 def read_masks(path: Path) -> dict[str, NDArray[Any]]:
-    """Read masks_detect.npz: frame_ids (N,), blocks (B,), finite low and high (B,), uint8 (N, h, w) for each block.
+    """Read masks_detect.npz: frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) per block.
 
-    Raises UserError if an array is missing, has another shape, type or range, or if the file is damaged or too large.
+    Raises UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -1,4 +1,4 @@
-"""A shaded map of a scene, drawn from its crater table, with the tracks of its trajectories."""
+"""Draw a shaded map of a scene from its crater table, with the ground tracks of its trajectories."""
 
 import numpy as np
 import pandas as pd
@@ -14,17 +14,18 @@ _SIDE_PX = 480
 _LEAST_DIAMETER_PX = 2.5
 _REACH_RADII = 2.5
 _RIM_SHARE = 0.18
-"""Height of the rim above the plain, in depths; 0.036 D against 0.2 D in fresh craters (Pike 1977)."""
+"""Height of the rim above the plain, divided by the depth: 0.036 D / 0.2 D in fresh craters (Pike 1977)."""
 _MARGIN_M = 250.0
 _MOST_TRACKS = 6
 
 
 def shaded_ground(craters: pd.DataFrame, sun: Array, half_m: float, side_px: int = _SIDE_PX) -> NDArray[np.uint8]:
-    """Return the map (side_px, side_px) of a square of 2 half_m, grey: row 0 is the lowest y, column 0 the lowest x.
+    """Return a grey map (side_px, side_px) of a square with sides of 2 half_m.
 
-    Each crater is a parabolic bowl with a rim that falls with the cube of the distance to nothing at 2.5 radii.
-    `craters` has x_m, y_m, diameter_m and depth_m, `sun` is a unit vector (3,) towards the Sun, O_L. The brightness is
-    Lambert's law without cast shadows. Relief and boulders are not in the crater table, so they are not drawn.
+    Row 0 has the lowest y, column 0 the lowest x. `craters` has x_m, y_m, diameter_m and depth_m; `sun` is a unit
+    vector (3,) towards the Sun, O_L. Each crater is a parabolic bowl with a rim, whose height falls with the cube of
+    the distance and is 0 from 2.5 radii on. The brightness follows Lambert's law, without cast shadows. Relief and
+    boulders are not in the crater table, so they are not drawn.
     """
     pixel_m = 2 * half_m / side_px
     axis = (np.arange(side_px) + 0.5) * pixel_m - half_m
@@ -44,7 +45,7 @@ def shaded_ground(craters: pd.DataFrame, sun: Array, half_m: float, side_px: int
 
 
 def scene_map(dataset: Dataset, scene_id: str) -> Figure:
-    """The map of a scene under its own Sun, north up, with the ground tracks of at most six of its trajectories."""
+    """Draw the map of a scene under its Sun, north up, with the ground tracks of at most six of its trajectories."""
     columns = ["trajectory_id", "frame_index", "position_m", "sun_direction"]
     frames = dataset.table("frames", columns, scene_id=scene_id).to_pandas()
     frames = frames.sort_values(["trajectory_id", "frame_index"])
@@ -57,7 +58,7 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
     tracks = list(frames.groupby("trajectory_id").indices.items())[:_MOST_TRACKS]
     with drawing(height_in=5.0) as figure:
         axes = figure.subplots()
-        # Columns run west and rows south.
+        # Columns run west and rows south, so reverse both.
         image = shaded_ground(drawn, sun / np.linalg.norm(sun), half_m)[::-1, ::-1]
         axes.imshow(image, cmap="gray", vmin=0, vmax=255, origin="lower", extent=(-half_m, half_m, -half_m, half_m))
         for number, (trajectory, rows) in enumerate(tracks):

@@ -1,4 +1,4 @@
-"""The section of navigation: trajectory, errors with bands, all methods compared."""
+"""The report's sections on navigation: trajectory, errors with bands, comparison of all methods."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ _ERRORS = (
     "drift_x_m", "drift_y_m", "drift_z_m", "method",
 )  # fmt: skip
 _DRAWN = ("warp", "stack", "klt", "klt_gyroscope", "nominal")
-"""Methods of the figures, beside those of the runs; the table has all."""
+"""Methods that the figures show in addition to the runs' methods; the table has all methods."""
 _POSE = {
     "position_rmse_vector_m": "position RMSE, vector (m)",
     "position_rmse_per_component_m": "per component (m)",
@@ -64,7 +64,7 @@ _METHOD_COLUMNS = {
 
 
 def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
-    """Show the runs of navigation; `dataset` has the true positions for the trajectory, which is left out without."""
+    """Show the navigation runs. `dataset` has the true positions; without it, no trajectory is drawn."""
     of_poses = [run for run in runs if run.metrics.get("evaluation/target") == "pose"]
     leads = (*(headline(run) for run in runs), *_starts(runs))
     tables, pictures = (_poses(of_poses),) if of_poses else (), [_pose_picture(run) for run in of_poses]
@@ -73,7 +73,7 @@ def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
         return Section("navigation", "Navigation", leads, tables, tuple(pictures))
     errors = {run.name: _read(run.folder / "errors.parquet", _ERRORS) for run in runs}
     joined = pd.concat([table.assign(run=name) for name, table in errors.items()], ignore_index=True)
-    # Each run also evaluates the methods without a network; they are the same in all.
+    # Each run also evaluates the methods without a network. Their results are equal in all runs, so keep one copy.
     joined = joined.drop_duplicates(["method", "scene_id", "trajectory_id", "step"])
     own = {run.metrics.get("evaluation/method") for run in runs}
     drawn = [name for name in joined["method"].unique() if name in _DRAWN or name in own]
@@ -90,7 +90,7 @@ def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
 
 
 def headline(run: Run) -> str:
-    """The errors of a network in one sentence, with the least error of a method without training."""
+    """One sentence with the errors of a network and the smallest error of a method without training."""
     position, angle = (
         _spread(run, f"test/{key}") for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg")
     )  # fmt: skip
@@ -114,7 +114,7 @@ def headline(run: Run) -> str:
 
 
 def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
-    """Compare all methods of navigation over the same descents, from the folder of `make navigate`."""
+    """Compare all navigation methods over the same descents, from the output folder of `make navigate`."""
     rows = _read(folder / "navigation.parquet", None)
     columns = {key: title for key, title in _METHOD_COLUMNS.items() if key in rows and rows[key].notna().any()}
     cells = tuple((str(row["method"]), *(_cell(row[key]) for key in columns)) for row in rows.to_dict("records"))
@@ -133,15 +133,16 @@ def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
 
 
 def _starts(runs: Sequence[Run]) -> list[str]:
-    """A line for each run that did not start from random weights."""
+    """One line for each run that did not start from random weights."""
     starts = {run.name: str(run.metrics.get("network/backbone", "from scratch")) for run in runs}
-    # A path of the machine that trained says nothing to a reader of the page: its last folders are those of the run.
+    # Readers of the page have no use for an absolute path of the training machine. Keep the last folders, which name
+    # the run.
     shown = {name: re.sub(r"(?<=\s)/\S*/(?=(?:[^/\s]+/){3}[^/\s]+$)", "", start) for name, start in starts.items()}
     return [f"{name} started {start}." for name, start in shown.items() if not start.startswith("from scratch")]
 
 
 def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
-    """The filter with the installed detector over the test descents, from the folder of `navigate monte-carlo`."""
+    """Show the filter with the installed detector on the test descents, from the folder of `navigate monte-carlo`."""
     rows, columns = read_landing(folder), _LANDING_COLUMNS
     cells = tuple(("/".join(ids), *(number(own[key]) for key in columns)) for ids, own in by_trajectory(rows).items())
     table = Table("Descents, with all draws of each", ("descent", *columns.values()), cells, sources)
@@ -159,7 +160,7 @@ def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
 
 
 def landing_headline(rows: pd.DataFrame) -> str:
-    """The filter's errors in one line, from its table of draws."""
+    """One line with the filter's errors, from the table of draws."""
     own = run_summary(rows)
     over, end = number(own["position_rmse_m"]), number(own["position_end_rmse_m"])
     return (
@@ -169,7 +170,7 @@ def landing_headline(rows: pd.DataFrame) -> str:
 
 
 def read_landing(folder: Path) -> pd.DataFrame:
-    """The table of draws. Raises UserError if it is damaged."""
+    """Read the table of draws. Raises UserError if it is damaged."""
     return _read(folder / LANDING_TABLE, _LANDING_ROWS)
 
 
@@ -213,7 +214,7 @@ def _table(runs: Sequence[Run]) -> Table:
 
 
 def _poses(runs: Sequence[Run]) -> Table:
-    """Errors of the poses in the landing frame, and of the floors of each run."""
+    """Table of the pose errors in the landing frame, for each run and its floors."""
     rows = []
     for run in runs:
         loses = run.metrics.get("evaluation/worse_than")
@@ -232,7 +233,7 @@ def _pose_picture(run: Run) -> Figure:
 def _trajectory(
     errors: pd.DataFrame, methods: Sequence[str], dataset: Dataset, sources: tuple[Provenance, ...]
 ) -> list[Figure]:
-    """Side view and ground track of the first test descent: true, and dead reckoned by each method."""
+    """Draw the side view and ground track of the first test descent: true, and dead reckoned by each method."""
     scene, trajectory = errors["scene_id"].iloc[0], errors["trajectory_id"].iloc[0]
     columns = ["frame_index", "position_m"]
     rows = dataset.table("frames", columns, scene_id=scene, trajectory_id=trajectory).to_pandas()
@@ -271,7 +272,7 @@ def _along(start: np.ndarray):
 
 
 def _bands(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenance, ...]) -> list[Figure]:
-    """Median error of a step by altitude, with a band from 5 to 95 % of the pairs."""
+    """Draw the median error per step by altitude, with a band from 5 to 95 % of the pairs."""
     edges = np.linspace(errors["altitude_m"].min(), errors["altitude_m"].max() * 1.0001, _BINS + 1)
     figures = []
     for what, column, unit in (("position", "position_error_m", "m"), ("orientation", "orientation_error_deg", "deg")):
@@ -298,7 +299,7 @@ def _bands(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenan
 
 
 def _drift(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenance, ...]) -> Figure:
-    """Error of the dead-reckoned position along the descent: median of all test descents, and their range."""
+    """Draw the error of the dead-reckoned position along the descent: median and range over all test descents."""
     with drawing(height_in=3.6) as figure:
         axes = figure.subplots()
         for place, method in enumerate(methods):
@@ -319,7 +320,7 @@ def _drift(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenan
 
 
 def _compared(rows: pd.DataFrame, sources: tuple[Provenance, ...]) -> Figure:
-    """Position RMSE of all methods as dots on a logarithmic axis."""
+    """Draw the position RMSE of all methods as dots on a logarithmic axis."""
     known = rows[rows["position_rmse_m"].notna()].sort_values(["kind", "position_rmse_m"], ascending=[False, False])
     with drawing(height_in=0.28 * len(known) + 1.4) as figure:
         axes = figure.subplots()
@@ -351,7 +352,7 @@ def _spread(run: Run, key: str) -> str:
     if not isinstance(value, int | float):
         return "-"
     spread = read_spread(run.metrics, key)
-    # Values of single trajectories would fill the table.
+    # Without an interval, the spread lists the value of every trajectory, which would fill the table.
     return f"{value:.3f}" if spread.interval is None else spread.text(float(value), one_line)
 
 

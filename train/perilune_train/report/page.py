@@ -1,4 +1,4 @@
-"""Write a report: read datasets and runs, render report.html and summary.md, and put both into place together."""
+"""Write a report: read datasets and runs, render report.html and summary.md, and publish both files together."""
 
 import base64
 import hashlib
@@ -51,7 +51,7 @@ _VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinj
 
 @dataclass(frozen=True)
 class _Opened:
-    """Datasets and runs that exist."""
+    """The datasets and runs of a report that exist, and the names of the others."""
 
     datasets: dict[Path, Dataset]
     """Complete datasets with frames, by folder."""
@@ -64,14 +64,15 @@ class _Opened:
     scores: list[Run]
     """Scores on the locked benchmark."""
     missing: tuple[str, ...]
-    """What does not exist."""
+    """Names of the datasets and runs that do not exist."""
 
 
 def write_report(kind: Kind, name: str, dataset: Path, runs: Path, out: Path) -> Path:
-    """Write report.html and summary.md of a demo, a paper run or a benchmark into `out`; returns the page.
+    """Write report.html and summary.md of a demo, a paper run or a benchmark into `out`; return the page's path.
 
-    `dataset` is the folder of the datasets and `runs` that of all runs (sources.py). What does not exist is left out
-    and named on the page. Raises UserError if nothing exists, or if a file is damaged; then nothing is written.
+    `dataset` is the folder of the datasets, `runs` the folder of all runs (sources.py). Datasets and runs that do not
+    exist are left out, and the page names them. Raises UserError and writes nothing if none of them exists or if a file
+    is damaged.
     """
     report = gather(kind, name, dataset, runs)
     page, summary = html_of(report), summary_of(report)
@@ -100,7 +101,7 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
             source = provenance_of_dataset(own) if detect is None else detect.provenance
             frames = frames or labelled_frames(split, found, source)
         sections.append(dataset_section(own, f"dataset-{len(sections)}", split))
-    # The datasets are described after what was reached with them.
+    # Results come first, descriptions of the datasets after them.
     sections = [*_run_sections(folders, opened, frames, runs), *sections]
     if not sections:
         raise UserError(dataset, "report", "no dataset and no finished run", f"the datasets and runs of a {kind}")
@@ -172,7 +173,7 @@ def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | No
 
 
 def _metrics_of(folder: Path) -> Metrics:
-    """Metrics of a folder; nothing if it is older than its record."""
+    """Metrics of a folder; empty if an older version wrote the folder without metrics.json."""
     return read_metrics(folder) if (folder / METRICS_FILE).is_file() else {}
 
 
@@ -186,15 +187,15 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 
 
 def _headlines(opened: _Opened, folders: Folders) -> list[str]:
-    """The result in sentences, the first for the page's first line: detection, navigation, landing, explanation.
+    """Sentences with the results of detection, navigation, landing and explanation; the first one opens the page.
 
-    What the preset `tiny` is for comes before all figures.
+    For the preset `tiny`, its purpose comes before all figures.
     """
     recipes = [recipe for one in opened.datasets.values() for recipe in one.info.recipes.values()]
     lines = [_TRIAL] if any(recipe.preset == _TRIAL_PRESET for recipe in recipes) else []
     if lines and opened.detect and opened.detect[-1].name.endswith(INSTALLED):
         lines[0] += " The frames show the installed detector."
-    # The last run is that whose detections the frames show.
+    # Begin with the last run, because the frames show its detections.
     lines += [detection.headline(run) for run in reversed(opened.detect)]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
     lines += [navigation.headline(run) for run in opened.navigate]
@@ -213,9 +214,10 @@ def _provenance(sections: Sequence[Section], viewer: Viewer | None) -> tuple[Pro
 
 
 def html_of(report: Report) -> str:
-    """The page: styles, script and data are inside, and a security policy allows no others and no connections.
+    """Render the page as one HTML file that contains its styles, script and data.
 
-    Names from files are escaped by Jinja2, and in the viewer's data by `json_block`.
+    A security policy allows no other styles or scripts and no connections. Jinja2 escapes names from files; in the
+    viewer's data `json_block` escapes them.
     """
     files = importlib.resources.files("perilune_train.report") / "templates"
     style, script = ((files / name).read_text(encoding="utf-8") for name in ("style.css", "viewer.js"))
@@ -242,7 +244,7 @@ _TEMPLATES = ("page.html.j2", "parts.html.j2")
 
 
 def viewer_data(viewer: Viewer) -> dict[str, object]:
-    """The viewer's data as plain lists: frames with marks, masks by gate."""
+    """The viewer's data as plain lists: frames with marks, and masks by gate."""
     frames = [
         {
             "name": frame.name,
@@ -259,9 +261,9 @@ def viewer_data(viewer: Viewer) -> dict[str, object]:
 
 
 def json_block(content: object) -> Markup:
-    """JSON that cannot end the script element that holds it, nor a line in it."""
+    """JSON text that can neither close the script element around it nor break a line in it."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
-    # JSON allows an escape for each of these characters; ensure_ascii escapes U+2028 and U+2029.
+    # JSON allows these characters to be escaped. `ensure_ascii` already escapes U+2028 and U+2029.
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return Markup(text)

@@ -1,4 +1,4 @@
-"""Pictures that are part of a page: inline SVG of matplotlib figures, images as data URIs."""
+"""Pictures embedded in a page: matplotlib figures as inline SVG, images as data URIs."""
 
 import base64
 import io
@@ -24,13 +24,13 @@ from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
 from perilune_shared.errors import UserError, one_line, shortened
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours that are legible on white and on black."""
+"""The colours of Okabe and Ito that are legible on both white and black."""
 DASHES: tuple[str | tuple[float, tuple[float, ...]], ...] = (
     "-", "--", "-.", ":", (0, (7, 2, 1, 2, 1, 2)), (0, (2, 1)),
 )  # fmt: skip
-"""One pattern for each colour, so that lines differ without colour."""
+"""One dash pattern per colour, so that lines can be told apart without colour."""
 WIDTH_IN = 5.0
-"""Width of a figure, inches: half of a wide page, all of a narrow one, where its text is still legible."""
+"""Width of a figure, inches. It fills half of a wide page, or a whole narrow page, with text that is still legible."""
 _INK, _INK_RGB = "#010203", re.compile(r"#010203")
 _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _FONT = re.compile(r"(?:^|\s)(\d+(?:\.\d+)?)px")
@@ -58,11 +58,11 @@ _QUALITY = 82
 _WHITE = 250
 _LEAST_PAPER_SHARE = 0.01
 _LEAST_PATCH_PX = 60
-"""Smallest white area beyond a line that is paper: bright spots of photographs beside paper are mostly smaller."""
+"""A white area beyond a line counts as paper from this size on. Bright spots in photographs are mostly smaller."""
 _STROKE_PX = 13
-"""Largest width of a line or letter on paper."""
+"""Largest width of a line or letter on paper, pixels."""
 _LARGEST_INK_SPREAD = 24
-"""Largest difference between the channels of a grey pixel, of 255: compressed greys are not exactly grey."""
+"""Largest difference between the channels, of 255, of a pixel that counts as grey. Compression shifts the channels."""
 _numbers = itertools.count()
 ElementTree.register_namespace("", _SVG)
 ElementTree.register_namespace("xlink", _LINK)
@@ -76,19 +76,19 @@ def drawing(width_in: float = WIDTH_IN, height_in: float = 3.4) -> Iterator[Draw
 
 
 def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
-    """Set a title and both labels. Names from data are drawn as they are: text.parse_math is off."""
+    """Set the title and both labels. Names from data are drawn literally, because text.parse_math is off."""
     axes.set(title=title, xlabel=x, ylabel=y)
 
 
 def logarithmic(axes: Axes, *which: Literal["x", "y"]) -> None:
-    """Make axes logarithmic, with plain numbers at the powers of ten, or more often within two decades."""
+    """Make axes logarithmic, labelled with plain numbers at the powers of ten; axes within two decades have more."""
     for name in which:
         (axes.set_xscale if name == "x" else axes.set_yscale)("log")
         axis = axes.xaxis if name == "x" else axes.yaxis
         low, high = axis.get_view_interval()
         few = low > 0 and high / low < 100
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
-        # The usual labels are mathematical text, which is off for the sake of names from files.
+        # The usual labels are mathematical text, which is disabled because of names from files.
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axis.set_minor_locator(NullLocator())
 
@@ -96,8 +96,8 @@ def logarithmic(axes: Axes, *which: Literal["x", "y"]) -> None:
 def svg_of(figure: Drawing, description: str) -> Markup:
     """Return a figure as inline SVG whose text and axes have the colour of the page's text.
 
-    Styles become presentation attributes, since the page's security policy allows no inline styles. Identifiers are
-    unique in this process.
+    Styles are converted to presentation attributes, since the page's security policy allows no inline styles.
+    Identifiers are unique within this process.
     """
     stream = io.StringIO()
     figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
@@ -125,7 +125,7 @@ def svg_of(figure: Drawing, description: str) -> Markup:
 
 
 def _presentation(style: str) -> dict[str, str]:
-    """Presentation attributes of a CSS style; `font` gives the size only."""
+    """Convert a CSS style to presentation attributes. Of `font`, only the size is kept."""
     found = {}
     for part in style.split(";"):
         name, _, value = (text.strip() for text in part.partition(":"))
@@ -142,7 +142,7 @@ def png_uri(content: bytes) -> str:
 
 
 def image_uri(image: Image.Image | NDArray[np.uint8], quality: int = _QUALITY) -> str:
-    """A data URI of an image as WebP; arrays are grey (height, width)."""
+    """A data URI of an image as WebP. Arrays are grey images (height, width)."""
     stream = io.BytesIO()
     (Image.fromarray(image) if isinstance(image, np.ndarray) else image).save(stream, "WEBP", quality=quality)
     return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()
@@ -154,10 +154,10 @@ def img(uri: str, description: str) -> Markup:
 
 
 def picture_of(path: Path, description: str) -> Markup:
-    """A run's PNG as HTML, reduced to at most 1400 px. Raises UserError if it is damaged or too large.
+    """Embed a run's PNG as HTML, reduced to at most 1400 px. Raises UserError if it is damaged or too large.
 
-    White paper around its content becomes transparent, and black ink on the paper a second image, which the page
-    inverts in dark colours.
+    White paper around the content becomes transparent. Black ink on the paper becomes a second image, which the page
+    inverts in dark mode.
     """
     try:
         with Image.open(path, formats=["PNG"]) as picture:
@@ -166,7 +166,7 @@ def picture_of(path: Path, description: str) -> Markup:
             colours = picture.convert("RGB")
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(path, "picture", error, f"a PNG of at most {LARGEST_IMAGE_PX} pixels") from None
-    # A dimension too large for the page is reduced; a small picture is not enlarged.
+    # `thumbnail` reduces pictures that are too large for the page and does not enlarge small ones.
     colours.thumbnail((_LARGEST_SIDE_PX, 4 * _LARGEST_SIDE_PX))
     layers = layers_of(np.asarray(colours))
     if layers is None:
@@ -179,14 +179,14 @@ def picture_of(path: Path, description: str) -> Markup:
 def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
     """Split a picture (height, width, 3) on white paper into two layers (height, width, 4): content, and black ink.
 
-    Over white, the layers together are the picture. Returns None if there is no paper.
+    Drawn together over white, the layers give the picture. Returns None if there is no paper.
     """
     paper = _paper(colours)
     if paper is None:
         return None
     values = colours.astype(np.float64)
-    # The least share of a colour that gives the pixel over white. Black ink has it; coloured lines have a larger one,
-    # since they would be too dark over black.
+    # Smallest opacity with which a colour over white can give the pixel. Black ink gets this opacity. Coloured lines
+    # get a larger one, because they would be too dark over black.
     least = (255 - values.min(axis=2)) / 255
     share = np.where(paper, np.sqrt(least), 1.0)
     pure = 255 - (255 - values) / np.maximum(share, 1 / 255)[..., None]
@@ -199,10 +199,10 @@ def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np
 
 
 def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """Where a picture (height, width, 3) is white paper, or a thin line or letter on it (height, width).
+    """Mask (height, width) of the white paper of a picture (height, width, 3), including thin lines and letters on it.
 
-    Photographs and filled shapes are none of it. Paper begins with each large white area, and goes on beyond lines.
-    Returns None if there is no large white area.
+    Photographs and filled shapes are not part of the mask. Paper starts at each large white area and continues beyond
+    lines. Returns None if there is no large white area.
     """
     _, parts, facts, _ = cv2.connectedComponentsWithStats((colours.min(axis=2) >= _WHITE).astype(np.uint8))
     area = facts[:, cv2.CC_STAT_AREA]
@@ -217,10 +217,10 @@ def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         if not len(added):
             break
         known[added] = True
-    # Closing adds the lines and letters, and keeps the straight edges of photographs.
+    # Morphological closing adds the lines and letters, and keeps the straight edges of photographs.
     return cv2.morphologyEx(known[parts].astype(np.uint8), cv2.MORPH_CLOSE, shape).astype(bool)
 
 
 def plain(text: object) -> str:
-    """A name from a file for a figure: one printable line of at most 60 characters."""
+    """Make a name from a file safe for a figure: one printable line of at most 60 characters."""
     return shortened(one_line(text), 60)

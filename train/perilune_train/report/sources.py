@@ -1,4 +1,4 @@
-"""Where figures come from: provenance of runs and of datasets, and the datasets and runs of each kind of report."""
+"""Datasets and runs of each kind of report, and their provenance."""
 
 import hashlib
 import json
@@ -18,9 +18,9 @@ from perilune_train.report.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
 Kind = Literal["demo", "paper", "benchmark"]
 SCORE_FILE = "benchmark.json"
 INSTALLED = "-installed"
-"""End of the name of an evaluation of the installed detector, which has no settings and no threshold of its own."""
+"""End of the folder name of an evaluation of the installed detector. This folder has no settings and no threshold."""
 LARGEST_JSON_BYTES = 16 * 2**20
-"""Largest JSON file that is read, bytes."""
+"""Largest size of a JSON file that is read, bytes."""
 
 
 @dataclass(frozen=True)
@@ -28,43 +28,44 @@ class Run:
     """A finished run, or a score on the locked benchmark."""
 
     folder: Path
-    """Its folder."""
+    """Folder of the run or score."""
     name: str
-    """Name in figures: the folder's."""
+    """Name in figures: the name of the folder."""
     metrics: Metrics
     """Flat keys of metrics.json, or of benchmark.json."""
     provenance: Provenance
-    """Configuration, inputs, commit."""
+    """Configuration, inputs and commit of the run."""
 
 
 @dataclass(frozen=True)
 class Folders:
-    """Folders of a report; any may be absent."""
+    """Folders that a report reads; any of them may be absent."""
 
     datasets: tuple[Path, ...]
     """Datasets, detection before navigation."""
     detect: tuple[Path, ...]
-    """Runs of detection."""
+    """Detection runs."""
     navigate: tuple[Path, ...]
-    """Runs of navigation."""
+    """Navigation runs."""
     methods: tuple[Path, ...]
-    """All methods of navigation over a split."""
+    """Comparisons of all navigation methods on a split."""
     explain: tuple[Path, ...]
-    """Runs of explanation, and of rendered interventions."""
+    """Explanation runs, including rendered interventions."""
     scores: tuple[Path, ...] = ()
     """Scores on the locked benchmark."""
     landing: Path | None = None
-    """The filter over draws of the test descents."""
+    """Monte Carlo run of the filter on the test descents."""
     page: Path | None = None
-    """Folder with paper.json and pictures of the paper's experiment."""
+    """Folder with paper.json and the pictures of the paper's experiment."""
 
 
 def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
     """The folders of a report by its kind.
 
-    demo: `dataset` has detect and nav, and runs are <runs>/<task>/<name>; <runs>/detect/<name>-installed has an
-    evaluation of the installed detector. paper: the same with the networks' names, below the folder of the experiment.
-    benchmark: `dataset` has the benchmark's datasets; all scores below <runs>/benchmark are shown.
+    demo: `dataset` contains detect and nav. Runs are <runs>/<task>/<name>. <runs>/detect/<name>-installed is the
+    evaluation of the installed detector.
+    paper: as for demo, but in the folder of the experiment and with the networks' names.
+    benchmark: `dataset` contains the benchmark's datasets. All scores in <runs>/benchmark are shown.
     """
     both = (dataset / "detect", dataset / "nav")
     if kind == "demo":
@@ -96,9 +97,9 @@ def _scores(runs: Path) -> tuple[Path, ...]:
 
 
 def read_run(folder: Path, root: Path, file: str = METRICS_FILE) -> Run | None:
-    """Read a run; None if it is absent or not finished. Raises UserError if a file of it is damaged.
+    """Read a run; None if it is absent or not finished. Raises UserError if one of its files is damaged.
 
-    `root` is the folder of all runs, which names in the report do not contain.
+    `root` is the folder of all runs. Names in the report are relative to it.
     """
     if not (folder / file).is_file():
         return None
@@ -108,14 +109,15 @@ def read_run(folder: Path, root: Path, file: str = METRICS_FILE) -> Run | None:
 
 
 def sources_of(runs: Sequence[Run]) -> tuple[Provenance, ...]:
-    """Provenance of several runs."""
+    """Provenance of each of several runs."""
     return tuple(run.provenance for run in runs)
 
 
 def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Provenance:
-    """Provenance of a run's folder: config.yaml, inputs.json and the entries run/... of its metrics, as far as known.
+    """Provenance of a run's folder, from config.yaml, inputs.json and the entries run/... of its metrics.
 
-    The random seed is that of config.yaml, or the entry `seed` of the metrics of a folder without one.
+    Unknown parts are left out. The random seed comes from config.yaml, or from the metric `seed` if the folder has no
+    config.yaml.
 
     Raises UserError if a file is damaged.
     """
@@ -141,9 +143,9 @@ def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Prove
 
 
 def provenance_of_dataset(dataset: Dataset) -> Provenance:
-    """Provenance of a dataset: hash of its dataset.json, random seeds, versions and settings of its recipes.
+    """Provenance of a dataset: the hash of dataset.json, and the random seeds, versions and settings of its recipes.
 
-    A dataset records no command, commit or date, so that equal datasets are equal byte for byte. The versions contain
+    A dataset records no command, commit or date, so that rendering it again gives equal bytes. The versions contain
     hashes of the renderer's code.
     """
     recipes = list(dataset.info.recipes.values())

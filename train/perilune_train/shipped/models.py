@@ -1,4 +1,4 @@
-"""The networks that are installed with this package. The folder of each is a run: every `--run` takes it."""
+"""The trained networks that are installed with this package. Every `--run` option accepts their folders."""
 
 import json
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ class ShippedModel:
     """A trained network that is installed with this package."""
 
     name: str
-    """Name of its folder."""
+    """Name of the network and of its folder."""
     task: Task
-    """What it does: detect (craters) or navigate."""
+    """Task of the network: detect (craters) or navigate."""
     folder: Path
-    """Its folder: config.yaml, metrics.json, weights.safetensors, benchmark.json, card.md."""
+    """Folder with config.yaml, metrics.json, weights.safetensors, benchmark.json and card.md."""
 
     @property
     def megabytes(self) -> float:
-        """Size of its weights, MB."""
+        """Size of the file of weights, MB."""
         return (self.folder / WEIGHTS).stat().st_size / 1e6
 
     @property
     def headline(self) -> str:
-        """Its least favourable figure on the locked benchmark, as text."""
+        """The strictest figure of this network on the locked benchmark, as text."""
         path = self.folder / BENCHMARK
         if not path.is_file():
             return "not scored on the locked benchmark"
@@ -44,19 +44,19 @@ class ShippedModel:
 
 
 def shipped_models() -> list[ShippedModel]:
-    """All installed networks, by name."""
+    """All installed networks, sorted by name."""
     return [ShippedModel(n, t, _FOLDER / n) for n, t in _TASKS.items() if (_FOLDER / n / WEIGHTS).is_file()]
 
 
 def weights_file(given: str | Path) -> Path:
-    """The file of weights that a setting names: a path, or the name of an installed network (`crater-detector`)."""
+    """The file of weights for a setting, which is a path or the name of an installed network (`crater-detector`)."""
     installed = {model.name: model.folder / WEIGHTS for model in shipped_models()}
     path = Path(given)
     return path if path.exists() else installed.get(str(given), path)
 
 
 def shipped_run(task: Task) -> Path:
-    """Folder of the installed network of a task. Raises UserError if none is installed."""
+    """Folder of the installed network for a task. Raises UserError if there is no such network."""
     found = [model.folder for model in shipped_models() if model.task == task]
     if not found:
         raise UserError("--run", "run", "not given, and no network is installed for this task", "the folder of a run")

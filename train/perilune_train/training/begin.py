@@ -1,4 +1,4 @@
-"""Resume, keep, replace or reject an existing run of the same name."""
+"""Decide whether to resume, keep, replace or reject an existing run with the requested name."""
 
 import contextlib
 import functools
@@ -32,7 +32,7 @@ _STATE_KEY = "perilune/run"
 
 
 def hashes_of(inputs: Mapping[str, Address | None]) -> dict[str, str | None]:
-    """Hash of each input: of dataset.json for a dataset (a folder or an address), otherwise of the file."""
+    """SHA-256 of each input. For a dataset (a folder or an address), the hash of its dataset.json."""
     return {name: None if address is None else _hash_of(address) for name, address in inputs.items()}
 
 
@@ -48,7 +48,8 @@ def _hash_of(address: Address) -> str | None:
 def held(*folders: RunFolder) -> Iterator[None]:
     """Lock the folders of runs within the block, so that no second training writes into them.
 
-    Of several processes that train together, the first holds the locks. Raises UserError if another training holds one.
+    If several processes train together, the first one holds the locks. Raises UserError if another training holds a
+    lock.
     """
     with contextlib.ExitStack() as locks:
         for run in folders if is_first_process() else ():
@@ -59,11 +60,12 @@ def held(*folders: RunFolder) -> Iterator[None]:
 def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrite: bool = False) -> State:
     """Decide what to do with a run's folder; all processes get the same decision.
 
-    new: start from the beginning, since there is no state or `overwrite` is given. resume: continue from last.ckpt.
-    finished: leave the run unchanged and print a message.
+    new: start from the beginning, because there is no saved state or `overwrite` is given. resume: continue from
+    last.ckpt. finished: leave the run unchanged and print a message.
 
-    Raises UserError if the existing run has other settings or inputs, if the folder holds no run of this task, or if
-    the first process resumes but this one has no last.ckpt (several machines, no shared folder).
+    Raises UserError if the existing run has other settings or inputs, or if the folder is not a run of this task. Also
+    raises it if the first process resumes but this process has no last.ckpt, because several machines train without a
+    shared folder.
     """
     if is_first_process():
         state = _decide(run, task, config, inputs, overwrite)
@@ -72,7 +74,7 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
     elif torch.distributed.is_torchelastic_launched():
         state = _store().get(f"{_STATE_KEY}/{run.root.name}").decode()
     else:
-        # Lightning starts these processes on the first process's machine, after the first has prepared the folder.
+        # Lightning starts these processes on the machine of the first process, which has already prepared the folder.
         state = "resume" if run.last.is_file() else "new"
     if state == "resume" and not run.last.is_file():
         expected = "the file of the first process: share the runs folder between the machines, or copy it"
@@ -85,10 +87,10 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
 
 
 def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state: State) -> None:
-    """Prepare the folder of a run: with `new`, remove an older run and write config.yaml and inputs.json.
+    """Prepare the folder of a run. If `state` is new, remove an older run and write config.yaml and inputs.json.
 
-    Of several processes, only the first changes the folder. Raises UserError on a folder that is not a run of this
-    task.
+    If there are several processes, only the first changes the folder. Raises UserError if the folder is not a run of
+    this task.
     """
     # Record the commit before training: the checkout may change during it.
     run_record()
@@ -109,7 +111,7 @@ def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state:
 
 @functools.cache
 def _store() -> Any:
-    """The key-value store of torchrun; unlike torch's process group it is available before training starts."""
+    """The key-value store of torchrun. Unlike torch's process group, it is available before training starts."""
     return next(torch.distributed.rendezvous("env://"))[0]
 
 
@@ -118,11 +120,11 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
         return "new"
     _check_own(run, task)
     damaged, finished = run.damaged, run.finished
-    # Without a saved state, weights would be replaced; metrics alone are computed again.
+    # Without a saved state, a new training would replace the weights. Metrics alone can be computed again.
     lost = damaged == run.best or (run.best.is_file() and not run.last.is_file())
     if damaged is not None and lost and not overwrite:
         raise UserError(damaged, "file", "an empty or damaged file", f"a whole file of the run{_REPLACE}")
-    # A run without a saved state may be replaced, whatever its settings were.
+    # A run without a saved state may be replaced even if its settings differ.
     if overwrite or not (finished or run.last.is_file()):
         return "new"
     check_settings(run, task, config)
@@ -131,15 +133,15 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
 
 
 def _is_used(run: RunFolder) -> bool:
-    # A process killed at its start may leave a temporary file, whose name begins with a dot.
+    # Ignore names that begin with a dot: a process that is killed at its start may leave such a temporary file.
     return run.root.is_dir() and any(not path.name.startswith(".") for path in run.root.iterdir())
 
 
 def _check_own(run: RunFolder, task: str) -> None:
-    """Raise UserError unless the folder is a run of this task: its config.yaml has this section and no other."""
+    """Raise UserError unless the folder is a run of this task, whose config.yaml has only the section of the task."""
     expected = f"another name: only a {task} run is resumed or replaced"
     if not run.config.is_file():
-        # A folder with only inputs.json is a run that was killed before it wrote its configuration.
+        # A folder with only inputs.json belongs to a run that was killed before it wrote config.yaml.
         if [path.name for path in run.root.iterdir() if not path.name.startswith(".")] == [run.inputs.name]:
             return
         raise UserError(run.root, "--name", "a folder that is not a run (no config.yaml)", expected)
@@ -149,9 +151,9 @@ def _check_own(run: RunFolder, task: str) -> None:
 
 
 def check_settings(run: RunFolder, task: str, config: Section) -> None:
-    """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
+    """Compare an older run, if there is one, with `config`. Raises UserError with the first setting that differs.
 
-    A setting that is missing in config.yaml was added after the run; the run used its default.
+    A setting that is missing in config.yaml was added after the run; the run used the default of this setting.
     """
     if not run.config.is_file():
         return
@@ -161,9 +163,9 @@ def check_settings(run: RunFolder, task: str, config: Section) -> None:
 
 
 def _check_inputs(run: RunFolder, inputs: Hashes, skip_missing: bool) -> None:
-    """Raise UserError naming the first input whose hash differs from the one in inputs.json.
+    """Compare the inputs with inputs.json. Raises UserError with the first input whose hash differs.
 
-    With `skip_missing`, inputs that are missing now or were missing when the run started are not compared.
+    With `skip_missing`, inputs that are missing now, or were missing when the run started, are not compared.
     """
     if not run.inputs.is_file():
         return
@@ -183,7 +185,7 @@ def _check_inputs(run: RunFolder, inputs: Hashes, skip_missing: bool) -> None:
 
 
 def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
-    """Key, old and new value of each difference between plain settings and a section."""
+    """Key, old value and new value of each setting in which plain settings differ from a section."""
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
         key, value = f"{where}.{name}", getattr(config, name)

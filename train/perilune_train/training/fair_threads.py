@@ -1,4 +1,4 @@
-"""Number of torch's threads on a CPU, adapted to other work on the machine."""
+"""Adapt torch's number of CPU threads to the load from other processes on the machine."""
 
 import math
 import time
@@ -11,25 +11,26 @@ from perilune_shared.threads import OtherWork, chosen_by_user
 _CHECK_S = 1.0
 """Interval at which the load of other processes is read, seconds."""
 _TRIAL_S, _TRIAL_STEPS = 1.0, 3
-"""Smallest duration, seconds, and number of steps of a trial of one number of threads."""
+"""Smallest duration, seconds, and smallest number of steps of a trial with one number of threads."""
 _RETRY_S = 20.0
 """Smallest interval between two trials, seconds."""
 _QUIET_CORES = 0.2
 """Load of other processes, in cores, below which all threads are used."""
 _GAIN = 1.03
-"""Smallest gain in speed for which the number of threads changes."""
+"""Smallest ratio of new to old speed at which the number of threads changes."""
 
 
 class FairThreads:
-    """Chooses torch's number of threads for each step of a loop; restores it after the step.
+    """Chooses torch's number of threads for each step of a loop, and restores the program's number after the step.
 
-    Each operation ends when its slowest thread ends. If another process takes half of one core, all threads of an
-    operation run at half speed, and fewer threads are faster. While other processes use the cores, a trial of some
-    steps with fewer threads decides; when they have ended, all threads are used again.
+    An operation ends when its slowest thread ends. If another process takes half of one core, all threads of an
+    operation effectively run at half speed, and fewer threads are faster. While other processes use the cores, trials
+    of a few steps with fewer threads decide on the number. When the other processes have ended, all threads are used
+    again.
 
     The number of threads changes the last digits of sums, so two trainings on a busy machine are equal only up to
-    rounding. It stays constant on an idle machine, on a GPU, and if OMP_NUM_THREADS is set; set it for exactly
-    repeatable trainings.
+    rounding. The number stays constant on an idle machine, on a GPU, and if OMP_NUM_THREADS is set. For exactly
+    repeatable trainings, set OMP_NUM_THREADS.
 
     Example:
 
@@ -45,24 +46,25 @@ class FairThreads:
         clock: Callable[[], float] = time.monotonic,
         others: Callable[[], float] | None = None,
     ):
-        """Without `enabled` the number stays: torch computes on a GPU, or several processes share the cores.
+        """Without `enabled` the number of threads stays constant.
 
-        `clock` returns the time, s; `others` the cores that other processes have used since its last call.
+        Disable it if torch computes on a GPU, or if several training processes share the cores. `clock` returns the
+        time, s. `others` returns the number of cores that other processes have used since the last call of `others`.
         """
         self._active = enabled and not chosen_by_user("OMP_NUM_THREADS")
         self._clock, self._others = clock, OtherWork().cores if others is None else others
         self._checked_s, self._tried_s = clock(), clock() - _RETRY_S
         self._most = self._number = self._preferred = torch.get_num_threads()
-        """Numbers of threads of the program, of the next step, and outside trials."""
+        """Numbers of threads: set by the program, used in the next step, and used outside trials."""
         self._waiting: list[int] = []
-        """Numbers of threads still to be tried, the current one first; empty outside a trial."""
+        """Numbers of threads that are still to be tried, the current one first; empty outside trials."""
         self._speeds: dict[int, float] = {}
         self._n_steps, self._steps_s, self._began_s = 0, 0.0, 0.0
 
     def __enter__(self) -> "FairThreads":
         if self._active:
             if torch.get_num_threads() != self._most:
-                # The program has chosen another number since the last step.
+                # The program has set another number since the last step.
                 self._most = self._number = self._preferred = torch.get_num_threads()
                 self._waiting = []
             _use(self._number)
@@ -80,7 +82,7 @@ class FairThreads:
             self._check(now_s)
 
     def restore(self) -> None:
-        """Use the program's number again after a step that failed."""
+        """Restore the program's number of threads after a failed step."""
         if self._active:
             _use(self._most)
 
@@ -106,7 +108,7 @@ class FairThreads:
             self._preferred = best
         self._number = self._preferred
         self._checked_s = self._tried_s = now_s
-        # The load during the trial says nothing about the chosen number.
+        # Discard the load measured during the trial, because it does not apply to the chosen number.
         self._others()
 
     def _try_next(self) -> None:

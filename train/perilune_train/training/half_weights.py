@@ -1,4 +1,4 @@
-"""Weights as a safetensors file in half precision or in 8 bits: small, and loading it executes nothing."""
+"""Weights as a small safetensors file, in half precision or 8 bits. Loading it executes no code."""
 
 import json
 from collections.abc import Mapping
@@ -17,16 +17,17 @@ SUFFIX = ".safetensors"
 _MOST_HEADER_BYTES = 8_000_000
 _DTYPES = {"F16", "F32", "F64", "I64", "I32", "I8", "BOOL"}
 _STEP = "#step"
-"""Suffix of the name of the tensor with the steps of an 8-bit tensor."""
+"""Suffix in the name of the tensor that holds the quantisation steps of an 8-bit tensor."""
 _PLAIN = ("architecture", "terrain")
-"""Keys of a checkpoint that are stored as JSON in the header; `terrain` may be missing."""
+"""Keys of a checkpoint whose values are stored as JSON in the header; `terrain` may be missing."""
 
 
 def write_half(path: Path, content: Mapping[str, Any]) -> None:
     """Write the content of a checkpoint (`runs.load_weights`) in half precision.
 
-    Only convolutions and matrices are halved. Vectors, such as the variances of norms, and buffers keep their type:
-    they are few and may exceed the range of half precision. Raises UserError if a weight exceeds it.
+    Only convolutions and matrices are converted. Vectors, such as the variances of norms, and buffers keep their type,
+    because they are few and may exceed the range of half precision. Raises UserError if a converted weight exceeds this
+    range.
     """
     tensors = {}
     for name, tensor in content["state_dict"].items():
@@ -40,8 +41,8 @@ def write_half(path: Path, content: Mapping[str, Any]) -> None:
 def write_bytewise(path: Path, content: Mapping[str, Any]) -> None:
     """Write the content of a checkpoint with 8 bits per weight, half the size of `write_half`.
 
-    The same tensors are rounded: each output channel to integers of -127 to 127 times its own step (float32). Raises
-    UserError if a weight is not finite.
+    Convolutions and matrices are rounded, as in `write_half`. Each output channel has a step (float32), and its weights
+    become integers from -127 to 127 times this step. Raises UserError if a weight is not finite.
     """
     tensors = {}
     for name, tensor in content["state_dict"].items():
@@ -49,7 +50,7 @@ def write_bytewise(path: Path, content: Mapping[str, Any]) -> None:
             raise UserError(path, name, "a weight that is not finite", "finite weights")
         if _is_rounded(name, tensor):
             flat = tensor.float().flatten(1)
-            # A channel of zeros has any step.
+            # Any positive step is correct for a channel of zeros.
             step = (flat.abs().amax(1) / 127).clamp(min=torch.finfo(torch.float32).tiny)
             tensors[name] = torch.round(flat / step[:, None]).to(torch.int8).view(tensor.shape).contiguous()
             tensors[name + _STEP] = step
@@ -69,7 +70,7 @@ def _write(path: Path, tensors: dict[str, torch.Tensor], content: Mapping[str, A
 
 
 def read_half(path: Path) -> dict[str, Any]:
-    """The content that `write_half` or `write_bytewise` wrote, weights as float32, on the CPU.
+    """Read a file of `write_half` or `write_bytewise`; return the content with weights as float32 on the CPU.
 
     Raises UserError on any other file.
     """
@@ -92,7 +93,7 @@ def read_half(path: Path) -> dict[str, Any]:
 
 
 def _as_float32(path: Path, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Undo the rounding. Raises UserError if integers and steps do not belong together."""
+    """Convert tensors to float32. Raises UserError if 8-bit tensors and their steps do not match."""
     steps = {name.removesuffix(_STEP): tensors.pop(name) for name in list(tensors) if name.endswith(_STEP)}
     for name in {key for key, tensor in tensors.items() if tensor.dtype == torch.int8} | set(steps):
         whole, step = tensors.get(name), steps.get(name)
@@ -106,17 +107,17 @@ def _as_float32(path: Path, tensors: dict[str, torch.Tensor]) -> dict[str, torch
 
 
 def precision_of(path: Path) -> str:
-    """How a file stores its weights, for people: half precision or 8 bits per weight."""
+    """How a file stores its weights, as text for users: half precision or 8 bits per weight."""
     with safetensors.safe_open(path, "pt") as file:
         bytewise = any(file.get_slice(name).get_dtype() == "I8" for name in file.keys())  # noqa: SIM118
     return "8 bits per weight" if bytewise else "half precision"
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file is a complete safetensors file; reads no tensor."""
+    """Whether a file is a complete safetensors file. No tensor is read."""
     try:
         _check_header(path, "")
-        # The library refuses a file whose size differs from the sizes of its header and its tensors.
+        # The library rejects a file whose size differs from the total size of its header and tensors.
         with safetensors.safe_open(path, "pt"):
             return True
     except (safetensors.SafetensorError, UserError, OSError):
@@ -124,7 +125,7 @@ def is_whole(path: Path) -> bool:
 
 
 def _check_header(path: Path, expected: str) -> None:
-    """Refuse a file or a header above the limits, before the library reads it."""
+    """Reject a file or a header that exceeds the size limits, before the library reads it."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = int.from_bytes(stream.read(8), "little")

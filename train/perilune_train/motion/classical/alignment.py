@@ -1,15 +1,15 @@
-"""Direct alignment of two frames: the motion, tilt and heights of the ground that make the second look like the first.
+"""Direct alignment of two frames: fit motion, tilt and ground heights so that the second frame matches the first.
 
-Unknowns, in this order: turn (3) and shift (3) of the points of frame 2, tilt of frame 1 (2), heights at the nodes of a
-grid over the ground (25). Steps for each level of an image pyramid, coarsest first:
+The unknowns, in this order, are turn (3) and shift (3) of the points of frame 2, tilt of frame 1 (2), and heights at
+the nodes of a grid over the ground (25). Steps for each level of an image pyramid, coarsest first:
 
 1. Project the pixels of frame 1 onto the ground and into frame 2 (`_Residuals.normal_equations`).
 2. Compare local contrast (contrast.py), with Tukey's weights (Beaton & Tukey 1974, doi
    10.1080/00401706.1974.10489171).
 3. Take a Gauss-Newton step, with the prior of motion, tilt and heights (`align`).
 
-Lucas & Kanade 1981; with free heights as in direct odometry, Engel et al. 2018, doi 10.1109/TPAMI.2017.2658577. Along a
-trajectory each pair starts from KLT's motion and the heights of the previous pair (`aligned_trajectory`).
+Sources: Lucas & Kanade 1981; for free heights, direct odometry (Engel et al. 2018, doi 10.1109/TPAMI.2017.2658577).
+Along a trajectory, each pair starts from KLT's motion and the heights of the previous pair (`aligned_trajectory`).
 """
 
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ from perilune_train.motion.data.trajectories import Trajectory
 
 _TUKEY = 4.685
 _DEPENDENT_PIXELS = 6.0
-"""Number of pixels that count as one, because errors of neighbouring pixels are correlated. Chosen on training and
-validation scenes."""
+"""Number of pixels that together count as one independent pixel, because errors of neighbouring pixels are correlated.
+Chosen on training and validation scenes."""
 _TILT_SIGMA_RAD = float(np.radians(0.5))
-"""Standard deviation of the tilt about a level attitude, on each axis, radians."""
+"""Standard deviation of the tilt from a level attitude, about each axis, radians."""
 _ITERATIONS = 8
 _SMALL_STEP = 1e-5
-"""Step of turn, and of shift divided by altitude, below which the iteration ends."""
+"""The iteration ends when the steps of the turn (radians) and of shift / altitude are smaller than this."""
 _MARGIN_PX = 2
 _N_POSE = 8
 _N_UNKNOWN = _N_POSE + N_NODES
@@ -49,9 +49,9 @@ class Prior:
     motion: ExpectedMotion
     """Expected motion."""
     plane: GroundPlane
-    """The ground plane below frame 1, if the camera is level."""
+    """The ground plane below frame 1, for a level camera."""
     heights: Heights
-    """Heights of the ground in view of frame 1."""
+    """Heights of the ground that frame 1 shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class State:
     """Heights at the nodes (N_NODES,)."""
 
     def changed(self, step: Array) -> "State":
-        """The state after a step of all unknowns (n_unknown,)."""
+        """The state after adding a step of all unknowns (n_unknown,)."""
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
         rotation_c2_from_c1 = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
         translation = self.translation_m - rotation_c2_from_c1.T @ step[3:6]
@@ -88,9 +88,9 @@ class State:
 
 
 def align(first: list[Level], second: list[Level], prior: Prior, start: State) -> tuple[State, Array]:
-    """Align two pyramids, the coarsest level first; returns the state and its covariance (n_unknown, n_unknown).
+    """Align two pyramids, coarsest level first; return the state and its covariance (n_unknown, n_unknown).
 
-    Turns are from the left, radians; shifts are metres, O_C of frame 2.
+    Turns multiply from the left and are in radians. Shifts are in metres, O_C of frame 2.
     """
     precision = np.zeros((_N_UNKNOWN, _N_UNKNOWN))
     shift_sigma_m = SHIFT_SHARE * prior.plane.altitude_m
@@ -147,8 +147,10 @@ class _Residuals:
         return (scaled.T @ jacobian).astype(np.float64), (scaled.T @ error).astype(np.float64)
 
     def _jacobian(self, points: Array, moved: Array, along: Array, by_moved: Array, by_first: Array) -> Array:
-        """Derivatives (n, n_unknown) of the differences, from their derivatives by the points of frame 2 and of frame 1
-        (n, 3)."""
+        """Derivatives (n, n_unknown) of the differences with respect to the unknowns.
+
+        They are computed from the derivatives (n, 3) with respect to the points of frame 2 and of frame 1.
+        """
         jacobian: NDArray[Any] = np.empty((len(points), _N_UNKNOWN), np.float32)
         # A turn w from the left moves a point X by w x X, so it changes the value by w . (X x derivative).
         jacobian[:, :3], jacobian[:, 3:6] = np.cross(moved, by_moved), by_moved
@@ -159,7 +161,7 @@ class _Residuals:
 
 
 def _by_point(by_u: Array, by_v: Array, points: Array, camera: Camera) -> Array:
-    """Derivatives (n, 3) by points (n, 3), O_C, from the derivatives by image coordinates."""
+    """Derivatives (n, 3) with respect to points (n, 3), O_C, from the derivatives with respect to image coordinates."""
     x, y, z = points.T
     by_x, by_y = by_u * np.float32(camera.fx_px) / z, by_v * np.float32(camera.fy_px) / z
     return np.stack([by_x, by_y, -(by_x * x + by_y * y) / z], axis=1)
@@ -173,9 +175,9 @@ def _across(down_c: Array) -> Array:
 
 
 def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
-    """Motions of a whole trajectory, from images and, if given, a gyroscope.
+    """Estimate the motions of a whole trajectory from images and, if given, a gyroscope.
 
-    The altitude is true at the first frame and then updated by the estimated motions.
+    The altitude of the first frame is the true one; the estimated motions then update it.
     """
     nominal_translation, nominal_rotation_c2_from_c1 = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
@@ -193,7 +195,7 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
             ExpectedMotion(nominal_translation[i], nominal_rotation_c2_from_c1[i], turn_sigma[i]),
             GroundPlane(down, altitude_m),
         )
-        # KLT must know the gyroscope's rotation too: its shift compensates errors of its own rotation.
+        # Give the gyroscope's rotation to KLT too, because KLT's shift compensates errors of KLT's rotation.
         tracked = klt_motion(camera, grey[i], grey[i + 1], expected, plane)
         prior = Prior(expected, plane, heights)
         start = State(tracked.translation_m, tracked.rotation_c2_from_c1, np.zeros(2), heights.mean_m)

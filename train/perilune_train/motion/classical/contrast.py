@@ -1,4 +1,4 @@
-"""Local contrast of frames, their pyramid, and its values between pixels."""
+"""Local contrast of frames, image pyramids, and bilinear sampling."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,9 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 _FINE_PX, _COARSE_PX = 0.5, 2.0
-"""Standard deviations of both blurs, pixels. Chosen on training and validation scenes."""
+"""Standard deviations of the fine and the coarse blur, pixels. Chosen on training and validation scenes."""
 _LEAST_BACKGROUND = 2.0
-"""Added to the background, grey values, so that the contrast of black shadow stays finite."""
+"""Grey value that is added to the background, so that the contrast in black shadow stays finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +25,10 @@ class Level:
 
 
 def local_contrast(image: np.ndarray) -> Array:
-    """Detail of an 8-bit image relative to its surroundings, (height, width): (G_fine - G_coarse) / G_coarse.
+    """Contrast (height, width) of an 8-bit image with its surroundings: (G_fine - G_coarse) / G_coarse.
 
-    A factor on the brightness that varies over many pixels does not change it. Alignment of grey values gave errors of
-    metres (docs/notebook/2026-11-23-alignment.md).
+    A brightness factor that varies slowly, over many pixels, does not change this contrast. Aligning grey values
+    instead gave errors of metres (docs/notebook/2026-11-23-alignment.md).
     """
     grey = image.astype(np.float32)
     fine, coarse = (
@@ -38,7 +38,7 @@ def local_contrast(image: np.ndarray) -> Array:
 
 
 def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:
-    """Levels of an image, coarsest first; each has half the size of the next, by area averaging."""
+    """Levels of an image, coarsest first. Each is half as large as the next one, reduced by area averaging."""
     levels = []
     for number in range(n_levels):
         if number:
@@ -53,9 +53,9 @@ def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:
 
 
 def sampled(values: Array, pixels: Array) -> Array:
-    """Bilinear values (k, n) of maps (k, height, width) at image coordinates (n, 2); NaN outside.
+    """Interpolate maps (k, height, width) bilinearly at image coordinates (n, 2); returns (k, n), NaN outside.
 
-    OpenCV's `remap` would round coordinates to 1/32 px.
+    OpenCV's `remap` is not used, because it rounds coordinates to 1/32 px.
     """
     height, width = values.shape[1:]
     x, y = pixels[:, 0] - 0.5, pixels[:, 1] - 0.5

@@ -1,4 +1,4 @@
-"""Prior knowledge of the classical methods about a pair of frames, and their result for a trajectory."""
+"""What the classical methods know in advance about a pair of frames, and their result for a trajectory."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class ExpectedMotion:
     rotation_c2_from_c1: Array
     """Rotation (3, 3)."""
     turn_sigma_rad: float
-    """Standard deviation of the rotation about each axis, radians."""
+    """Standard deviation of the true rotation from the expected one, about each axis, radians."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,5 +35,5 @@ class EstimatedMotion:
     motion: Motion
     """translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
     covariance: Array
-    """Covariances (n - 1, 6, 6) of rotation (turn from the left, radians) and shift (metres, O_C of the later
-    frame)."""
+    """Covariances (n - 1, 6, 6) of rotation and shift. The rotation is a turn that multiplies from the left, in
+    radians; the shift is in metres, O_C of the later frame."""

@@ -1,11 +1,11 @@
 """The classical baseline: corners tracked from frame to frame, and a robust motion fit over the ground plane.
 
 1. Warp frame 2 onto frame 1 by the expected motion, so that only a small residual at one scale is left.
-2. Find corners in frame 1, track them into frame 2 and back, and drop tracks that do not return (`_tracks`). Lucas &
-   Kanade 1981, with pyramids after Bouguet 2001, as in OpenCV.
+2. Find corners in frame 1, track them into frame 2 and back, and drop tracks that do not return (`_tracks`): Lucas &
+   Kanade 1981, with the pyramids of Bouguet 2001, as implemented in OpenCV.
 3. Project the corners of frame 1 onto the ground plane at the estimated altitude.
-4. Fit the motion by Gauss-Newton on the reprojection error, with Tukey's weights and a weak prior (`_fit`). Beaton
-   & Tukey 1974, doi 10.1080/00401706.1974.10489171.
+4. Fit the motion by Gauss-Newton on the reprojection error, with Tukey's weights (Beaton & Tukey 1974, doi
+   10.1080/00401706.1974.10489171) and a weak prior (`_fit`).
 """
 
 from dataclasses import dataclass
@@ -32,35 +32,36 @@ _CONSISTENCY_PX = 0.5
 _TUKEY = 4.685
 NOMINAL_TURN_SIGMA_RAD = float(np.radians(0.5))
 SHIFT_SHARE = 0.02
-"""Standard deviations of a weak prior about the nominal motion: of the rotation, radians, and of the shift divided by
-altitude. Few or clustered corners cannot separate tilt from sideways shift, which look alike from above."""
+"""Standard deviations of a weak prior on the nominal motion: NOMINAL_TURN_SIGMA_RAD for the rotation, in radians, and
+SHIFT_SHARE for shift / altitude. The prior is needed because few or clustered corners cannot separate tilt from
+sideways shift, which look alike from above."""
 _ITERATIONS = 15
 _MIN_TRACKS = 8
 _MEDIAN_OF_SIGMA = 1.1774
-"""Median length of a vector with two normal components, divided by their standard deviation."""
+"""Median length of a vector with two normal components, divided by the standard deviation of one component."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """Motion between two frames from tracks."""
+    """Motion between two frames, estimated from tracks."""
 
     translation_m: Array
     """Motion (3,), O_C of frame 1."""
     rotation_c2_from_c1: Array
     """Rotation (3, 3)."""
     covariance: Array
-    """Covariance (6, 6) of the turn from the left (radians) and the shift (metres, O_C of frame 2): the Cramer-Rao
-    bound of the tracks, if their errors are independent and the ground is a plane. Residuals give the size of the
-    errors."""
+    """Covariance (6, 6) of the turn, which multiplies from the left (radians), and the shift (metres, O_C of frame 2).
+    It is the Cramer-Rao bound for these tracks if their errors are independent and the ground is a plane. The size of
+    the errors is estimated from the residuals."""
     n_tracks: int
     """Number of consistent tracks."""
 
 
 def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
-    """Motions of a whole trajectory, from images and, if given, a gyroscope.
+    """Estimate the motions of a whole trajectory from images and, if given, a gyroscope.
 
-    One pair gives the translation only relative to the altitude. The altitude is true at the first frame and then
-    updated by the estimated motions; the attitude is assumed to be level.
+    One pair of frames gives the translation only relative to the altitude. The altitude of the first frame is the true
+    one; the estimated motions then update it. The attitude is assumed to be level.
     """
     nominal_translation, nominal_rotation_c2_from_c1 = trajectory.nominal_motion
     turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
@@ -80,8 +81,10 @@ def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) 
 
 
 def stretched(images: np.ndarray) -> np.ndarray:
-    """Frames (n, height, width) with equal mean and contrast, 8 bits: OpenCV rejects flat windows by a fixed
-    threshold."""
+    """Stretch frames (n, height, width) to equal mean and contrast, 8 bits.
+
+    This is needed because OpenCV rejects windows of low contrast by a fixed threshold.
+    """
     return np.clip(110 + 45 * normalised(images), 0, 255).astype(np.uint8)
 
 
@@ -92,7 +95,7 @@ def klt_motion(
     expected: ExpectedMotion,
     plane: GroundPlane,
 ) -> Tracked:
-    """Motion between two 8-bit images (height, width), over the ground plane below the first.
+    """Estimate the motion between two 8-bit images (height, width), over the ground plane below the first camera.
 
     If fewer than 8 corners can be tracked, returns the expected motion with the prior's covariance and 0 tracks.
     """
@@ -147,7 +150,8 @@ def _fit(camera: Camera, points_c1: Array, pixels_2: Array, expected: ExpectedMo
         weights = np.clip(1 - (distance / (_TUKEY * spread)) ** 2, 0, None) ** 2
         x, y, z = points.T
         zero = np.zeros_like(z)
-        # Derivatives: of the pixel by the point in camera 2; of that point by a rotation (from the left) and a shift.
+        # Derivatives of the pixel with respect to the point in camera 2, then of this point with respect to a rotation
+        # (from the left) and a shift.
         by_point = np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
         by_point *= focal[:, None]
         cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)

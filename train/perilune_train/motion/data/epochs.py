@@ -8,15 +8,15 @@ from perilune_train.motion.data.sequences import Jitter, Sequence, pair_sequence
 from perilune_train.motion.data.trajectories import Trajectory
 
 Key = tuple[int, int, int, int]
-"""Epoch, position in its order, number of a trajectory, and first pair of a sequence."""
+"""Epoch, position in the epoch's order, number of the trajectory, and first pair of the sequence."""
 
 
 class TrainingSequences(torch_data.Dataset):
-    """The training sequences of a share; they depend on trajectories, seed and epoch only.
+    """The training sequences of one process; they depend only on trajectories, seed and epoch.
 
-    A trajectory gives about as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into
-    it, each with its own random start. A sequence belongs to the process of its trajectory. Sequences
-    of `warp` are mirrored and, with `jitter`, moved (see `pair_sequence`).
+    A trajectory gives about as many sequences of `n_pairs` pairs as fit into it. Each sequence has a random start.
+    `n_pairs` is reduced to the length of the shortest trajectory. A sequence belongs to the process that has its
+    trajectory. Sequences for `warp` are mirrored and, with `jitter`, moved (see `pair_sequence`).
     """
 
     def __init__(
@@ -36,12 +36,12 @@ class TrainingSequences(torch_data.Dataset):
 
     @property
     def fewest(self) -> int:
-        """Number of sequences of the process that has the fewest."""
+        """Smallest number of sequences of any process."""
         processes = self.share.processes
         return min(sum(self.counts[process::processes]) for process in range(processes))
 
     def keys(self, epoch: int) -> list[Key]:
-        """Keys of the share's sequences in the order of an epoch."""
+        """Keys of this process's sequences in the order of an epoch."""
         rng = np.random.default_rng([self.seed, epoch])
         windows = [
             (number, int(start))
@@ -57,7 +57,7 @@ class TrainingSequences(torch_data.Dataset):
         return self.augmented_sequence(key, self.trajectories[number], start)
 
     def augmented_sequence(self, key: Key, trajectory: Trajectory, start: int) -> Sequence:
-        """The pairs of a trajectory from `start` on, with the augmentation of a key."""
+        """The pairs of a trajectory from `start` on, with the augmentation that belongs to the key."""
         epoch, position, _, _ = key
         rng = np.random.default_rng([self.seed, epoch, position]) if self.warp else None
         return pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)

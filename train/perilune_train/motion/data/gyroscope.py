@@ -1,4 +1,4 @@
-"""Rotations between frames by integration of a gyroscope, from the table `inertial`."""
+"""Rotations between frames, integrated from the gyroscope measurements of the table `inertial`."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, InertialGrade
 
 _LATE_S = 1e-6
-"""Tolerance, seconds, with which measurements must reach the last frame."""
+"""Tolerance, seconds, for gaps between measurements and at both ends of the trajectory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,13 +20,15 @@ class GyroscopeTurns:
     rotation_c2_from_c1: Array
     """Rotations (n - 1, 3, 3)."""
     sigma_rad: Array
-    """Standard deviation of each rotation about every axis (n - 1,), radians, from the errors of the grade."""
+    """Standard deviation of each rotation, equal about all axes (n - 1,), radians, from the errors of the grade."""
 
 
 def gyroscope_turns(
     dataset: Dataset, ids: tuple[str, str], grade: InertialGrade, time_s: Array, rotation_camera_from_body: Array
 ) -> GyroscopeTurns | None:
-    """Rotations between frames at times (n,) of a trajectory (scene_id, trajectory_id); None if it has no such unit.
+    """Rotations between the frames at times (n,) of a trajectory; None if it has no inertial unit of this grade.
+
+    `ids` are scene_id and trajectory_id.
 
     Raises UserError if measurements are missing between the first and the last frame.
     """
@@ -53,7 +55,7 @@ def turns_between(
     grade: InertialGrade,
     rotation_camera_from_body: Array,
 ) -> GyroscopeTurns:
-    """Rotations between times (n,) from mean angular rates (m, 3), O_B, over intervals (m,) up to `end_s` (m,)."""
+    """Rotations between times (n,), from mean angular rates (m, 3), O_B, over intervals (m,) that end at `end_s`."""
     attitude = [np.eye(3)]
     for rate, interval in zip(angular_rate_radps, interval_s, strict=True):
         attitude.append(attitude[-1] @ matrix_from_rotation_vector(rate * interval))
@@ -65,7 +67,7 @@ def turns_between(
             for k, part in zip(number, since, strict=True)
         ]
     )
-    # R_site_from_body grows by turns from the right; the camera's rotation is C R_body_from_site.
+    # Turns multiply R_site_from_body from the right; the camera's rotation is C R_body_from_site.
     turn = np.swapaxes(body[1:], 1, 2) @ body[:-1]
     mounted = rotation_camera_from_body @ turn @ rotation_camera_from_body.T
     step_s, errors = np.diff(time_s), GRADES[grade]

@@ -1,4 +1,4 @@
-"""An image server as a source of training data: checks, frames of poses over its scenes, record of their terrain."""
+"""An image server as a source of training data: check it, request frames, and record the terrain of its scenes."""
 
 import threading
 from dataclasses import astuple, replace
@@ -22,8 +22,8 @@ _EXTENT_TOLERANCE = 1e-3
 class Stream:
     """The image server of a run.
 
-    Raises UserError if it does not answer or does not fit a navigation dataset. A scene on terrain of the dataset's
-    validation or test split is refused when it is first rendered.
+    Raises UserError if the server does not answer or does not fit a navigation dataset. A scene is refused when it is
+    first rendered if its terrain belongs to the validation or test split of the dataset.
     """
 
     def __init__(self, settings: StreamConfig, dataset: Dataset):
@@ -45,17 +45,17 @@ class Stream:
             raise UserError(settings.address, "extent of the ground", f"{self.served.extent_m:.1f} m", expected)
 
     def client(self) -> SceneClient:
-        """A new connection; use it in one thread."""
+        """Open a connection. Use it in one thread only."""
         return SceneClient(self.settings.address, self.settings.timeout_s)
 
     @property
     def uses(self) -> frozenset[TerrainUse]:
-        """The terrain that was rendered so far, also before a resume."""
+        """The terrain that was rendered so far, including before the run was resumed."""
         with self._lock:
             return frozenset(self._uses.values())
 
     def state_dict(self) -> list[list]:
-        """Number and terrain of the scenes that were rendered so far, as plain data."""
+        """Numbers and terrain of the scenes that were rendered so far, as plain data."""
         with self._lock:
             return [[number, *astuple(use)] for number, use in self._uses.items()]
 
@@ -71,11 +71,10 @@ class Stream:
     def rendered(
         self, client: SceneClient, scene: int, following: int | None, part: Trajectory, velocity: Array, index: int
     ) -> Trajectory:
-        """The poses of `part` (n) with images of a scene; `velocity` (n, 3) sets their motion blur, `index` their
-        noise.
+        """Return the n poses of `part` with images of a scene.
 
-        Meanwhile the server generates the `following` scene. Raises UserError if the server fails or the terrain is
-        held out.
+        `velocity` (n, 3) sets the motion blur of the images, `index` their noise. Meanwhile the server generates the
+        `following` scene. Raises UserError if the server fails or the terrain is held out.
         """
         self._record(client, scene)
         if following is not None:
@@ -89,9 +88,9 @@ class Stream:
         return replace(part, images=pixels, camera=camera)
 
     def _record(self, client: SceneClient, scene: int) -> None:
-        """Record the terrain of a scene before its first frame in this process.
+        """Record the terrain of a scene before its first frame is rendered in this process.
 
-        Raises UserError if it is held out, or differs from the terrain that the run used before.
+        Raises UserError if the terrain is held out, or differs from the terrain that the run used before.
         """
         if scene in self._known:
             return
@@ -119,7 +118,7 @@ class Stream:
 
 
 def _velocities(dataset: Dataset) -> dict[tuple[str, str], Array]:
-    """Velocities (n, 3) of each training trajectory, by its ids."""
+    """Velocities (n, 3) of each training trajectory, by scene_id and trajectory_id."""
     columns = ["scene_id", "trajectory_id", "frame_index", "velocity_mps"]
     table = dataset.table("frames", columns, split="train").to_pandas().sort_values(columns[:3])
     groups = table.groupby(["scene_id", "trajectory_id"])
@@ -127,7 +126,7 @@ def _velocities(dataset: Dataset) -> dict[tuple[str, str], Array]:
 
 
 def _check_camera(address: str, served: Camera, expected_camera: Camera) -> None:
-    """Raise UserError unless both cameras have the same view; sizes may differ."""
+    """Raise UserError unless both cameras have the same field of view; image sizes may differ."""
     sizes = (served.width_px, served.height_px), (expected_camera.width_px, expected_camera.height_px)
     views = [
         (c.fx_px / w, c.fy_px / h, c.cx_px / w, c.cy_px / h, w / h, *c.distortion)

@@ -1,9 +1,9 @@
-"""Training sequences over new ground, rendered by an image server while the network trains.
+"""Training sequences over new ground, rendered by an image server during training.
 
-A rendered sequence has poses of a training trajectory, rotated about the vertical through the site by a random angle,
-over a scene of the server. Attitudes relative to the path stay, since a descent from another azimuth has equal camera
-axes. So positions, motions and attitudes are distributed as in the training trajectories, except for the azimuth, which
-is uniform.
+A rendered sequence shows a scene of the server from the poses of a training trajectory. These poses are rotated about
+the vertical through the site by a random angle. Attitudes relative to the path do not change, because the camera axes
+relative to the path are equal in a descent from another azimuth. So positions, motions and attitudes are distributed as
+in the training trajectories, except for the azimuth, which is uniform.
 """
 
 from collections.abc import Iterator
@@ -22,15 +22,16 @@ from perilune_train.motion.data.stream import Stream
 from perilune_train.motion.data.trajectories import Trajectory
 
 _AHEAD = 8
-"""Largest number of rendered sequences waiting in memory."""
+"""Largest number of rendered sequences that wait in memory."""
 _INDICES = 2**30
 
 
 class StreamedSequences(TrainingSequences):
-    """Training sequences of which a share is rendered by a server; the others come from the trajectories.
+    """Training sequences, some of them rendered by a server; the others come from the trajectories.
 
-    The seeds and the epoch and position of a sequence determine whether it is rendered, over which scene, from which
-    poses and with which noise. `size_px` is the width to which frames are shrunk. Call `close` at the end.
+    Whether a sequence is rendered, over which scene, from which poses and with which noise, depends only on the seeds,
+    the epoch and the sequence's position in it. `size_px` is the width to which frames are shrunk. Call `close` at the
+    end.
     """
 
     def __init__(self, stream: Stream, size_px: int, *arguments: Any, **named: Any):
@@ -42,23 +43,25 @@ class StreamedSequences(TrainingSequences):
         return self._ahead.take(key) if self.is_rendered(key) else super().__getitem__(key)
 
     def close(self) -> None:
-        """Stop the thread that asks the server."""
+        """Stop the thread that sends requests to the server."""
         self._ahead.close()
 
     def is_rendered(self, key: Key) -> bool:
-        """Whether a sequence is rendered; rendered ones are evenly spread over the order of an epoch."""
+        """Whether a sequence is rendered. Rendered sequences are spread evenly over an epoch."""
         share = self.stream.settings.share
         return floor((key[1] + 1) * share) > floor(key[1] * share)
 
     def scene_of(self, key: Key) -> int:
-        """Number of the server's scene under a rendered sequence, from 1; each scene serves `pairs_per_scene` pairs in
-        turn."""
+        """Number, from 1, of the server's scene that a rendered sequence shows.
+
+        Scenes take turns; each shows `pairs_per_scene` consecutive pairs.
+        """
         settings = self.stream.settings
         before = key[0] * floor(sum(self.counts) * settings.share) + floor(key[1] * settings.share)
         return 1 + before * self.n_pairs // settings.pairs_per_scene % settings.n_scenes
 
     def poses(self, key: Key) -> tuple[Trajectory, np.ndarray, int]:
-        """The poses of a rendered sequence, without images, their velocities (n, 3), O_L, and the first noise index."""
+        """Poses of a rendered sequence, without images; their velocities (n, 3), O_L; and the first noise index."""
         epoch, position, number, start = key
         rng = np.random.default_rng([self.stream.settings.seed, epoch, position])
         angle, index = rng.uniform(0, 2 * np.pi), int(rng.integers(_INDICES))
@@ -75,7 +78,7 @@ class StreamedSequences(TrainingSequences):
         return part, self.stream.velocities_mps(whole.ids)[frames] @ turn.T, index
 
     def _following(self, key: Key) -> Iterator[Key]:
-        """The rendered sequences of this process from `key` on, in training order, without end."""
+        """Endless keys of the rendered sequences of this process, from `key` on, in training order."""
         epoch, keys = key[0], self.keys(key[0])
         keys = keys[keys.index(key) :]
         while True:

@@ -1,4 +1,4 @@
-"""Trajectories as arrays, with the nominal motion."""
+"""Trajectories of a navigation dataset as arrays, with their nominal motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,21 +21,21 @@ from perilune_train.motion.data.undistort import undistorted
 from perilune_train.motion.geometry import relative_poses
 
 Motion = tuple[Array, Array]
-"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one trajectory."""
+"""Motions of one trajectory: translation_m (n - 1, 3), O_C of the earlier frame; rotation_c2_from_c1 (n - 1, 3, 3)."""
 Pose = tuple[Array, Array]
-"""position_m (n - 1, 3) in O_L and rotation_camera_from_site (n - 1, 3, 3) at the later frame of each pair."""
+"""Poses at the later frame of each pair: position_m (n - 1, 3), O_L; rotation_camera_from_site (n - 1, 3, 3)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """One trajectory of n frames, with the nominal motion known before the flight."""
+    """One trajectory of n frames, with the nominal motion, which is known before the flight."""
 
     ids: tuple[str, str]
     """scene_id and trajectory_id."""
     split: str
     """train, val or test."""
     images: np.ndarray
-    """8-bit grey frames (n, height, width); (0, height, width) if another process loads them."""
+    """8-bit grey frames (n, height, width); (0, height, width) if only another process loads them."""
     camera: Camera
     """Intrinsics of `images`."""
     position_m: Array
@@ -45,9 +45,9 @@ class Trajectory:
     nominal_position_m: Array
     """Positions (n, 3), metres, on the nominal curve at the frames' times, O_L."""
     nominal_rotation_camera_from_site: Array
-    """Nominal attitude (3, 3): the camera on a level body, the same for all frames."""
+    """Nominal attitude (3, 3) of the camera on a level body, equal for all frames."""
     gyroscopes: Mapping[InertialGrade, GyroscopeTurns] = field(default_factory=dict)
-    """Rotations measured by a gyroscope, by its grade; only those that the dataset has, and none in training."""
+    """Rotations measured by a gyroscope, by its grade. Grades that the dataset lacks are absent; empty in training."""
 
     @property
     def n_pairs(self) -> int:
@@ -66,7 +66,7 @@ class Trajectory:
 
     @property
     def nominal_motion(self) -> Motion:
-        """Nominal motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3), which is the identity."""
+        """Nominal motions: translation_m (n - 1, 3), and rotation_c2_from_c1 (n - 1, 3, 3), always the identity."""
         attitudes = np.broadcast_to(self.nominal_rotation_camera_from_site, (len(self.position_m), 3, 3))
         return relative_poses(self.nominal_position_m, attitudes)
 
@@ -77,11 +77,11 @@ class Trajectory:
 
     @property
     def down_c(self) -> Array:
-        """Unit vector (3,) towards the ground in O_C of a level body."""
+        """Unit vector (3,) towards the ground in O_C, if the body is level."""
         return -self.nominal_rotation_camera_from_site[:, 2]
 
     def shrunk(self, size_px: int) -> "Trajectory":
-        """The same trajectory with images shrunk to `size_px` wide by area averaging; itself if they have that size."""
+        """Shrink the images to a width of `size_px` by area averaging; returns self if they have this width."""
         height, width = self.images.shape[1:]
         if width == size_px:
             return self
@@ -97,10 +97,10 @@ class Trajectory:
 
 
 def own_trajectories(split: str, count: int, share: Share) -> list[int]:
-    """Numbers of the trajectories of a split, among 0 .. count - 1, whose frames a process needs.
+    """Numbers, from 0 to count - 1, of the trajectories of a split whose frames a process needs.
 
-    Trajectories of train and val are divided among the processes; if val has fewer than processes, some validate the
-    same one. Only the first process evaluates test.
+    Trajectories of train and val are divided among the processes. If val has fewer trajectories than there are
+    processes, some processes validate on a shared trajectory. Only the first process evaluates test.
     """
     if split == "test":
         return list(range(count)) if share.process == 0 else []
@@ -110,9 +110,9 @@ def own_trajectories(split: str, count: int, share: Share) -> list[int]:
 def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory]:
     """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
 
-    One of several processes loads only the frames that it needs (`own_trajectories`). Raises UserError if the dataset
-    is of another kind, a frame is missing or there are fewer training trajectories than processes. Frames of a
-    distorting lens are undistorted.
+    If there are several processes, each loads only the frames that it needs (`own_trajectories`). Frames of a
+    distorting lens are undistorted. Raises UserError if the dataset is of another kind, if a frame is missing, or if
+    there are fewer training trajectories than processes.
     """
     trajectories = [trajectory for split in SPLITS for trajectory in load_split(dataset, split, share)]
     if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):

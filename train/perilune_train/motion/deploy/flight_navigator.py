@@ -1,4 +1,4 @@
-"""A trained navigator as one graph: one pair of frames and the LSTM's state in, the motion and the new state out."""
+"""A trained navigator as one graph, from one pair of frames and the LSTM's state to the motion and the new state."""
 
 import copy
 from typing import Any
@@ -14,16 +14,16 @@ INPUTS = {
     "warp": ("first", "second", "nominal_translation_m", "altitude_m", "hidden", "cell"),
     "stack": ("first", "second", "hidden", "cell"),
 }
-"""Names of the inputs, by fusion."""
+"""Names of the graph's inputs, by fusion."""
 OUTPUTS = ("translation_m", "rotation_c2_from_c1", "hidden_out", "cell_out")
 
 
 class FlightNavigator(nn.Module):
-    """A navigation network with the scaling of its output.
+    """A navigation network together with the scaling of its output.
 
-    Shape: frames (1, height, width), normalised, hidden and cell state (2, 1, hidden), zero at the start of a descent,
-    for warp also the nominal translation (1, 3) and altitude (1,), metres; to the translation (1, 3), metres, O_C of
-    the earlier frame, the rotation (1, 3, 3) and the state.
+    Inputs: two frames (1, height, width), normalised; the hidden and the cell state (2, 1, hidden), zero at the start
+    of a descent; for warp also the nominal translation (1, 3) and altitude (1,), metres. Outputs: the translation
+    (1, 3), metres, O_C of the earlier frame; the rotation (1, 3, 3); the new hidden and cell state.
     """
 
     def __init__(self, network: nn.Module, architecture: dict[str, Any], focal_over_width: float):
@@ -37,7 +37,7 @@ class FlightNavigator(nn.Module):
             self.network.focal_over_width = focal_over_width
             # ONNX has no operator that solves linear equations.
             self.network.solved = solved_by_elimination  # type: ignore[method-assign]
-        # The exporter sets all parts to the mode of the whole.
+        # The exporter sets all parts to the mode of the whole module.
         self.eval()
 
     def forward(self, first: Tensor, second: Tensor, *known: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -49,16 +49,17 @@ class FlightNavigator(nn.Module):
         return *self.motion(output[:, 0], known[0]), hidden, cell
 
     def motion(self, output: Tensor, nominal_translation_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Translations (N, 3), metres, and rotations (N, 3, 3) of outputs (N, 9)."""
+        """Convert outputs (N, 9) to translations (N, 3), metres, and rotations (N, 3, 3)."""
         reference = nominal_translation_m if self.is_warp else torch.tensor(self.scales.mean_m)
         translation_m = reference + torch.tensor(self.scales.spread_m) * output[:, :3]
         return translation_m, decoded_rotation(output, self.scales)
 
 
 def solved_by_elimination(normal: Tensor, right: Tensor) -> Tensor:
-    """Solutions (N, n) of positive definite equations (N, n, n), (N, n), by Gauss-Jordan elimination without pivoting.
+    """Solve equations (N, n, n), (N, n) with positive definite matrices; returns the solutions (N, n).
 
-    Positive definite matrices need no pivoting (Golub & Van Loan, Matrix Computations, 4th edition, section 4.2).
+    Gauss-Jordan elimination without pivoting, which positive definite matrices do not need (Golub & Van Loan, Matrix
+    Computations, 4th edition, section 4.2).
     """
     rows = torch.cat([normal, right[..., None]], dim=2)
     n = normal.shape[1]

@@ -65,7 +65,7 @@ def step(earlier, later, state):
 
 
 def readme(metadata: dict[str, Any]) -> str:
-    """Markdown for users of an export with this metadata (navigator.json)."""
+    """Return the README, in Markdown, of an export with this metadata (navigator.json)."""
     height, width, hidden = metadata["height_px"], metadata["width_px"], metadata["hidden"]
     warp = metadata["fusion"] == "warp"
     rows = [

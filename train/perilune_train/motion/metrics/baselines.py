@@ -1,4 +1,4 @@
-"""The methods without training: KLT tracks, direct alignment, the nominal motion, mean motions of the training set."""
+"""Methods without a network: KLT tracks, direct alignment, the nominal motion, mean motions of the training set."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from perilune_train.motion.data.trajectories import Motion, Trajectory
 from perilune_train.motion.geometry import mean_rotation
 
 GYROSCOPE: InertialGrade = "tactical"
-"""Grade of the inertial unit whose rotations `klt_gyroscope` and `alignment_gyroscope` use."""
+"""Grade of the inertial unit that provides the rotations of `klt_gyroscope` and `alignment_gyroscope`."""
 
 CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
 """Methods that read the images, in the order of the tables."""
@@ -22,7 +22,7 @@ CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
 
 @dataclass(frozen=True, slots=True)
 class MethodMotions:
-    """Motions of trajectories by each method, and their covariances where a method states them."""
+    """Motions that each method estimates for trajectories, and their covariances if the method computes them."""
 
     motions: dict[str, list[Motion]]
     """Motions of each trajectory, by method."""
@@ -33,7 +33,8 @@ class MethodMotions:
 def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotions:
     """Estimate the motions of test trajectories by all methods.
 
-    Without training trajectories there are no mean motions; without a gyroscope, no methods that use one.
+    Mean motions are left out if there are no training trajectories; methods with a gyroscope are left out if the
+    dataset has no gyroscope.
     """
     with progress_bar() as progress:
         task = progress.add_task("classical methods", total=len(test), unit="trajectories", note="")
@@ -56,14 +57,14 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotio
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
-    """The training set's mean motion, for every pair of the trajectory."""
+    """The mean motion of the training set, repeated for every pair of the trajectory."""
     translation = np.concatenate([trajectory.motion[0] for trajectory in training]).mean(0)
     rotation_c2_from_c1 = mean_rotation(np.concatenate([trajectory.motion[1] for trajectory in training]))
     return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation_c2_from_c1, (trajectory.n_pairs, 1, 1))
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:
-    """The training set's mean motion at each step; beyond its last step, the mean motion at its last step."""
+    """The mean motion of the training set at each step. Beyond the last step of training, the last mean is repeated."""
     translations, rotations = [], []
     longest = max(trajectory.n_pairs for trajectory in training)
     for step in range(trajectory.n_pairs):

@@ -1,4 +1,4 @@
-"""Errors of estimated motions and poses, and their summary."""
+"""Errors of estimated motions and poses, and their summaries."""
 
 import itertools
 
@@ -11,19 +11,21 @@ from perilune_train.motion.geometry import dead_reckoning
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
 _ALTITUDES_M = (0, 200, 400, 800, 1200, 1600, 100_000)
-"""Limits of the bands of altitude of poses."""
+"""Limits of the altitude bands for pose errors, metres."""
 
 
 def motion_errors(
     trajectories: list[Trajectory], motions: list[Motion], covariances: list[Array] | None = None
 ) -> pd.DataFrame:
-    """Errors of the motion, and of the position dead reckoned from the true first pose; one row per pair.
+    """Errors of motions, and of positions that are dead reckoned from the true first pose; one row per pair.
 
-    Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its components
-    error_x_m, error_y_m, error_z_m in O_C of the earlier frame, orientation_error_deg (angle of the residual rotation)
-    with its components error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L),
-    and, with `covariances` (n - 1, 6, 6) as in `EstimatedMotion`, normalised_error_squared and stated_error_m, the root
-    mean square length of the position error that the covariance states.
+    Columns: scene_id, trajectory_id, step, altitude_m (nominal).
+    Position: position_error_m (length), and its components error_x_m, error_y_m, error_z_m in O_C of the earlier frame.
+    Orientation: orientation_error_deg (angle of the residual rotation), and its components error_x_deg, error_y_deg,
+    error_z_deg (rotation vector, O_C of the later frame).
+    Dead reckoning: drift_m (length), and its components drift_x_m, drift_y_m, drift_z_m in O_L.
+    With `covariances` (n - 1, 6, 6) as in `EstimatedMotion`: normalised_error_squared, and stated_error_m, the root
+    mean square length of the position error that the covariance predicts.
     """
     tables = []
     stated = covariances if covariances is not None else [None] * len(trajectories)
@@ -56,7 +58,7 @@ def motion_errors(
 def pose_errors(trajectories: list[Trajectory], poses: list[Pose]) -> pd.DataFrame:
     """Errors of the pose in O_L at the later frame of each pair; one row per pair.
 
-    Columns as those of `motion_errors` without drift. Components of the position error are along O_L, and altitude_m is
+    The columns are as in `motion_errors`, without drift. Components of the position error are in O_L, and altitude_m is
     the nominal altitude at the later frame.
     """
     tables = []
@@ -93,17 +95,17 @@ def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
 
 
 def normalised_errors(trajectory: Trajectory, motion: Motion, covariance: Array) -> Array:
-    """Normalised errors squared of rotation and shift together, by their covariance (n - 1, 6, 6); 6 in the mean if it
-    is right.
+    """Normalised squared errors (n - 1,) of rotation and shift together, by their covariances (n - 1, 6, 6).
 
-    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.
+    Their mean is 6 if the covariances are correct. Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to
+    Tracking and Navigation, 2001, section 5.4.
     """
     error = signed_errors(trajectory, motion)
     return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
 
 
 def signed_errors(trajectory: Trajectory, motion: Motion) -> Array:
-    """Errors (n - 1, 6) in the form of the covariance of `EstimatedMotion`: turn, radians, and shift, metres."""
+    """Errors (n - 1, 6) in the order of the covariance of `EstimatedMotion`: turn, radians, then shift, metres."""
     (translation, rotation), (true_translation, true_rotation) = motion, trajectory.motion
     turn = rotation_vectors(true_rotation @ np.swapaxes(rotation, 1, 2))
     shift = np.einsum("nij,nj->ni", true_rotation, translation - true_translation)
@@ -111,11 +113,10 @@ def signed_errors(trajectory: Trajectory, motion: Motion) -> Array:
 
 
 def summary(errors: pd.DataFrame) -> dict[str, float]:
-    """Root mean squares over all pairs of all trajectories; drift (length) over all frames and at the last frames.
+    """Root mean squares over all pairs of all trajectories.
 
-    Poses have no drift.
-
-    Each RMSE has two forms (`squared_errors`) and is also given by axis. docs/reference/metrics.md has the formulas.
+    Each RMSE has two forms (`squared_errors`) and is also given by axis. The drift (length) is given over all frames
+    and at the last frames; poses have no drift. docs/reference/metrics.md has the formulas.
     """
     figures = {key: float(np.sqrt(np.mean(values))) for key, values in squared_errors(errors).items()}
     figures |= {f"position_rmse_{axis}_m": _rms(errors[f"error_{axis}_m"]) for axis in "xyz"}
@@ -130,11 +131,11 @@ def summary(errors: pd.DataFrame) -> dict[str, float]:
 
 
 def squared_errors(errors: pd.DataFrame) -> dict[str, Array]:
-    """Squared errors (pairs,) by key of the RMSE, which is the root of their mean.
+    """Squared errors (pairs,), by key of the RMSE, which is the square root of their mean.
 
-    per_component is the paper's RMSE: each of the three components of each pair is one variable. vector and angle use
-    the length of the error vector and are sqrt(3) times as large. The components of the orientation are those of the
-    residual rotation vector; differences of the paper's Euler angles are the same to first order.
+    per_component is the paper's RMSE: each of the three components of each pair is one value. vector and angle use the
+    length of the error vector and are sqrt(3) times as large. The orientation components are the components of the
+    residual rotation vector, which equal the differences of the paper's Euler angles to first order.
     """
     length_2 = np.square(np.asarray(errors["position_error_m"], np.float64))
     angle_2 = np.square(np.asarray(errors["orientation_error_deg"], np.float64))
@@ -147,7 +148,7 @@ def squared_errors(errors: pd.DataFrame) -> dict[str, Array]:
 
 
 def summary_spreads(errors: pd.DataFrame, seed: int = 0) -> dict[str, Spread]:
-    """Spread of each RMSE of `squared_errors` between test scenes, or between trajectories if there is one scene."""
+    """Spread of each RMSE of `squared_errors` over test scenes, or over trajectories if there is only one scene."""
     scenes = errors["scene_id"].tolist()
     names = [f"{scene}/{name}" for scene, name in zip(scenes, errors["trajectory_id"], strict=True)]
     rows, squares = np.arange(len(errors)), squared_errors(errors)

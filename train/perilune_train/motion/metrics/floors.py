@@ -13,13 +13,13 @@ FLOORS = {
     "mean_pose_at_frame": "mean pose of the training at that frame, without images",
     "ridge": "ridge regression on the frozen features",
 }
-"""Names in tables of the methods that a pose network is compared with."""
+"""Names, in tables, of the methods that a pose network is compared with."""
 _PENALTIES = np.logspace(-6, 2, 17)
 """Penalties of the ridge regression, in units of the mean squared length of a standardised feature vector."""
 
 
 def mean_poses(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Pose]]:
-    """The training set's mean pose, and its mean pose at each frame, for every test trajectory."""
+    """Poses by method for every test trajectory: the mean training pose, and the mean training pose at each frame."""
     position_m, rotation_camera_from_site = (
         np.concatenate([trajectory.pose[i] for trajectory in training]) for i in range(2)
     )
@@ -39,7 +39,7 @@ def constant_pose(position_m: Array, rotation_camera_from_site: Array, n_pairs: 
 
 
 def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
-    """Mean pose of the training set at each frame; beyond its last frame, the mean pose at its last frame."""
+    """Mean pose of the training set at each frame. Beyond the last frame of training, the last mean is repeated."""
     last, positions, rotations = max(trajectory.n_pairs for trajectory in training) - 1, [], []
     for step in np.minimum(np.arange(n_pairs), last):
         known = [trajectory.pose for trajectory in training if trajectory.n_pairs > step]
@@ -50,16 +50,16 @@ def _mean_pose_at_frame(training: list[Trajectory], n_pairs: int) -> Pose:
 
 @dataclass(frozen=True)
 class Known:
-    """Trajectories with features of their pairs."""
+    """Trajectories together with features of their pairs."""
 
     trajectories: list[Trajectory]
     """The trajectories."""
     features: list[Array]
-    """Features (pairs, inputs) of each."""
+    """Features (pairs, inputs) of each trajectory."""
 
 
 def ridge_poses(training: Known, validation: Known, features: list[Array]) -> list[Pose]:
-    """Poses by ridge regression, fitted to the training pairs, from features (pairs, inputs) of each test trajectory.
+    """Estimate poses of test trajectories from their features (pairs, inputs) by ridge regression.
 
     Features are standardised. The penalty is the one with the lowest squared position error on validation.
     """
@@ -81,13 +81,13 @@ def ridge_poses(training: Known, validation: Known, features: list[Array]) -> li
 
 
 class _Ridge:
-    """Ridge regression from features (n, inputs) to targets (n, outputs), for any penalty."""
+    """Ridge regression from features (n, inputs) to targets (n, outputs), solved once for all penalties."""
 
     def __init__(self, features: Array, targets: Array):
         self.mean, spread = features.mean(0), features.std(0)
         self.scale = np.maximum(np.maximum(spread, 0.1 * spread.mean()), 1e-12)
         self.centre, standard = targets.mean(0), self._standardised(features)
-        # With more features than pairs, the matrix of inner products is the smaller one.
+        # If there are more features than pairs, the matrix of inner products is smaller.
         self.known = standard if features.shape[1] > len(features) else None
         gram = standard @ standard.T if self.known is not None else standard.T @ standard
         self.values, self.vectors = np.linalg.eigh(gram.astype(np.float64))
@@ -95,12 +95,12 @@ class _Ridge:
         self.right, self.unit = self.vectors.T @ right, float(np.mean(np.sum(standard**2, axis=1)))
 
     def projected(self, features: Array) -> Array:
-        """Features (n, inputs) along the eigenvectors."""
+        """Project features (n, inputs) onto the eigenvectors."""
         inner = self._standardised(features)
         return np.asarray((inner if self.known is None else inner @ self.known.T) @ self.vectors)
 
     def targets(self, projected: Array, penalty: float) -> Array:
-        """Targets (n, outputs) of projected features, for a penalty in units of `_PENALTIES`."""
+        """Targets (n, outputs) for projected features, with a penalty in units of `_PENALTIES`."""
         shrunk = self.right / (np.maximum(self.values, 0) + penalty * self.unit)[:, None]
         return np.asarray(self.centre + projected @ shrunk)
 

@@ -1,4 +1,4 @@
-"""Pictures of a navigation run."""
+"""Draw the pictures of a navigation run."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ COLOURS = {
 def draw_trajectory(
     path: Path, trajectory: Trajectory, motions: dict[str, Motion], errors: dict[str, pd.DataFrame]
 ) -> None:
-    """Draw one trajectory: true and dead-reckoned paths from the side and from above, and errors by step."""
+    """Draw one trajectory: true and dead-reckoned paths from the side and from above, and the errors by step."""
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 3)
     side, top, drift = axes[0]
@@ -65,9 +65,10 @@ def draw_trajectory(
 
 
 def draw_pose_errors(path: Path, errors: dict[str, pd.DataFrame], network: str) -> None:
-    """Draw errors of the position in O_L along the test trajectories, by component, and their distribution.
+    """Draw the position errors in O_L along the test trajectories, by component, and their distribution.
 
-    Thick lines are root mean squares over the trajectories at each step, thin lines single trajectories of `network`.
+    Thick lines are root mean squares over the trajectories at each step. Thin lines are single trajectories of
+    `network`.
     """
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 2).ravel()
@@ -90,7 +91,7 @@ def draw_pose_errors(path: Path, errors: dict[str, pd.DataFrame], network: str) 
 
 
 def draw_errors(path: Path, errors: dict[str, pd.DataFrame]) -> None:
-    """Draw, for each method, the fraction of test pairs with an error below a bound, and the errors by axis."""
+    """Draw, for each method, the cumulative distribution of the errors of test pairs, and the errors by axis."""
     figure = Figure(figsize=(16, 5), layout="constrained")
     axes = figure.subplots(1, 3)
     for method, table in errors.items():

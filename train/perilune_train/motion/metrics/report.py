@@ -1,4 +1,4 @@
-"""Tables, pictures and metrics of an evaluation of navigation."""
+"""Write the tables, pictures and metrics of an evaluation of navigation."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -40,8 +40,9 @@ def write_evaluation(
     """Write the errors of all methods on the trajectories of a split.
 
     Writes navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png, errors.png and
-    metrics.json: <split>/<figure> for the method `network`, <method>/<figure> for another network,
-    baseline/<method>/... for the others, and `details`, which include the mark of the terrain check.
+    metrics.json. Keys of metrics.json: <split>/<figure> for the method `network`, <method>/<figure> for another
+    network, baseline/<method>/<figure> for the other methods. `details` are added; they include the mark of the terrain
+    check.
     """
     errors = {
         method: motion_errors(trajectories, motions, estimates.covariances.get(method))
@@ -64,10 +65,10 @@ def write_pose_evaluation(
     poses: Mapping[str, list[Pose]],
     details: Mapping[str, float | int | str | None],
 ) -> str:
-    """Write the errors of a pose network and its floors on the trajectories of a split; returns the page.
+    """Write the errors of a pose network and its floors on the trajectories of a split; return the page.
 
-    Writes pose.md, errors.png and the tables and metrics of `write_evaluation`, with evaluation/worse_than: the floor
-    with the lowest RMSE of position, if it is not higher than the network's.
+    Writes pose.md, errors.png, and the tables and metrics of `write_evaluation`. The metric evaluation/worse_than names
+    the floor with the lowest position RMSE if the network is not better.
     """
     errors = {method: pose_errors(trajectories, entries) for method, entries in poses.items()}
     rows = {method: pose_summary(table) for method, table in errors.items()}
@@ -84,7 +85,7 @@ def write_pose_evaluation(
 
 
 def worse_than_floor(network: str, rows: Mapping[str, Mapping[str, float]]) -> str:
-    """The floor with the lowest RMSE of position if `network` is not better; otherwise empty."""
+    """Name of the floor with the lowest position RMSE if `network` is not better; otherwise empty."""
     key = "position_rmse_per_component_m"
     best = min((method for method in rows if method != network), key=lambda method: rows[method][key], default=network)
     return best if best != network and rows[best][key] <= rows[network][key] else ""
@@ -106,7 +107,7 @@ def _pose_page(network: str, split: str, metrics: Metrics, methods: list[str], w
 
 def _with_interval(metrics: Metrics, key: str) -> str:
     value, spread = metrics.get(key), read_spread(metrics, key)
-    # Values of all single trajectories would fill the table.
+    # Without an interval, the spread lists the value of every trajectory, which would fill the table.
     return spread.text(float(value)) if spread.interval and isinstance(value, int | float) else number(value)
 
 

@@ -1,4 +1,4 @@
-"""Evaluation of a run that learned the pose in O_L, together with its floors."""
+"""Evaluate a run that was trained to estimate the pose in O_L, together with its floors."""
 
 import time
 from typing import Any
@@ -22,7 +22,7 @@ from perilune_train.training.runs import RunFolder, choose_bf16, choose_device
 
 
 def check_one_area(dataset: Dataset) -> None:
-    """Raise UserError unless all trajectories of a dataset are over one scene."""
+    """Raise UserError unless the dataset has all its trajectories over one scene."""
     scenes = {str(row["scene_id"]) for row in dataset.table("trajectories").to_pylist()}
     if len(scenes) != 1:
         expected = "1, the landing area of navigate.stack.target=pose; render with dataset.nav.n_scenes=1"
@@ -36,7 +36,7 @@ def evaluate_pose_run(
     backbone: dict[str, Tensor] | None,
     details: Metrics,
 ) -> None:
-    """Evaluate the best weights of a run on the test trajectories; write the tables and print the page."""
+    """Evaluate the best weights of a run on the test trajectories, write the tables, and print the page."""
     device = torch.device(choose_device(task.settings.device))
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     network, architecture = load_navigator(run.best, "stack")
@@ -60,7 +60,7 @@ def evaluate_pose_run(
 def _ridge(
     task: NavigationTask, backbone: dict[str, Tensor], test: list[Trajectory], device: torch.device
 ) -> list[Pose]:
-    """Poses by ridge regression on the features of the detector's backbone, before training."""
+    """Poses by ridge regression on the features of the detector's backbone before navigation training."""
     frozen: Any = build(task.architecture)
     frozen.backbone.load_state_dict(backbone, strict=False)
     # Scale features as the coarse stage did when it stored them.
@@ -80,7 +80,7 @@ def _ridge(
     validation = [task.validation_trajectories[number] for number in task.validated]
     known = {}
     for split, split_trajectories in (("train", training), ("val", validation)):
-        # Features of views follow the features of the trajectories.
+        # The features of `views` come after the features of the trajectories.
         stored = [
             split_features[: sum(t.n_pairs for t in split_trajectories)].cpu().numpy()
             for split_features in task.stored.get(split, [])

@@ -1,4 +1,4 @@
-"""Training of the navigation networks."""
+"""Train the navigation networks."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -39,9 +39,9 @@ from perilune_train.records.provenance import Provenance
 from perilune_train.training.runs import choose_bf16, choose_device
 
 _OF_STACK = ("target", "pool", "stages", "dropout", "sequence_pairs")
-"""Settings in the architecture of a stack network."""
+"""Settings that the architecture of a stack network stores."""
 _VALIDATIONS = 10
-"""Approximate number of validations of a coarse stage on stored features, whose epochs take a second or less."""
+"""Approximate number of validations in a coarse stage on stored features, where an epoch takes a second or less."""
 _WARM_STEPS = 50
 
 
@@ -50,7 +50,8 @@ def learning_rate_factor(
 ) -> float:
     """Factor on the learning rate: a short warm-up, then the cosines that `FusionConfig.cycles` describes.
 
-    With `coarse`, the factor at the peak of the coarse stage, each stage has a warm-up and cosines of its own.
+    `coarse` is the factor at the peak of the coarse stage. If it is given, each stage has a separate warm-up and
+    separate cosines.
     """
     if coarse is not None:
         if step < coarse_steps:
@@ -69,9 +70,9 @@ def learning_rate_factor(
 def axis_weights(scales: Scales, target: Target) -> Tensor:
     """Weights (3,) of the standardised errors of the axes in the loss.
 
-    Positions spread over hundreds of metres along the descent and over a few metres across it. Equal weights of
-    standardised errors would leave the first inaccurate, equal weights of errors in metres the second. The weights are
-    the geometric mean of both.
+    Positions spread over hundreds of metres along the descent and over a few metres across it. Equal weights on
+    standardised errors would leave the positions along the descent inaccurate. Equal weights on errors in metres would
+    leave the positions across it inaccurate. The weights are the geometric mean of both choices.
     """
     if target == "motion":
         return torch.ones(3)
@@ -81,12 +82,12 @@ def axis_weights(scales: Scales, target: Target) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Initial:
-    """What a training starts from in place of random weights and measured scales."""
+    """Initial weights and scales, used in place of random weights and measured scales."""
 
     backbone: dict[str, Tensor] | None = None
     """Weights of a detector's backbone, by name."""
     scales: Scales | None = None
-    """Scales of a network whose weights are loaded later."""
+    """Scales of the network whose weights are loaded later."""
 
 
 RANDOM = Initial()
@@ -94,17 +95,19 @@ RANDOM = Initial()
 
 
 class NavigationTask(lightning.LightningModule):
-    """Training of one network: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
+    """Training of one network: the paper's coarse stage, then its fine stage; AdamW, short warm-up, cosine to zero.
 
-    Errors are standardised: P by the unit of the translation, phi (Euler angles) by the spread of the rotation.
-    Coarse: L^(S1) = |dP|^2 + kappa |dphi|^2. Fine: L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with learnt
-    s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles, unless
-    `cycles` is 5; warp's pairs are mirrored and jittered (see data/sequences.py).
+    The loss of the coarse stage is L^(S1) = |dP|^2 + kappa |dphi|^2. The loss of the fine stage is
+    L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with learnt s_p, s_phi. The errors are standardised: dP by
+    the unit of the translation, dphi (Euler angles) by the spread of the rotation. Deviations from the paper: means
+    over the pairs instead of sums; one cosine instead of five cycles, unless `cycles` is 5; the pairs of warp are
+    mirrored and jittered (see data/sequences.py).
 
-    In the coarse stage a stack network whose whole backbone is given computes the backbone's features once, also those
-    of further views of the training trajectories (`views`). The target
-    `pose` replaces the motion by the pose in O_L at the later frame; P is then the position, its axes weighted by
-    `axis_weights`.
+    If the whole backbone of a stack network is given, the coarse stage computes the backbone's features only once. This
+    includes the features of further views of the training trajectories (`views`).
+
+    The target `pose` replaces the motion by the pose in O_L at the later frame. P is then the position, and its axes
+    have the weights of `axis_weights`.
     """
 
     def __init__(
@@ -119,7 +122,7 @@ class NavigationTask(lightning.LightningModule):
         super().__init__()
         self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
-        # Initial weights predict motions on the scales of their own training.
+        # Initial weights need the scales of the run that trained them.
         training = [trajectory for trajectory in trajectories if trajectory.split == "train"]
         self.scales = initial.scales or Scales.measured(training, fusion, self.own.target)
         self.architecture = {
@@ -166,7 +169,7 @@ class NavigationTask(lightning.LightningModule):
 
     @property
     def terrain(self) -> dict[str, Any] | None:
-        """The record of the terrain of the training, as plain data, with all that was rendered so far."""
+        """The record of the training terrain as plain data, including all terrain that was rendered so far."""
         if self.provenance is None:
             return None
         rendered = self.stream.uses if self.stream is not None else frozenset()
@@ -179,7 +182,7 @@ class NavigationTask(lightning.LightningModule):
 
     @property
     def coarse(self) -> bool:
-        """Whether this epoch belongs to the coarse stage."""
+        """Whether the current epoch belongs to the coarse stage."""
         return self.current_epoch < self.own.coarse_epochs
 
     def _sequences(self) -> TrainingSequences:
@@ -199,14 +202,14 @@ class NavigationTask(lightning.LightningModule):
         return StreamedSequences(self.stream, self.own.size_px, *trajectories_and_length, **options)
 
     def train_dataloader(self) -> DataLoader:
-        # The current epoch is one too low here if the run is resumed.
+        # In a resumed run, Lightning's current epoch is one too low at this point.
         epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
         resumed_epoch, done = self.resumed
         start = done if epoch == resumed_epoch else 0
         batches = EpochBatches(self.sequences.keys, self.sequences.fewest, self.own.batch_sequences, epoch, start)
         pinned = choose_device(self.settings.device) == "cuda"
         if self.fusion == "stack":
-            # Workers would have nothing to prepare.
+            # Use no workers, because they would have nothing to prepare.
             return batch_loader(self.sequences, batches, collated, 0, pinned)
         return batch_loader(self.sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
@@ -217,7 +220,7 @@ class NavigationTask(lightning.LightningModule):
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         if isinstance(batch, Tensor):
             return batch.to(device, non_blocking=True)
-        # In validation a batch is a trajectory; `predict` moves it.
+        # In validation a batch is a trajectory; `predict` moves it to the device.
         return batch.to(device) if isinstance(batch, Batch) else batch
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -237,10 +240,10 @@ class NavigationTask(lightning.LightningModule):
             parameter.requires_grad_(not (self.coarse and name in self.pretrained))
         for name, module in self.network.backbone.named_modules():
             if isinstance(module, nn.BatchNorm2d):
-                # Statistics of single batches change the features by more than their spread over the trajectories, so a
-                # network for poses keeps the detector's statistics.
+                # Batch statistics would change the features by more than the spread of the features over the
+                # trajectories, so a network for poses keeps the detector's statistics.
                 kept = self.coarse or self.own.target == "pose"
-                # The norms of some gates have statistics, but no weight.
+                # Check the statistics, because the norms of some gates have statistics but no weight.
                 module.train(not (kept and f"{name}.running_mean" in self.pretrained))
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
@@ -250,7 +253,7 @@ class NavigationTask(lightning.LightningModule):
         stores, last = self.coarse and self.stores, self.current_epoch + 1 == self.own.coarse_epochs
         if stores and not self.stored:
             self._store()
-        # Lightning reads it after the last batch of every epoch.
+        # Lightning reads this setting after the last batch of every epoch.
         often = not stores or last
         self.trainer.check_val_every_n_epoch = 1 if often else max(1, self.own.coarse_epochs // _VALIDATIONS)
 
@@ -273,7 +276,7 @@ class NavigationTask(lightning.LightningModule):
         self.stored = {"train": [torch.cat(train)], "val": val}
 
     def _loss(self, output: Tensor, true_position: Tensor, true_angles: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss of the stage, and its parts."""
+        """The loss of the current stage, and the parts of this loss."""
         angles = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
         position = ((output[..., :3] - true_position) * self.axis_weights).square().sum(-1).mean()
         orientation = (angles - true_angles).square().sum(-1).mean()
@@ -300,7 +303,7 @@ class NavigationTask(lightning.LightningModule):
         """A training step of a stack network on the sequences at `places` (see `Windows`)."""
         assert self.windows is not None
         if self.own.dropout:
-            # Seed the dropout, so that a resumed run draws the same.
+            # Seed the dropout, so that a resumed run draws equal masks.
             seeds = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
             torch.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]))
         pairs = self.windows.pairs(places)
@@ -315,7 +318,7 @@ class NavigationTask(lightning.LightningModule):
     def on_validation_epoch_start(self) -> None:
         self.validation_motions: list[Motion | Pose] = []
         if self.share.processes > 1:
-            # Weights are equal in all processes; batch statistics differ, and those of the first process are used.
+            # Weights are equal in all processes, but batch statistics differ. Use the statistics of the first process.
             for value in self.network.buffers():
                 torch.distributed.broadcast(value, 0)
 
@@ -338,13 +341,15 @@ class NavigationTask(lightning.LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        # Lightning refuses to clip for fused optimizers under mixed precision, for the scaling of float16 only.
+        # Lightning refuses to clip for fused optimizers under mixed precision. Only the scaling of float16 needs this
+        # refusal, so clip here.
         if gradient_clip_val:
             torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
 
     def configure_optimizers(self) -> Any:
         steps = -(-len(self.train_dataloader()) // self.own.accumulate)
-        # The two loss weights must change by about 1 during the run, whatever the learning rate of the network.
+        # The two loss weights must change by about 1 during the run, so their learning rate does not depend on the
+        # learning rate of the network.
         rate, factor = self.own.learning_rate, self.own.backbone_factor
         slower = {f"backbone.{name}" for name in self.pretrained} if factor < 1 else set()
         named = list(self.network.named_parameters())
@@ -357,7 +362,8 @@ class NavigationTask(lightning.LightningModule):
             groups.append({"params": own_values, "lr": factor * rate, "weight_decay": 1e-3})
         optimizer = torch.optim.AdamW(
             groups,
-            # Fused: one pass over memory, ten times as fast on a CPU, where it is half of a step on stored features.
+            # Fused: one pass over memory, ten times as fast on a CPU. There the optimizer takes half the time of a step
+            # on stored features.
             fused=True,
         )
         settings = self.own

@@ -1,4 +1,4 @@
-"""Other views of training trajectories: poses near the descents, to which frames are warped over the ground plane."""
+"""Other views of training trajectories: frames are warped over the ground plane to poses near the original ones."""
 
 from dataclasses import replace
 
@@ -13,19 +13,19 @@ from perilune_train.motion.metrics.floors import mean_poses
 
 
 def other_views(trajectories: list[Trajectory], count: int, spread: float, seed: int) -> list[Trajectory]:
-    """`count` further versions of each training trajectory: all of the first version, then all of the second one.
+    """`count` further versions of each training trajectory: the first version of all, then the second version of all.
 
-    A version has other poses; its images are still those of the original. The pose of each frame is moved by `spread`
-    times the deviation of a random descent from the mean pose of that frame, with a random sign for each axis of
-    position and attitude. So moves are as large, and change as smoothly along a sequence, as the deviations of real
-    descents.
+    A version has other poses, but still the original images. The pose of each frame is moved by `spread` times the
+    deviation of a random descent from the mean pose of that frame, with a random sign for each axis of position and
+    attitude. With `spread` 1 the moves are as large as the deviations of real descents. They always change as smoothly
+    along a sequence.
     """
     deviations, versions = _deviations(trajectories) if count else [], []
     for version in range(count):
         for number, trajectory in enumerate(trajectories):
             rng = np.random.default_rng([seed, version, number])
             moves = spread * rng.choice([-1.0, 1.0], 6) * deviations[rng.integers(len(deviations))]
-            # Beyond the end of the other descent, repeat its last deviation.
+            # If the other descent is shorter, repeat its last deviation.
             moves = moves[np.minimum(np.arange(len(trajectory.position_m)), len(moves) - 1)]
             turns = np.stack([matrix_from_rotation_vector(vector) for vector in moves[:, 3:]])
             rotation_camera_from_site = turns @ trajectory.rotation_camera_from_site
@@ -47,17 +47,16 @@ def _deviations(trajectories: list[Trajectory]) -> list[Array]:
     ):
         turns = rotation_vectors(trajectory.pose[1] @ np.swapaxes(rotation, 1, 2))
         pairs = np.concatenate([trajectory.pose[0] - position_m, turns], axis=1)
-        # Poses belong to the later frames of pairs. The first frame moves like the second one.
+        # A pose belongs to the later frame of a pair, so the first frame has none. Move it like the second one.
         deviations.append(np.concatenate([pairs[:1], pairs]))
     return deviations
 
 
 def view_homographies(trajectory: Trajectory, view: Trajectory) -> Tensor:
-    """Homographies (n, 3, 3), float32, from image coordinates of a view's frames to image coordinates of the
-    trajectory's.
+    """Homographies (n, 3, 3), float32, from image coordinates of a view to image coordinates of its trajectory.
 
-    They are exact for points of the mean ground plane, z = 0 of O_L. A point h above it is displaced by about f h m /
-    a^2 pixels, for a move by m metres, altitude a and focal length f.
+    They are exact for points of the mean ground plane, z = 0 in O_L. A point at height h above the plane is displaced
+    by about f h m / a^2 pixels, for a move by m metres, altitude a and focal length f.
     """
     from_ground, other = (
         ground_homography(trajectory.camera.matrix, poses.position_m, poses.rotation_camera_from_site)

@@ -1,4 +1,4 @@
-"""Curves: AP against the density of craters, learning curves, errors of the navigators along a trajectory."""
+"""Draw AP against crater density, learning curves, and the errors of the navigators along a trajectory."""
 
 import logging
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ _ERRORS = {"position_error_m": "position error (m)", "orientation_error_deg": "o
 
 
 def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -> None:
-    """Draw AP of YOLOv3 against equilibrium_share, evenly spaced by run; mark the paper's AP and the headline."""
+    """Draw AP of YOLOv3 against equilibrium_share, with evenly spaced runs; mark the paper's AP and the headline."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     shares = list(curve)
@@ -44,7 +44,7 @@ def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -
 
 
 def learning_curve(run: Path, key: str) -> list[float]:
-    """Values of a metric at each validation, from a run's TensorBoard events; the last value of a repeated step."""
+    """Values of a metric at each validation, from a run's TensorBoard events. Of a repeated step, the last value."""
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -58,7 +58,10 @@ def learning_curve(run: Path, key: str) -> list[float]:
 
 
 def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]]]) -> bool:
-    """Draw learning curves of a metric, one panel for each title, by run; returns whether there are any."""
+    """Draw learning curves, one panel per title; return whether there are any curves.
+
+    A panel has the key of its metric, and the folder of each run by name.
+    """
     values = {
         title: {name: heights for name, run in runs.items() if (heights := learning_curve(run, key))}
         for title, (key, runs) in panels.items()
@@ -79,9 +82,9 @@ def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]
 
 
 def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]]) -> bool:
-    """Draw errors along the first test trajectory, one row for each reading, from errors.parquet by network.
+    """Draw the errors of each network along the first test trajectory, one row per reading.
 
-    Returns whether there are any.
+    `readings` has the path of errors.parquet by reading and network. Returns whether there are any errors.
     """
     tables = {
         reading: {network: _first_trajectory(file) for network, file in files.items() if file.is_file()}

@@ -1,4 +1,4 @@
-"""Detections that a finished detect run wrote for its test split: sizes, and pictures like the paper's."""
+"""Crater widths and pictures like the paper's, from the detections of a finished detect run on its test split."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,13 +31,13 @@ class Detected:
     split: DetectSplit
     """Test frames and labels."""
     found: list[Detections]
-    """Detections at or above the run's threshold, one entry for each frame."""
+    """Detections at or above the run's threshold, one entry per frame."""
 
 
 def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
-    """Read a run's detections. Raises UserError if they are missing, damaged or of other frames.
+    """Read a run's detections. Raises UserError if they are missing, damaged or from other frames.
 
-    `trained` is the folder of the network's training, by default `run`; it has the settings and the threshold.
+    `trained` is the folder of the training, which has the settings and the threshold; by default it is `run`.
     """
     trained = trained or run
     split = load_split(open_single(dataset), "test", config_of_run(trained).labels)
@@ -68,16 +68,16 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
 
 @dataclass(frozen=True)
 class WidthRatio:
-    """Width of detected large craters, divided by that of their labels."""
+    """Width of detected large craters, divided by the width of their labels."""
 
     median: float
     """Median over the craters."""
     interval: Interval | None
-    """95 % interval over trajectories, or over scenes; None with fewer than five of them."""
+    """95 % interval over scenes or trajectories; None with fewer than five of them."""
 
 
 def width_ratio(detected: Detected) -> WidthRatio | None:
-    """Width of the detected large craters, relative to the truth; None if none was detected."""
+    """Width of the detected large craters relative to the ground truth; None if no large crater was detected."""
     split = detected.split
     height, width = split.frames.images.shape[1:]
     sizes = np.tile((width, height), (len(split), 1))
@@ -94,7 +94,7 @@ def width_ratio(detected: Detected) -> WidthRatio | None:
 
     def medians(resamples: Resamples) -> dict[str, NDArray[np.float64]]:
         weights = np.cumsum(resamples.weights[:, resamples.of_row[frames[order]]], axis=1)
-        # A resample without large craters has no median.
+        # A resample without large craters has no median, so it gives NaN.
         middle = (weights < weights[:, -1:] / 2).sum(axis=1)
         return {"ratio": np.where(weights[:, -1] > 0, ratios[order][np.minimum(middle, len(ratios) - 1)], np.nan)}
 
@@ -105,9 +105,9 @@ def width_ratio(detected: Detected) -> WidthRatio | None:
 
 
 def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
-    """Draw the frames with the smallest and with the largest labels: truth red, detections cyan, as in the paper.
+    """Draw the frames with the smallest and the largest labels; ground truth red, detections cyan, as in the paper.
 
-    Both frames have at least a quarter of the largest number of labels in a frame.
+    Each frame has at least a quarter as many labels as the frame with the most labels.
     """
     split = next(iter(by_network.values())).split
     counts = np.array([int(labels.selected.sum()) for labels in split.labels])

@@ -1,4 +1,4 @@
-"""The attention gates of the explain run: PCC1 to PCC4 with their nulls, and the paper's claims on them."""
+"""The attention gates of the explain run: PCC1 to PCC4 with their nulls, and the paper's claims about the gates."""
 
 from collections.abc import Callable, Sequence
 
@@ -19,7 +19,7 @@ _PIXELS = {
     "_all_pixels": "all pixels, 0 where the other half is not seen",
     "": "pixels that both halves see",
 }
-"""PCC3 and PCC4 by the pixels that they are computed over."""
+"""Pixels over which PCC3 and PCC4 are computed, by the suffix of their keys."""
 _CORRELATIONS = {
     "pcc1_craterness": "PCC1: mask and craters",
     "pcc2": "PCC2: masks of two frames",
@@ -30,10 +30,10 @@ _CORRELATIONS = {
 
 
 def gate_verdicts(explained: Metrics) -> list[Verdict]:
-    """Claims on gates: a claim holds if it is true of all of its gates, does not hold if of none, and is open
-    otherwise.
+    """Verdicts on the claims about gates.
 
-    A gate's figure has no interval, so over fewer than `MIN_UNITS` scenes every claim is open.
+    A claim holds if it is true for all its gates, does not hold if it is true for no gate, and is open otherwise. The
+    figure of a gate has no interval, so every claim is open with fewer than `MIN_UNITS` scenes.
     """
     shallow = f"PCC1 of {' and '.join(SHALLOW_CRATER_GATES)} is moderate (here: at least {MODERATE} in size)"
     deep = f"PCC2 of {', '.join(DEEP_ALIKE_GATES)} is above {DEEP_ALIKE}"
@@ -73,7 +73,7 @@ def _of(explained: Metrics, measure: str, gates: Sequence[str]) -> dict[str, flo
 def _judged(
     explained: Metrics, claim: tuple[str, str], values: dict[str, float], ok: Callable[[float], bool], null: str
 ) -> Verdict:
-    """Verdict on a claim (text, the paper's figure) from the value of each gate; `null` names its nulls, if any."""
+    """Verdict on a claim (text, the paper's figure) from the value of each gate; `null` names the nulls, if any."""
     if not values:
         return Verdict(*claim, "-", "-", "not measured")
     scenes = explained.get("pair_scenes" if "PCC4" in claim[0] else "scenes")
@@ -89,14 +89,14 @@ def _judged(
 
 
 def gate_table(explained: Metrics) -> list[str]:
-    """Ranges of PCC1 to PCC4 over all gates, with the ranges of each null, as lines of Markdown."""
+    """Table of the ranges of PCC1 to PCC4 and their nulls over all gates, as lines of Markdown."""
     rows = []
     for measure, title in _CORRELATIONS.items():
         names = [key.removeprefix(f"{measure}/") for key in explained if key.startswith(f"{measure}/B_")]
         gates = _of(explained, measure, [name for name in names if not name.endswith(("_low", "_high"))])
         if not gates:
             continue
-        # A gate without nulls has no such key.
+        # Leave out gates without nulls, which lack this key.
         beats = [bool(value) for gate in gates if (value := explained.get(f"{measure}_beats_nulls/{gate}")) is not None]
         beating = f"{sum(beats)} of {len(beats)}" if beats else "-"
         rows.append([title, _range(list(gates.values())), _nulls(explained, measure, gates) or "-", beating])
@@ -104,7 +104,7 @@ def gate_table(explained: Metrics) -> list[str]:
 
 
 def _nulls(explained: Metrics, measure: str, gates: dict[str, float]) -> str:
-    """Range of each null over the gates; empty without nulls."""
+    """Range of each null over the gates, as text; empty without nulls."""
     nulls: dict[str, list[float]] = {}
     for gate in gates:
         prefix = f"{measure}_null/{gate}/"

@@ -1,4 +1,4 @@
-"""The page of the paper's experiment, from the runs that are finished: verdicts, tables, figures, deviations."""
+"""Write the page of the paper's experiment from the finished runs: verdicts, tables, figures, deviations."""
 
 import shutil
 from collections.abc import Sequence
@@ -48,11 +48,12 @@ _READINGS = {
 
 
 def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline_share: str | None = None) -> Path:
-    """Write paper.md, paper.json and pictures into the folder of the experiment's runs; returns the page.
+    """Write paper.md, paper.json and pictures into the folder of the experiment's runs; return the page's path.
 
-    `dataset` is the detection dataset of the headline ground. `about` are lines on how the experiment was run and what
-    was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the curve with
-    the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is finished.
+    `dataset` is the detection dataset of the headline ground. `about` has lines on how the experiment was run and what
+    was left out. `headline_share` is the equilibrium_share of the headline ground; by default, it is the point of the
+    curve whose AP is nearest to the paper's AP. Sections without finished runs contain a note instead. Raises UserError
+    if no run is finished.
     """
     runs = PaperRuns(root)
     if not root.is_dir():
@@ -86,7 +87,7 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
 
 
 def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
-    """Detections of the finished trainings on the headline ground, by network."""
+    """Detections of the finished training runs on the headline ground, by network."""
     folders = {
         network: runs.detector(detect_name(network)) for network, trainings in runs.detections().items() if trainings
     }
@@ -98,7 +99,7 @@ def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
 
 
 def _settings(runs: PaperRuns) -> list[str]:
-    """Settings of the detectors on the headline ground, from the first finished one."""
+    """Settings of the detectors on the headline ground, from the first finished detector."""
     folders = [runs.detector(detect_name(network)) for network, trainings in runs.detections().items() if trainings]
     known = [folder for folder in folders if (folder / "config.yaml").is_file()]
     if not known:
@@ -139,7 +140,7 @@ def _table_2(runs: PaperRuns) -> list[str]:
 
 
 def _elsewhere(runs: PaperRuns) -> bool:
-    """Whether any detector on another ground than the headline, or on the benchmark, is finished."""
+    """Whether a finished detector exists for the benchmark or for a ground other than the headline ground."""
     trainings = [
         some_trainings for ground in (SPARSE, USUAL, TRANSFER) for some_trainings in runs.detections(ground).values()
     ]
@@ -147,7 +148,7 @@ def _elsewhere(runs: PaperRuns) -> bool:
 
 
 def _starts(runs: PaperRuns) -> str:
-    """A sentence on the initial weights of the headline rows and of the rows after transfer; empty if unknown."""
+    """A sentence on the initial weights of the headline rows and the transfer rows; empty if unknown."""
     found = []
     for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "rows after transfer")):
         starts = {
@@ -251,7 +252,7 @@ def _attention(runs: PaperRuns) -> list[str]:
 
 
 def _figures(read: dict[str, Metrics], answered: list[Verdict]) -> Metrics:
-    """Flat keys: <folder of a run>/<metric>, verdict/<number>/<part>."""
+    """All figures of the page, with flat keys: <folder of a run>/<metric>, verdict/<number>/<part>."""
     figures: Metrics = {}
     for folder, metrics in read.items():
         figures |= {f"{folder}/{key}": value for key, value in metrics.items() if not key.startswith("run/")}

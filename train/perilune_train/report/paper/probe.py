@@ -1,4 +1,4 @@
-"""Training time on this machine, from a few steps on random frames."""
+"""Measure training time on this machine with a few steps on random frames."""
 
 import time
 
@@ -15,7 +15,7 @@ _STEPS = 3
 
 
 def detect_seconds(config: DetectConfig, size_px: int) -> float:
-    """Seconds of a training image of a detector, forward and backward, for square frames."""
+    """Seconds per training image of a detector, forward and backward, for square frames."""
     network = YOLOv3(None, config.in_channels, config.width, config.attention, config.strides)
     device = choose_device(config.device)
     images = torch.randn(_IMAGES, config.in_channels, size_px, size_px, device=device)
@@ -31,7 +31,7 @@ def detect_seconds(config: DetectConfig, size_px: int) -> float:
 
 
 def navigate_seconds(config: NavigateConfig) -> float:
-    """Seconds of a training pair of the paper's navigator, forward and backward, for square frames."""
+    """Seconds per training pair of the paper's navigator, forward and backward, for square frames."""
     stack = config.stack
     form = config.in_channels, stack.width, stack.attention, stack.hidden
     network = StackNavigator(*form, StackOptions(stack.pool, stack.stages))
@@ -48,7 +48,7 @@ def navigate_seconds(config: NavigateConfig) -> float:
 
 
 def _timed(step, device: str) -> float:
-    """Seconds of a step: the fastest of a few, after a first one."""
+    """Seconds of the fastest of a few steps, after one warm-up step."""
     step()
     seconds = []
     for _ in range(_STEPS):

@@ -1,4 +1,4 @@
-"""Sentences of the page: the first paragraph, the rule of the verdicts, the three causes, the deviations."""
+"""Sentences of the page: the first paragraph, the rule for verdicts, the three causes, the deviations."""
 
 from perilune_train.records.markdown import number
 from perilune_train.report.paper.claimed import DETECTION, TARGET_AP
@@ -15,7 +15,7 @@ CAUSES = {
     "ground": "**Ground.** perilune's usual ground has many craters, many of them too faint to see, and the paper's "
     "rule labels them all. The curve above shows the network on sparser ground.",
 }
-"""By the first part of the keys of paper-causes.json."""
+"""Text on each cause, by the first part of the keys of paper-causes.json."""
 
 DEVIATIONS = (
     "Frames are rendered by perilune in place of PANGU. The paper does not publish its data, camera or Sun. The "
@@ -49,12 +49,15 @@ DEVIATIONS = (
 
 
 def lead(runs: PaperRuns, share: str | None, *, given: bool) -> str:
-    """The paragraph; `share` is the equilibrium_share of the headline ground, `given` if the caller named it."""
+    """The first paragraph of the page.
+
+    `share` is the equilibrium_share of the headline ground; `given` says whether the caller chose it.
+    """
     return " ".join([_ground(runs, share, given), _scoring(runs), _trainings(runs)])
 
 
 def verdict_note() -> str:
-    """The rule of the verdicts, in words."""
+    """The rule for verdicts, in words."""
     return (
         f"The rule is the same for both signs. With {MIN_TRAININGS} trainings or more of each network a claim *holds* "
         "if every training with attention is better than every one without, and *does not hold* if every one is worse. "

@@ -1,8 +1,9 @@
-"""The rule by which a claim holds, does not hold or is open.
+"""The rule that decides whether a claim holds, does not hold or is open.
 
-The rule is symmetric in the sign. With `MIN_TRAININGS` trainings or more of each network, a claim holds if every
-training with attention is better than every training without, and does not hold if every one is worse. With one
-training of each, it holds or does not hold only if the intervals are separated. Otherwise it is open.
+The rule treats better and worse symmetrically. With at least `MIN_TRAININGS` training runs of each network, a claim
+holds if every run with attention is better than every run without attention, and does not hold if every run with
+attention is worse than every run without. With one training run of each network, the claim holds or does not hold only
+if the intervals are separated. Otherwise the claim is open.
 """
 
 from collections.abc import Sequence
@@ -15,30 +16,33 @@ from perilune_train.report.paper.tables import numbers
 
 Answer = Literal["holds", "does not hold", "open", "not measured"]
 AS_FAST = 1.05
-"""Largest ratio of two times, in either direction, that counts as equal."""
+"""Largest ratio of two times, the longer divided by the shorter, at which they count as equal."""
 MIN_TRAININGS = 3
-"""Number of trainings of each network from which their order decides. With three of each, chance puts all trainings of
-one network above all of the other once in ten times."""
+"""Smallest number of training runs of each network at which their order decides. With three runs of each, chance alone
+puts all runs of either network above all runs of the other network in one of ten cases."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One claim."""
+    """One claim of the paper and the answer to it."""
 
     claim: str
     """What the paper says."""
     claimed: str
     """The paper's figures."""
     measured: str
-    """Our figures: with attention against without."""
+    """Our figures, with and without attention."""
     trainings: str
-    """Number of trainings on which the answer rests."""
+    """Number of training runs on which the answer is based."""
     answer: Answer
-    """Answer by the rule at the top of this file. not measured: a run or a figure is missing."""
+    """Answer by the rule at the top of this file; "not measured" if a run or a figure is missing."""
 
 
 def compared(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics], *, higher: bool) -> Answer:
-    """Answer to the claim that attention makes a figure higher (or lower), from trainings with and without it."""
+    """Answer to the claim that attention makes a figure higher (or lower).
+
+    `attended` are the training runs with attention, `plain` the training runs without.
+    """
     ours, others = numbers(attended, key), numbers(plain, key)
     if not ours or not others:
         return "not measured"
@@ -51,7 +55,7 @@ def compared(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics], *,
 
 
 def by_order(ours: Interval | None, other: Interval | None, higher: bool) -> Answer:
-    """Answer from two ranges: open if they overlap or one is unknown."""
+    """Answer from the order of two ranges; open if they overlap or if one is unknown."""
     if ours is None or other is None:
         return "open"
     above, below = ours[0] > other[1], ours[1] < other[0]

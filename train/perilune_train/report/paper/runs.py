@@ -1,25 +1,25 @@
-"""The runs of the paper's experiment: names of their folders, and which of them are finished.
+"""The runs of the paper's experiment: the names of their folders, and which runs are finished.
 
-Below the root of the runs:
+Folders and files below the root of the runs:
 
     detect/curve-<share>            YOLOv3 without attention on grounds of rising density; <share> is the
                                     equilibrium_share as text, or `lunar` for our usual ground
     detect/<network>                headline ground, full width; networks are the keys of `ATTENTION`
-    detect/<network>-half-<seed>    the same at half width, seeds `SEEDS`
+    detect/<network>-half-<seed>    headline ground, half width, seeds `SEEDS`
     detect/sparse-<network>         sparse ground, full width
-    detect/lunar-<network>          our usual ground by the paper's rule of labels
+    detect/lunar-<network>          our usual ground, with labels by the paper's rule
     detect/long-<network>           headline ground, full width, more epochs
     detect/transfer-<network>       headline ground, started from our own network, with frozen epochs
     navigate/<navigator>-stack, navigate/<navigator>-attitude-stack, navigate/<navigator>-motion-stack
-                                    pose in O_L (the paper's reading), the same with attitude noise, and motion
+                                    pose in O_L (as we read the paper), pose in O_L with attitude noise, and motion
                                     between frames
     explain/attention
     benchmark/<network>, benchmark/<navigator>
-                                    the locked benchmark; of navigators, that for motion: the landing frame of other
-                                    ground is unknown
+                                    scores on the locked benchmark; only the navigator for motion is scored, because
+                                    the landing frame of other ground is unknown
     paper-causes.json               ablations (`read_causes` in tables.py)
 
-Any of them may be missing.
+Each of these may be missing.
 """
 
 from collections.abc import Mapping
@@ -30,9 +30,9 @@ from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metr
 from perilune_train.report.paper.claimed import TARGET_AP
 
 DETECTORS = {"YOLOv3": "yolov3", "attention-YOLOv3": "attention-yolov3"}
-"""Folders of the paper's detectors, by the paper's names."""
+"""Folder of each detector of the paper, by the paper's name."""
 ATTENTION = {"yolov3": "none", "attention-yolov3": "cbam", "attention-identity": "cbam_identity"}
-"""Value of detect.attention of each detector, by its folder."""
+"""Value of detect.attention, by the folder of the detector."""
 NAMES = {
     "yolov3": "YOLOv3",
     "attention-yolov3": "attention-YOLOv3, plain CBAM",
@@ -40,18 +40,18 @@ NAMES = {
 }
 """Names of the detectors on the page."""
 SEEDS = (0, 1, 2)
-"""Random seeds of the trainings at half width."""
+"""Random seeds of the training runs at half width."""
 HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
-"""Grounds, and two variants of the headline ground (after transfer, with more epochs): the first part of a run's
-name."""
+"""First parts of the names of runs: three grounds, then two variants of the headline ground (after transfer, and with
+more epochs)."""
 SPARSE_SHARE = "0.1"
 """equilibrium_share of the sparse ground."""
 CURVE = "curve"
 """First part of the names of the runs on grounds of rising density."""
 NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
-"""First part of the names of the navigate runs, by the paper's names; their folders end in -stack."""
+"""First part of the names of the navigate runs, by the paper's name. The names of their folders end in -stack."""
 READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
-"""Endings of the names of the navigate runs: pose in O_L, pose with attitude noise, motion between frames."""
+"""Ending of the names of the navigate runs: pose in O_L, pose in O_L with attitude noise, motion between frames."""
 EXPLAINED = "attention"
 """Name of the explain run."""
 CAUSES = "paper-causes.json"
@@ -60,20 +60,21 @@ BENCHMARK_FILE = "benchmark.json"
 
 
 def detect_name(network: str, ground: str = HEADLINE, seed: int | None = None) -> str:
-    """Name of the training of a detector, a key of `ATTENTION`; with a seed, of the one at half width."""
+    """Name of a detector's training run. `network` is a key of `ATTENTION`; a seed selects the run at half width."""
     half = [] if seed is None else ["half", str(seed)]
     return "-".join([*([ground] if ground else []), network, *half])
 
 
 def navigate_name(navigator: str, reading: str = "pose") -> str:
-    """Name of the training of a navigator, a value of `NAVIGATORS`, in one of the `READINGS`."""
+    """Name of a navigator's training run. `navigator` is a value of `NAVIGATORS`, `reading` a key of `READINGS`."""
     return navigator + READINGS[reading]
 
 
 def nearest_share(curve: Mapping[str, Metrics], prefix: str = "") -> str | None:
-    """Share of the curve, except `lunar`, at which the AP on validation is nearest to the AP of the paper's YOLOv3.
+    """The equilibrium_share at which the validation AP is nearest to the AP of the paper's YOLOv3.
 
-    `prefix` is that of the scoring rule: "" (usual) or "strict/". None if the curve has no AP.
+    The point `lunar` of the curve is left out. `prefix` selects the scoring rule: "" (usual) or "strict/". None if the
+    curve has no AP.
     """
     ap_of_share = {share: metrics.get(f"val/{prefix}ap50_paper") for share, metrics in curve.items() if share != USUAL}
     known = {share: abs(ap - TARGET_AP) for share, ap in ap_of_share.items() if isinstance(ap, int | float)}
@@ -82,17 +83,17 @@ def nearest_share(curve: Mapping[str, Metrics], prefix: str = "") -> str | None:
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """Folders and metrics of the experiment's runs. Methods raise UserError only on damaged metrics."""
+    """Folders and metrics of the experiment's runs. Methods raise UserError only if metrics are damaged."""
 
     root: Path
-    """The folder that holds all of them, such as runs/paper."""
+    """The folder of all these runs, such as runs/paper."""
 
     def detector(self, name: str) -> Path:
-        """Folder of a detect run, from its name."""
+        """Folder of the detect run with this name."""
         return self.root / "detect" / name
 
     def navigator(self, name: str) -> Path:
-        """Folder of a navigate run, from its name."""
+        """Folder of the navigate run with this name."""
         return self.root / "navigate" / f"{name}-stack"
 
     @property
@@ -101,23 +102,23 @@ class PaperRuns:
         return self.root / "explain" / EXPLAINED
 
     def benchmark(self, name: str) -> Path:
-        """Folder of the score on the locked benchmark of a detector or navigator, by its folder's name."""
+        """Folder with the benchmark score of the detector or navigator whose run folder has this name."""
         return self.root / "benchmark" / name
 
     def detections(self, ground: str = HEADLINE) -> dict[str, list[Metrics]]:
-        """Metrics of the finished trainings at full width on a ground, at most one for each network."""
+        """Metrics of the finished training runs at full width on a ground, at most one per network."""
         return {network: self._detect(detect_name(network, ground)) for network in ATTENTION}
 
     def halves(self) -> dict[str, list[Metrics]]:
-        """Metrics of the finished trainings at half width on the headline ground, for each network."""
+        """Metrics of the finished training runs at half width on the headline ground, by network."""
         names = {network: [detect_name(network, seed=seed) for seed in SEEDS] for network in ATTENTION}
         return {network: self._detect(*run_names) for network, run_names in names.items()}
 
     def curve(self, headline: str | None = None) -> dict[str, Metrics]:
         """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
 
-        Runs on the sparse, the headline and our usual ground also count as points if network size and epochs equal
-        those of the curve's runs. `headline` is the share of the headline ground.
+        Runs on the sparse, the headline and our usual ground are also points of the curve if their network size and
+        epochs equal those of the curve's runs. `headline` is the equilibrium_share of the headline ground.
         """
         name_of_share = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
         read = {share: finished(self.detector(name)) for share, name in name_of_share.items()}
@@ -134,21 +135,21 @@ class PaperRuns:
         return {share: metrics for share, metrics in ordered.items() if metrics is not None}
 
     def navigation(self, reading: str) -> dict[str, Metrics]:
-        """Metrics of the finished navigators of a reading, by the paper's names."""
+        """Metrics of the finished navigators in one of the `READINGS`, by the paper's names."""
         folders = {name: self.navigator(navigate_name(network, reading)) for name, network in NAVIGATORS.items()}
         read = {name: finished(folder) for name, folder in folders.items()}
         return {name: metrics for name, metrics in read.items() if metrics is not None}
 
     def explanation(self) -> Metrics | None:
-        """Metrics of the explain run."""
+        """Metrics of the explain run; None if it is missing or not finished."""
         return finished(self.explained)
 
     def scored(self, name: str) -> Metrics | None:
-        """Figures of a detector or navigator on the locked benchmark."""
+        """Figures of a detector or navigator on the locked benchmark; None if they are missing."""
         return finished(self.benchmark(name), BENCHMARK_FILE)
 
     def all_finished(self) -> dict[str, Metrics]:
-        """Metrics of every finished run by its folder below the root, such as detect/yolov3."""
+        """Metrics of every finished run, by the folder relative to the root, such as detect/yolov3."""
         files = sorted(path for kind in ("detect", "navigate") for path in self.root.glob(f"{kind}/*/{METRICS_FILE}"))
         files += [self.explained / METRICS_FILE, *sorted(self.root.glob(f"benchmark/*/{BENCHMARK_FILE}"))]
         read = {path.parent.relative_to(self.root).as_posix(): finished(path.parent, path.name) for path in files}
@@ -165,7 +166,7 @@ def finished(folder: Path, file: str = METRICS_FILE) -> Metrics | None:
 
 
 def _size(metrics: Metrics) -> tuple[object, object]:
-    """Size of a detector and of its training."""
+    """Network size of a detector, and the epochs of its training."""
     return metrics.get("parameters"), metrics.get("train/epochs")
 
 

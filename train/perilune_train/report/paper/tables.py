@@ -1,4 +1,4 @@
-"""Tables of the page: Table II, the curve, Table III, ablations of the causes."""
+"""Tables of the page: Table II, the curve, Table III, and the ablations of the causes."""
 
 import json
 import math
@@ -46,7 +46,7 @@ _IDENTITY_ONLY = (_GROUNDS[USUAL],)
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 _NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
-"""Columns of Table III, with their number of decimals."""
+"""Number of decimals of each column of Table III."""
 FLOORS = {
     "mean_pose": "mean pose of the training",
     "mean_pose_at_frame": "mean pose of the training at that frame",
@@ -55,12 +55,12 @@ FLOORS = {
     "mean_at_step": "mean motion of the training at that step",
     "nominal": "nominal motion",
 }
-"""Baselines of a navigator: methods without images, and linear regression on its initial features."""
+"""Baselines of a navigator: methods without images, and linear regression on the navigator's initial features."""
 _METHODS = {"klt": "KLT tracks, without training", "alignment": "direct alignment, without training"}
 
 
 def table_2(runs: PaperRuns) -> list[str]:
-    """Table II as lines of Markdown, and one line that names what was not run."""
+    """Table II as lines of Markdown, with one line that names the missing training runs."""
     rows, missing = [], []
     for network, figures in DETECTION.items():
         cells = [f"{figures[key]:.4f}" if key in figures else "-" for key in _DETECTION]
@@ -99,7 +99,7 @@ def table_2(runs: PaperRuns) -> list[str]:
 
 
 def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]:
-    """The curve of AP against equilibrium_share as lines of Markdown, the headline ground marked."""
+    """The curve of AP against equilibrium_share as lines of Markdown, with a mark on the headline ground."""
     rows = []
     for share, metrics in curve.items():
         name = "lunar (our usual ground)" if share == USUAL else share
@@ -111,7 +111,7 @@ def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]
 
 
 def table_3(runs: PaperRuns, reading: str) -> list[str]:
-    """Table III in one reading as lines of Markdown, with the RMSE of the vector's length next to the components'."""
+    """Table III for one of the `READINGS` as lines of Markdown, with the RMSE per component and of the vector."""
     rows = []
     navigation = runs.navigation(reading)
     for network, claimed in NAVIGATION.items():
@@ -128,7 +128,7 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
     others: dict[str, list[str]] = {}
     for network, metrics in navigation.items():
         for method, name in (FLOORS | _METHODS).items():
-            # The features come from the network's own backbone.
+            # Name the network, because the features come from its backbone.
             title = f"{name} of {network}" if method == "ridge" else name
             if f"baseline/{method}/{_POSITION}" in metrics:
                 others.setdefault(title, [title, "here", *_errors(metrics, f"baseline/{method}"), "-"])
@@ -137,7 +137,7 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
 
 
 def floor(metrics: Metrics) -> str | None:
-    """The best of the `FLOORS` of a navigate run by the RMSE of position; None if there is none."""
+    """The floor of a navigate run (`FLOORS`) with the lowest position RMSE; None if the run has no floors."""
     errors = {name: metrics.get(f"baseline/{name}/{_POSITION}") for name in FLOORS}
     known = {name: value for name, value in errors.items() if isinstance(value, int | float)}
     return min(known, key=lambda name: known[name], default=None)
@@ -153,10 +153,10 @@ def lost_to(metrics: Metrics) -> str | None:
 
 
 def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
-    """Tables of the ablations by cause, as lines of Markdown; empty if there are none.
+    """Tables of the ablations by cause, as lines of Markdown; empty if there are no ablations.
 
-    Keys of paper-causes.json are <cause>/<row>/<column>, with cause loss, gates or ground; values are numbers or texts.
-    Other keys are not shown.
+    Keys of paper-causes.json are <cause>/<row>/<column>, with cause loss, gates or ground. Values are numbers or
+    strings. Other keys are not shown.
     """
     path = runs.root / CAUSES
     if not path.is_file():
@@ -167,7 +167,7 @@ def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
         raise UserError(path, "content", str(error), "the file that make bench-paper-causes writes") from None
     if not isinstance(content, dict):
         raise UserError(path, "content", type(content).__name__, "the file that make bench-paper-causes writes")
-    # The record of the run is an object.
+    # Leave out the record of the run, which is an object.
     figures = {key: value for key, value in content.items() if isinstance(value, str | int | float)}
     causes: dict[str, dict[str, dict[str, str]]] = {}
     for key, value in figures.items():
@@ -185,7 +185,7 @@ def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
 
 
 def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
-    """A figure with its interval; for several trainings, mean and range; a dash if undefined."""
+    """A figure with its interval as text. For several training runs: mean and range. A dash if undefined."""
     known = numbers(trainings, key)
     if not known:
         return "-"
@@ -196,25 +196,25 @@ def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
 
 
 def numbers(trainings: Sequence[Metrics], key: str) -> list[float]:
-    """The finite values of a figure."""
+    """The finite values of a figure in training runs."""
     values = [metrics.get(key) for metrics in trainings]
     return [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
 
 
 def epochs(trainings: Sequence[Metrics]) -> str:
-    """Epochs of the trainings; a dash if unknown."""
+    """Epochs of the training runs, as text; a dash if unknown."""
     counts = {str(metrics["train/epochs"]) for metrics in trainings if "train/epochs" in metrics}
     return " or ".join(sorted(counts, key=int)) or "-"
 
 
 def labels_a_frame(metrics: Metrics, prefix: str = "test") -> str:
-    """Mean number of selected labels in a frame; a dash if unknown."""
+    """Mean number of selected labels per frame, as text; a dash if unknown."""
     labels, frames = (metrics.get(f"{prefix}/{key}") for key in ("labels", "frames"))
     return f"{labels / frames:.1f}" if isinstance(labels, int) and isinstance(frames, int) and frames else "-"
 
 
 def seconds(metrics: Metrics) -> str:
-    """Seconds of a pair; a dash if unknown."""
+    """Seconds per pair, as text; a dash if unknown."""
     milliseconds = metrics.get("test/ms_per_single_pair")
     return f"{milliseconds / 1e3:.3f}" if isinstance(milliseconds, int | float) else "-"
 

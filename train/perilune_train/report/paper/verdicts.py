@@ -1,4 +1,4 @@
-"""The paper's claims, each with what was measured here and whether it holds (rule.py)."""
+"""The paper's claims, each with our measurement and the answer whether the claim holds (rule.py)."""
 
 import math
 from collections.abc import Sequence
@@ -13,13 +13,16 @@ from perilune_train.report.paper.tables import FLOORS, lost_to, numbers, values
 
 ONE = "one training each"
 _CONSTANT_DEG = 1e-4
-"""Without attitude noise the orientation is constant, and its mean has an error below this limit, degrees."""
+"""The orientation counts as constant if its mean has an error below this limit, degrees (no attitude noise)."""
 GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from identity"}
 """Detectors with attention."""
 
 
 def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
-    """All claims in the order of the paper; `large` is the width of the large craters that attention-YOLOv3 finds."""
+    """Verdicts on all claims in the order of the paper.
+
+    `large` is the width ratio of the large craters that attention-YOLOv3 detects; None if unknown.
+    """
     answers = []
     for key, (name, claimed) in _detection_claims().items():
         answers += [
@@ -32,7 +35,7 @@ def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
 
 
 def _detection_claims() -> dict[str, tuple[str, str]]:
-    """Name of each claim and the paper's figures, by the key of metrics.json."""
+    """Text of each claim and the paper's figures, by the key in metrics.json."""
     names = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
     plain, attended = DETECTION.values()
     compared = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
@@ -45,7 +48,7 @@ def _detection_claims() -> dict[str, tuple[str, str]]:
 
 
 def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) -> Verdict:
-    """Compare at half width if there are several trainings, and add the single training at full width."""
+    """Compare the training runs at half width if there are several, and add the single run at full width."""
     full, half = runs.detections(), runs.halves()
     counts = [len(numbers(half[network], key)) for network in (gates, "yolov3")]
     pair = full[gates], full["yolov3"]
@@ -67,7 +70,7 @@ def _measured(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics]) -
     if not known and not numbers(attended, key):
         return "-"
     size = max(map(abs, known), default=0.0)
-    # Four digits, so that small differences show.
+    # Show four digits, so that small differences are visible.
     digits = max(0, 3 - math.floor(math.log10(size))) if size else 3
     return f"{values(attended, key, digits)} against {values(plain, key, digits)}"
 
@@ -119,7 +122,10 @@ def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
 
 
 def _as_fast(runs: PaperRuns) -> Verdict:
-    """Compare seconds per pair in each reading, and on the benchmark, where one machine measured both networks."""
+    """Compare seconds per pair in each of the `READINGS`, and on the benchmark.
+
+    Times are compared only if one kind of machine and one command measured both networks.
+    """
     claim, claimed = "a pair takes as long with attention as without", "0.22 s both"
     pairs = {reading: list(runs.navigation(reading).values()) for reading in READINGS}
     scored = [runs.scored(name) for name in NAVIGATORS.values()]
@@ -138,13 +144,13 @@ def _as_fast(runs: PaperRuns) -> Verdict:
         listed.append(f"{setting}: {with_ / 1e3:.3f} s against {without / 1e3:.3f} s{load}{note}")
     if not ratios:
         return Verdict(claim, claimed, "; ".join(listed) or "-", "-", "not measured")
-    # Above, below or within the tolerance.
+    # 1: slower than the tolerance; -1: faster; 0: within the tolerance.
     sides = {(ratio > AS_FAST) - (ratio < 1 / AS_FAST) for ratio in ratios}
     answer: Answer = "holds" if sides == {0} else "does not hold" if sides in ({1}, {-1}) else "open"
     return Verdict(claim, claimed, "; ".join(listed), f"{len(ratios)} comparisons" if len(ratios) > 1 else ONE, answer)
 
 
 def _program(metrics: Metrics) -> tuple[str, ...]:
-    """The command that measured, without its options."""
+    """The command that measured the time, without its options."""
     words = str(metrics.get("run/command") or "").split()
     return tuple(word for word in words[:3] if not word.startswith("-"))
