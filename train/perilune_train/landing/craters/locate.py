@@ -40,8 +40,8 @@ class Located:
 def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior) -> Located | None:
     """Estimate the pose of a frame from its craters, near the expected pose or by a search.
 
-    A search is used if the expected pose is too uncertain. Returns None if too few sightings match, or if two poses
-    explain them about equally well.
+    Searches if the expected pose is too uncertain or no fix is found near it. Returns None if too few sightings match,
+    or if two poses explain them about equally well.
     """
     ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
     altitude_m = float(prior.pose.position_m[2] - ground_m)

@@ -1,4 +1,4 @@
-"""The crater catalogue of a descent: in the site's frame, or by latitude and longitude. It is untrusted input."""
+"""Read the crater catalogue of a descent, in the site frame or by latitude and longitude. It is untrusted input."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ _SETTING = "prior.catalogue_columns"
 _SITE_FRAME: dict[str, Kind] = dict.fromkeys((*CRATER_COLUMNS, *NORMAL_COLUMNS), "number")
 _HEIGHT = "height_m"
 _REACH_M = 200_000.0
-"""Distance from the site up to which craters of a catalogue by latitude and longitude are used, metres."""
+"""Largest distance from the site, metres, at which craters listed by latitude and longitude are used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,21 +29,22 @@ class CatalogueUse:
     """How a catalogue is read."""
 
     position_sigma_m: float
-    """Standard deviation of a crater's position on each axis."""
+    """Standard deviation of a crater's position, per axis, metres."""
     diameter_sigma_share: float
-    """Standard deviation of a crater's diameter, divided by it."""
+    """Standard deviation of a crater's diameter, as a share of the diameter."""
     site_deg: tuple[float, float] | None = None
-    """Latitude and longitude of the site, for catalogues by latitude and longitude."""
+    """Latitude and longitude of the site, degrees; needed for a catalogue by latitude and longitude."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Columns of such a catalogue; empty to recognise them."""
+    """Column names of a catalogue by latitude and longitude; if empty, they are recognised automatically."""
 
 
 def read_catalogue(path: Path, use: CatalogueUse) -> Catalogue:
     """Read a crater catalogue, Parquet or CSV.
 
-    In the site's frame it has x_m, y_m, z_m, diameter_m and, optional, normal_x, normal_y, normal_z; without normals
-    the rims are level. By latitude and longitude it has the columns that `read_craters` reads and, optional, height_m
-    above the sphere through the site. Raises UserError on a missing column or a value that is no crater.
+    A catalogue in the site frame has the columns x_m, y_m, z_m, diameter_m and, optionally, normal_x, normal_y,
+    normal_z. Without normals, rims are taken as level. A catalogue by latitude and longitude has the columns that
+    `read_craters` reads and, optionally, height_m above the sphere through the site. Raises UserError if a column is
+    missing or a value is invalid.
     """
     with open_table(path, CATALOGUE) as table:
         if not table.names or set(CRATER_COLUMNS[:3]) & set(table.names):
@@ -69,7 +70,7 @@ def _in_site_frame(columns: Columns, use: CatalogueUse) -> Catalogue:
 
 
 def _by_latitude(path: Path, use: CatalogueUse) -> Catalogue:
-    """Read a catalogue by latitude and longitude; prints how many of its craters are used."""
+    """Read a catalogue by latitude and longitude, and print how many of its craters are used."""
     listed = read_craters(path, _SETTING, use.columns, [_HEIGHT])
     if use.site_deg is None:
         expected = "site_latitude_deg and site_longitude_deg in prior.yaml, since the catalogue has no x_m, y_m, z_m"
