@@ -38,8 +38,7 @@ def true_homography(
 
 
 def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool_]:
-    """Mask (height, width) of the pixels of frame 1 whose ground is also inside frame 2. Both frames have equal
-    shape."""
+    """Mask (height, width) of the pixels of frame 1 whose ground is also in frame 2, which has an equal shape."""
     height, width = shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     moved = apply_homography(homography, np.stack([u, v], axis=-1))
