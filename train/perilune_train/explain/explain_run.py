@@ -203,7 +203,7 @@ def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metr
         metrics[f"{row['measure']}_beats_nulls/{row['map']}"] = bool(row["beats_all"])
     least = removal_row(evidence, higher_is_better=higher_is_better)
     metrics |= {f"{task}/removal_{name}": float(least[name]) for name in ("most", "least", "random", "shifted")}
-    # The ratio is undefined if no control does harm.
+    # The ratio is undefined if no control does harm; record 0.
     metrics[f"{task}/removal_ratio"] = float(least["ratio"]) if np.isfinite(least["ratio"]) else 0.0
     metrics[f"{task}/strongest_gate"] = evidence.strongest
     for measure in _COUNTED[task]:

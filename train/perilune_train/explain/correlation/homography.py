@@ -21,7 +21,8 @@ def true_homography(
     position_2_m: Array,
     rotation_2_camera_from_site: Array,
 ) -> Array:
-    """Homography (3, 3) of the ground from image coordinates (pixels) of frame 1 to those of frame 2, from true poses.
+    """Homography (3, 3) of the ground from pixel coordinates in frame 1 to pixel coordinates in frame 2, from true
+    poses.
 
     Takes positions (3,) in metres, O_L, and rotations (3, 3). The plane is the mean ground, z = 0 of O_L. The paper
     uses "the affine transformation matrix defined by groundtruth pose" without defining it. Deviation from the paper:

@@ -94,8 +94,7 @@ def detector_values(
 
 
 def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pixels: bool = True) -> pd.DataFrame:
-    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the id of the
-    pair.
+    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the pair's id.
 
     pcc3 and pcc4 use the overlap: the pixels of the upper frame whose ground is also in the lower frame. The paper uses
     all pixels, at least for PCC3, and does not define the moved map outside the overlap. In pcc3_all_pixels and

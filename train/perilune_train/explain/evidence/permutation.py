@@ -54,8 +54,8 @@ def permuted(
 def detector_permutations(masks: Masks, targets: FrameTargets, signs: Signs, rng: np.random.Generator) -> pd.DataFrame:
     """Rows of the permutation null for pcc1_craterness and pcc1_partial, with the columns of `null_differences`.
 
-    Masks are (N, height, width); `signs` are those of `validation_signs`. There is no permutation null for PCC2,
-    because PCC2 does not depend on the order of the frames.
+    Masks are (N, height, width); `signs` come from `validation_signs`. There is no permutation null for PCC2, because
+    PCC2 does not depend on the order of the frames.
     """
     basis = given_basis([targets.brightness, targets.gradient])
     craterness = standardised_rows(1 - targets.truth)
@@ -78,7 +78,7 @@ def pair_permutations(masks: Masks, targets: PairTargets, rng: np.random.Generat
 
     Upper halves are compared with lower halves of pairs in other scenes. Each lower half is moved by the homography of
     the pair that it belongs to. Stacked masks (N, 2 height, width) are sampled every fourth pixel, since all N x N
-    combinations are computed; values therefore differ slightly from those of `pair_values`.
+    combinations are computed; values therefore differ slightly from the values of `pair_values`.
     """
     scale = np.diag([1 / _PAIR_STEP, 1 / _PAIR_STEP, 1.0])
     small = [scale @ homography @ np.linalg.inv(scale) for homography in targets.homographies]

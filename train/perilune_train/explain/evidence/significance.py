@@ -137,8 +137,8 @@ def against_nulls(differences: pd.DataFrame) -> pd.DataFrame:
     gate's mean exceeds the mean of each null, and at least 5 scenes have values. Trajectories of one scene do not
     suffice.
 
-    With S scenes, p is at least 2^-S. With 9 scenes or more, a single gate out of 23 can pass. With 5 scenes, at least
-    15 gates must pass together.
+    With S scenes, p is at least 2^-S. With 9 scenes or more, a single gate out of 23 can pass alone. With 5 scenes, at
+    least 15 gates must pass together.
     """
     rows = []
     for (task, measure), family in differences.groupby(["task", "measure"], sort=False):

@@ -62,7 +62,7 @@ def stability(
     changes: Changes = DEFAULT_CHANGES,
     stacked: int = 1,
 ) -> pd.DataFrame:
-    """Pearson correlation of the masks of images (N, height, width) with those of the changed images.
+    """Pearson correlation of the masks of images (N, height, width) with the masks of the changed images.
 
     Columns: map, change ("noise 2 DN", "shift 3 -2 px", "lens -5 %"), frame_index, pearson (NaN if a mask is constant).
     A shift is undone before masks are compared over the pixels that both images show. For another lens, the image and

@@ -20,8 +20,8 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
     """Draw a PNG sheet: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
 
     `height_m` is the height of each frame's camera, metres, which is written below the frame. All masks of the sheet
-    share one scale, from the smallest to the largest value. Below each mask, its range is written, or "constant" if it
-    does not vary.
+    share one scale, from the smallest to the largest value. The range of each mask, or "constant" if the mask does not
+    vary, is written below the mask.
     """
     low = min(float(gate_masks.min()) for gate_masks in masks.values())
     high = max(float(gate_masks.max()) for gate_masks in masks.values())

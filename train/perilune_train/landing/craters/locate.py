@@ -20,7 +20,8 @@ _AHEAD = 1.5
 """Smallest ratio of agreeing sightings between the best and the second-best hypothesis."""
 _SIGMAS = 3.5
 _REACHES = (1.0, 3.0)
-"""Search radii, as multiples of the radius that the prior suggests. They grow because the prior may be wrong."""
+"""Search radii, tried in turn, as multiples of the radius that the prior suggests. The larger one is tried because the
+prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
 _LEAST_MARGIN = 0.06

@@ -2,15 +2,15 @@
 
 Parts of the error state, in this order:
 
-    POSITION     shift, metres, O_L                                              3
+    POSITION     translation, metres, O_L                                        3
     VELOCITY     change of velocity, metres per second, O_L                      3
-    ATTITUDE     turn of the body from the right, radians, O_B                   3
+    ATTITUDE     rotation applied from the right, radians, O_B                   3
     GYRO_BIAS    error of the gyroscope's bias, radians per second, O_B          3
     FORCE_BIAS   error of the accelerometer's bias, metres per second^2, O_B     3
     COMMON       image error that all sightings of craters share, pixels         5
     GROUND       height of the ground below, metres                              1
     (craters)    offset of each crater in view over ground, metres, O_L          2 each
-    (poses)      shift and turn of each kept pose, as POSITION and ATTITUDE      6 each
+    (poses)      translation and rotation of each kept pose, as above            6 each
 
 Errors of the catalogue, of the detector and of the ground's height repeat from frame to frame. If the filter treated
 them as noise, it would average them over frames and report too small a covariance. They are therefore parts of the
@@ -183,8 +183,8 @@ def common_pattern(ray: Array) -> Array:
     """Derivatives (n, 2, 5) of the image error that all sightings share, at rays (n, 2) on the plane at depth 1.
 
     The error is a shift, a scale and two terms that grow with the square of the distance from the image centre. Errors
-    of position, altitude and tilt displace craters in the same pattern, so one frame cannot distinguish them from this
-    error.
+    of position, altitude and tilt displace craters in this pattern too, so one frame cannot distinguish them from the
+    image error.
     """
     x, y = ray.T
     zero, ones = np.zeros_like(x), np.ones_like(x)
