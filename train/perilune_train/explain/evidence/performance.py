@@ -50,8 +50,7 @@ class DetectionPerformance:
 
 @dataclass(frozen=True)
 class MotionPerformance:
-    """Position error of a stack navigator on runs of consecutive pairs. Each run starts from the initial state of the
-    LSTM."""
+    """Position error of a stack navigator on runs of pairs, each from the initial state of the LSTM."""
 
     navigator: StackNavigator
     """The network, in evaluation mode."""

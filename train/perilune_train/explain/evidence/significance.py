@@ -43,8 +43,7 @@ def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
 
 
 def validation_signs(table: pd.DataFrame) -> dict[tuple[str, str, str], float]:
-    """Sign, 1 or -1, of the mean of every PCC1 measure on validation frames, by task, measure and map; 1 if
-    undefined."""
+    """Sign of the mean of each PCC1 measure on validation frames, by task, measure and map; 1 if undefined."""
     rows = table[table["measure"].str.startswith("pcc1")]
     means = rows.groupby(["task", "measure", "map"], as_index=False)["value"].mean()
     keys = zip(means["task"], means["measure"], means["map"], strict=True)
@@ -95,8 +94,7 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
 
 
 def pairwise(measure: str, values: Array) -> Array:
-    """Values (N,) of frames, rescaled if the measure is PAIRWISE so that resampling units gives the correct spread of
-    the mean.
+    """Values (N,) of frames, rescaled if PAIRWISE so that resampling units gives the spread of the mean.
 
     The mean over all pairs of frames is a U-statistic of order 2. A unit changes this mean by twice the deviation of
     the unit's mean over pairs (Hoeffding 1948, doi 10.1214/aoms/1177730196). Deviations from the mean are therefore

@@ -43,8 +43,7 @@ def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
 
 
 def lens_map(height: int, width: int, distortion: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """For each pixel under another lens, column and row (height, width) of the corresponding point in the original
-    image.
+    """Columns and rows (height, width) in the original image of the pixels seen through another lens.
 
     r = r' (1 - distortion r'^2), where r' is the distance from the image centre under the new lens and r under the
     original lens, both in half widths. Coordinate 0 is the centre of the first pixel, as in cv2.remap.

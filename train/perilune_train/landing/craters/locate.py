@@ -67,8 +67,7 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
 def lost_in_space(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
 ) -> Located | None:
-    """Search an area for the pose of a frame whose tilt is known to about 1 degree; None if the result is not
-    certain."""
+    """Search an area for the pose of a frame whose tilt is known to about 1 degree; None if uncertain."""
     hypotheses = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
     least = max(_LEAST_AGREED, _LEAST_SHARE * min(len(sightings), N_TESTED))
     if not hypotheses or hypotheses[0].n_agreed < least:

@@ -136,8 +136,7 @@ class Lander:
         return self._since
 
     def inertial(self, measured: Increments) -> None:
-        """Propagate to the end of inertial measurements; ignores measurements older than the state and non-finite
-        ones."""
+        """Propagate by inertial measurements; ignore measurements that are not finite or older than the state."""
         self._stretch.inertial(measured)
 
     def coast(self, until_s: float) -> None:

@@ -37,8 +37,7 @@ def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_
 
 
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Translation and rotation (6,) from the expected pose, and their derivative (6, 21) with respect to the error
-    state."""
+    """Translation and rotation (6,) from the expected pose, and their derivative (6, 21) by the error state."""
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
     by_error = np.zeros((6, N_ERRORS))
@@ -115,8 +114,7 @@ def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offs
 
 @compiled
 def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDArray[np.int64]) -> None:
-    """Add the contribution of the craters' offsets to the array `crossed`; the offsets begin at rows `first` of the
-    state."""
+    """Add the contribution of craters' offsets, which begin at rows `first` of the state, to `crossed`."""
     for k in range(len(first)):
         east = first[k]
         for axis in range(2):
@@ -127,8 +125,7 @@ def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDA
 
 @compiled
 def _add_own(spread: Array, by_offset: Array, crossed: Array, first: NDArray[np.int64]) -> None:
-    """Add the contribution of the craters' offsets to the array `spread`; the offsets begin at rows `first` of the
-    state."""
+    """Add the contribution of craters' offsets, which begin at rows `first` of the state, to `spread`."""
     for row in range(len(crossed)):
         for k in range(len(first)):
             east = first[k]

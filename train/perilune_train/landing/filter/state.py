@@ -117,8 +117,7 @@ class State:
         )
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
-        """The state with the offsets of exactly `craters` (n,); `sigma_m` (n,) are the standard deviations of new
-        offsets."""
+        """The state with the offsets of exactly `craters` (n,); new offsets have standard deviations `sigma_m` (n,)."""
         row_of = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
         row_of[self.craters] = np.arange(len(self.craters))
         before = row_of[craters]
@@ -135,8 +134,8 @@ class State:
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
-        """Translation and rotation (6,) from the kept pose of an earlier frame to the true pose, and their covariance
-        (6, 6)."""
+        """Translation and rotation (6,) from an earlier frame's kept pose to the true pose, and their covariance (6,
+        6)."""
         turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
         start = N_ERRORS + 2 * len(self.craters) + 6 * number
         parts = slice(start, start + 6)

@@ -125,8 +125,7 @@ def fly_descent(
 
 
 def doubts_of(descent: Descent, *, is_lost: bool = False) -> list[str]:
-    """Reasons to doubt the units of the inertial measurements; less evidence is enough if the flight lost its
-    position."""
+    """Reasons to doubt the units of the inertial measurements; a lost flight needs less evidence."""
     mounting, expected = np.array(descent.camera.rotation_camera_from_body), descent.prior
     sigmas = expected.position_sigma_m, expected.velocity_sigma_mps
     prior = Prior(_start(descent), *sigmas, mounting[2], float(descent.frames.time_s[-1]))

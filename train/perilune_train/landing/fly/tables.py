@@ -111,8 +111,7 @@ def column_names(path: Path, limits: TableLimits) -> list[str]:
 
 
 def _header(path: Path, limits: TableLimits) -> tuple[list[str], bool]:
-    """Names of the columns, and whether they come from a comment. Such a comment starts with the name of the time
-    column."""
+    """Names of the columns, and whether they come from a comment that starts with the time column."""
     with open_table(path, limits, header=()) as table:
         first = table.peek()
         for comment in reversed(table.comments):

@@ -61,8 +61,7 @@ def _of_euroc(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Tr
 
 
 def with_errors_of(estimates: pd.DataFrame, truth: Truth | None) -> pd.DataFrame:
-    """Estimates of the first frames with added errors: estimate minus truth (metres, O_L), and the angle between
-    both."""
+    """Add errors to estimates of the first frames: position minus truth (metres, O_L) and attitude angle."""
     if truth is None:
         return estimates
     n = len(estimates)

@@ -137,8 +137,7 @@ def doubts(measured: Increments, prior: Prior, *, is_lost: bool) -> list[str]:
 
 
 def _better(steps: Increments, prior: Prior, *, is_unsteady: bool) -> Iterator[str]:
-    """Names of the readings that fit with the fewest changes, in order of how close their force is to the Moon's
-    gravity."""
+    """Names of the readings that fit with the fewest changes, force closest to the Moon's gravity first."""
     fitting = []
     for force, rate in product(_FORCES, _RATES):
         if not force.name and not rate.name:

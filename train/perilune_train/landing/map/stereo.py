@@ -72,7 +72,7 @@ class Ground:
     """Standard deviation of a crater's height relative to the height that `at` returns, metres."""
 
     def at(self, place_m: Array, without_nearest: bool = False) -> Array:
-        """Heights (M,) of points (M, 2): the median of the nearest craters, or of all if there are few; 0 without
+        """Heights (M,) of points (M, 2): median of the nearest craters, or of all if there are few; 0 without
         craters."""
         if len(self.height_m) <= _NEIGHBOURS:
             return np.full(len(place_m), np.median(self.height_m) if len(self.height_m) else 0.0)

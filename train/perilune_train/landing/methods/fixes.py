@@ -24,8 +24,7 @@ LOST_ABOVE_M, LOST_ALTITUDE_SHARE = 800.0, 0.1
 
 
 def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames. The priors have random errors of 100 m and 1 degree (standard deviation per
-    axis)."""
+    """Errors of the fixes of all frames, from priors with random errors of 100 m and 1 degree per axis (1 sigma)."""
     rng, sigma = np.random.default_rng(seed), np.repeat([PRIOR_M, np.radians(PRIOR_DEG)], 3)
     rows = []
     for descent in _followed("fixes", descents):
@@ -97,8 +96,7 @@ def _row(descent: SeenDescent, true: Pose, located: Located | None, seconds: flo
 
 
 def step_to(pose: Pose, true: Pose) -> Array:
-    """The step (6,) from a pose to the true pose: translation (metres, O_L), then rotation from the left (radians,
-    O_C)."""
+    """The step (6,) to the true pose: translation (metres, O_L), then rotation from the left (radians, O_C)."""
     turn = rotation_vectors(true.rotation_camera_from_site @ pose.rotation_camera_from_site.T)
     return np.concatenate([true.position_m - pose.position_m, turn])
 

@@ -1,5 +1,4 @@
-"""Draw the results of all methods: errors by altitude, filter errors with their bands, and craters matched in a
-frame."""
+"""Draw errors by altitude, filter errors with their bands, and craters matched in a frame."""
 
 from pathlib import Path
 
@@ -69,8 +68,7 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
 def draw_matches(
     path: Path, image: NDArray[np.uint8], descent: SeenDescent, frame: int, catalogue: Catalogue, located: Located
 ) -> None:
-    """Draw a frame with matched (cyan) and unmatched (red) detections, and the catalogue projected at the pose
-    (yellow)."""
+    """Draw a frame: matched (cyan) and unmatched (red) detections, and the projected catalogue (yellow)."""
     figure = Figure(figsize=(9, 9.4), layout="constrained")
     axis = figure.subplots()
     enlarged = cv2.resize(image, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)

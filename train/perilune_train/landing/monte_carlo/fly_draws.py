@@ -200,8 +200,7 @@ def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit processes that start in this block to one thread for linear algebra. Threads of several workers would slow
-    each other down."""
+    """Start processes with one thread for linear algebra, since threads of several workers slow each other down."""
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
