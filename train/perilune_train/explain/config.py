@@ -15,13 +15,13 @@ class ExplainConfig(Section):
     """The section `explain`."""
 
     seed: Seed = 0
-    """Random seed of nulls, intervals, controls and untrained networks."""
+    """Random seed for nulls, intervals, controls and untrained networks."""
     n_frames: _Several = 32
     """Number of test frames, evenly spaced through the split, for correlations."""
     n_pairs: _Several = 48
     """Number of test pairs for correlations, in runs of at most 8 consecutive pairs; at least one run."""
     n_validation: _Several = 16
-    """Number of validation frames and of pairs on which signs and gates are chosen."""
+    """Number of validation frames, and of validation pairs, on which signs and gates are chosen."""
     n_changed: _Several = 16
     """Number of these test frames for interventions: gates forced, pixels removed, weights randomised."""
     n_changed_pairs: _Several = 24
@@ -29,11 +29,11 @@ class ExplainConfig(Section):
     n_attributed: Annotated[int, Field(ge=1, le=100_000)] = 4
     """Number of these test frames for Grad-CAM, integrated gradients and occlusion."""
     n_drawn: Annotated[int, Field(ge=1, le=8)] = 3
-    """Number of frames and of pairs whose masks are drawn: of high, middle and low altitude."""
+    """Number of frames, and of pairs, whose masks are drawn, at high, middle and low altitude."""
     removed_share: Annotated[float, Field(gt=0, lt=0.5)] = 0.2
-    """Share of the pixels that is replaced."""
+    """Share of the pixels that removal replaces."""
     integration_steps: Annotated[int, Field(ge=1, le=10_000)] = 8
-    """Points of the integral of integrated gradients."""
+    """Number of integration points of integrated gradients."""
     occlusion_px: Annotated[int, Field(ge=8, le=4096)] = 32
     """Side and stride of the square that occlusion sets to grey, pixels."""
     ring_factors: tuple[_Factor, _Factor, _Factor, _Factor] = (1.1, 1.2, 1.3, 1.4)

@@ -1,4 +1,4 @@
-"""Evidence on the detector's gates: correlations, nulls, interventions, localisation, stability."""
+"""Compute evidence on the detector's gates: correlations, nulls, interventions, localisation, stability."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,13 +32,13 @@ from perilune_train.models.yolo import YOLOv3
 
 TASK = "detect"
 SHALLOW_STAGES = "123"
-"""Stages up to stride 8."""
+"""Stages with strides up to 8."""
 
 
 def explain_detector(
     settings: ExplainConfig, detector: Detector, frames: LabelledFrames, validation: LabelledFrames, where: Path
 ) -> tuple[Evidence, Masks]:
-    """All tables of the detector, and its masks of the test frames (N, height, width).
+    """All evidence tables of the detector, and its masks for the test frames (N, height, width).
 
     Signs, and the gate whose pixels are removed, are chosen on the validation frames. Raises UserError if the network
     has no attention.
@@ -103,7 +103,7 @@ def explain_detector(
 
 
 def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int) -> YOLOv3:
-    """A network of equal architecture with random weights; its batch statistics are measured on `images` (N, h, w)."""
+    """A network of equal architecture with random weights and batch statistics from `images` (N, height, width)."""
     trained, config = detector.network, detector.config
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -114,9 +114,9 @@ def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int)
 
 
 def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
-    """The gate up to stride 8 of the largest mean craterness, by its sign, on validation frames.
+    """The gate up to stride 8 whose mean craterness, multiplied by its sign, is largest on validation frames.
 
-    A gate without a defined correlation is never chosen, unless there is no other.
+    A gate without a defined correlation is chosen only if there is no other gate.
     """
     rows = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
     rows = rows[rows["map"].str[2].isin(list(SHALLOW_STAGES))]

@@ -1,4 +1,4 @@
-"""One explain run: evidence on the gates of a detector and of a stack navigator, as tables, pictures and claims."""
+"""Run `explain`: write evidence on the gates of a detector and a stack navigator as tables, pictures and claims."""
 
 import json
 import math
@@ -36,12 +36,12 @@ from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.runs import NamedRun, RunFolder
 
 _COUNTED = {"detect": ("pcc1_craterness", "pcc1_partial"), "navigate": ("pcc4", "pcc4_minus_pcc3")}
-"""Measures whose gates that beat every null are counted, by task."""
+"""Measures, by task, for which the gates that beat every null are counted."""
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkOnData:
-    """A network to explain, and the dataset whose test split it is explained on."""
+    """A network to explain, and the dataset whose test split is used."""
 
     checkpoint: Path
     """checkpoints/best.ckpt of a run, or the weights of an installed network."""
@@ -56,15 +56,15 @@ def explain_run(
     navigator: NetworkOnData | None,
     allow_overlap: bool = False,
 ) -> RunFolder:
-    """Compute the evidence on the attention gates of one or two networks on test data; writes runs/explain/<name>.
+    """Compute evidence on the attention gates of one or two networks on test data; writes runs/explain/<name>.
 
-    The config.yaml in the folder of the detector's checkpoint defines the selected craters. A network that is None is
-    not explained. A finished run of the same settings, datasets and checkpoints stays unchanged. Signs and the gates
-    whose pixels are removed are chosen on the validation splits.
+    The config.yaml in the folder of the detector's checkpoint defines which craters are selected. A network that is
+    None is not explained. A finished run with equal settings, datasets and checkpoints is left unchanged. Signs, and
+    the gates whose pixels are removed, are chosen on the validation splits.
 
-    Raises UserError if the existing run has other settings, datasets or checkpoints; if a dataset, a checkpoint or
-    config.yaml is missing or invalid; if a network has no attention; or if it was fitted to terrain of its test frames
-    (unless `allow_overlap`).
+    Raises UserError if an existing run has different settings, datasets or checkpoints; if a dataset, a checkpoint or
+    config.yaml is missing or invalid; if a network has no attention; or if a network was fitted to the terrain of its
+    test frames (unless `allow_overlap`).
     """
     with held(named.folder("explain")):
         return _run(settings, named, detector, navigator, allow_overlap)
@@ -171,12 +171,12 @@ def _write_tables(run: RunFolder, evidence: Mapping[str, Evidence]) -> None:
 
 
 def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metrics:
-    """Figures of one network by name; undefined ones are left out.
+    """Metrics of one network by name; undefined values are left out.
 
     <measure>/<map>, _low and _high: means of gates and attribution methods. <measure>_null/<gate>/<null>: means of the
-    nulls. <measure>_p/<gate>: corrected for the number of gates. <task>/forced/<scope>: harm of forcing a gate, a stage
-    or all. <task>/removal/<map>/<how>/<which>: harm of removed pixels. <task>/stability/<change>/<gate> and
-    <task>/randomised/<direction>/<step>/<gate>: similarity of masks.
+    nulls. <measure>_p/<gate>: p, corrected for the number of gates. <task>/forced/<scope>: harm of forcing a gate, a
+    stage or all gates to their means. <task>/removal/<map>/<how>/<which>: harm of removed pixels.
+    <task>/stability/<change>/<gate> and <task>/randomised/<direction>/<step>/<gate>: similarity of masks.
     """
     numbers: dict[str, float] = {}
     for row in evidence.summary[evidence.summary["kind"] != "null"].to_dict("records"):
@@ -203,7 +203,7 @@ def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metr
         metrics[f"{row['measure']}_beats_nulls/{row['map']}"] = bool(row["beats_all"])
     least = removal_row(evidence, higher_is_better=higher_is_better)
     metrics |= {f"{task}/removal_{name}": float(least[name]) for name in ("most", "least", "random", "shifted")}
-    # Without harm by a control there is no ratio.
+    # The ratio is undefined if no control does harm; record 0.
     metrics[f"{task}/removal_ratio"] = float(least["ratio"]) if np.isfinite(least["ratio"]) else 0.0
     metrics[f"{task}/strongest_gate"] = evidence.strongest
     for measure in _COUNTED[task]:

@@ -1,4 +1,4 @@
-"""Images that an explain run uses: labelled frames of the detector with the paper's masks G, pairs of the navigator."""
+"""Load the images of an explain run: labelled frames with the paper's masks G, and pairs of frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from perilune_train.explain.correlation.homography import true_homography
 from perilune_train.motion.data import trajectories as navigation
 
 RUN_PAIRS = 8
-"""Largest number of consecutive pairs of a run. Each run starts from the initial state of the LSTM, as in training."""
+"""Largest number of consecutive pairs in a run. As in training, each run starts from the initial state of the LSTM."""
 
 
 def ground_truth_mask(
@@ -24,9 +24,10 @@ def ground_truth_mask(
 ) -> Array:
     """The paper's mask G (height, width): 0 in craters, 0.2, 0.4, 0.6, 0.8 in rings around them, 1 elsewhere.
 
-    Takes centres (N, 2) and radii (N,) in pixels; the rings end at ring_factors times the radius (equation
+    Takes centres (N, 2) and radii (N,) in pixels. The rings end at ring_factors times the radius (equation
     "crater_width"). Where craters overlap, the smallest value is used; the paper does not define this case. The paper's
-    text calls the craters white and the background black, which contradicts its numbers; this code uses the numbers.
+    text calls craters white and the background black, which contradicts the paper's numbers. This code follows the
+    numbers.
     """
     mask = np.ones((height_px, width_px))
     levels = np.arange(len(ring_factors) + 1) / (len(ring_factors) + 1)
@@ -53,9 +54,9 @@ class LabelledFrames:
     truth: NDArray[np.float32]
     """The paper's masks G (N, height, width): 1 on background, 0 in craters."""
     labels: Sequence[FrameLabels]
-    """Labels of each frame."""
+    """Labels of each frame (N)."""
     radius_px: tuple[float, float]
-    """Range of radii that is evaluated, pixels."""
+    """Range of crater radii that is evaluated, pixels."""
     frame_ids: list[str]
     """Ids of the frames."""
     scene_ids: list[str]
@@ -76,7 +77,8 @@ class Pairs:
     images: NDArray[np.uint8]
     """The pairs (N, 2 height, width), the earlier frame above."""
     homographies: NDArray[np.float64]
-    """True homographies (N, 3, 3) of the ground plane, from pixels of the earlier frame to those of the later one."""
+    """True homographies (N, 3, 3) of the ground plane, from pixels of the earlier frame to pixels of the later
+    frame."""
     translation_m: NDArray[np.float64]
     """True translations (runs, pairs of a run, 3), metres, O_C of the earlier frame."""
     position_m: NDArray[np.float64]
@@ -92,10 +94,10 @@ class Pairs:
 def labelled_frames(
     dataset: Dataset, split: str, detector: DetectConfig, count: int, ring_factors: tuple[float, ...]
 ) -> tuple[LabelledFrames, DetectSplit]:
-    """At most `count` frames of a split, evenly spaced, and the whole split.
+    """Load at most `count` frames of a split, evenly spaced, and the whole split.
 
-    G contains only craters that the detector's own run selects, so no hardly visible ones. Raises UserError if the
-    dataset is of another kind, or if the split is empty or damaged.
+    G contains only the craters that the detector's run selects, which excludes barely visible craters. Raises UserError
+    if the dataset is not a detection dataset, or if the split is empty or damaged.
     """
     if dataset.info.kind != "detect":
         raise UserError(dataset.store, "kind", dataset.info.kind, "detect, a dataset with labels")
@@ -104,7 +106,7 @@ def labelled_frames(
 
 
 def frames_of(split: DetectSplit, chosen: Sequence[int], ring_factors: tuple[float, ...]) -> LabelledFrames:
-    """Some frames of a split by their indices."""
+    """The frames of a split at the chosen indices."""
     labels = [split.labels[i] for i in chosen]
     height, width = split.frames.images.shape[1:]
     truth = [
@@ -136,19 +138,19 @@ def first_descent(split: DetectSplit) -> list[int]:
 
 
 def consecutive_pairs(descents: Sequence[navigation.Trajectory], count: int) -> Pairs:
-    """At most `count` pairs of descents in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes."""
+    """At most `count` pairs, in runs of at most RUN_PAIRS, spread evenly over descents and altitudes."""
     length = min(RUN_PAIRS, *(descent.n_pairs for descent in descents))
     runs = [(descent, start) for descent in descents for start in range(0, descent.n_pairs - length + 1, length)]
     return _pairs_of([(*runs[i], length) for i in evenly_spaced(len(runs), max(1, count // length))])
 
 
 def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:
-    """At most `count` pairs of a descent, evenly spaced from its highest to its lowest one."""
+    """At most `count` pairs of a descent, evenly spaced from the highest to the lowest pair."""
     return _pairs_of([(descent, step, 1) for step in evenly_spaced(descent.n_pairs, count)])
 
 
 def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:
-    """Pairs of runs of equal length: trajectory, first step, number of pairs."""
+    """The pairs of runs of equal length; each run is given as (trajectory, first step, number of pairs)."""
     images, homographies, translations, positions, ids, scenes, heights = [], [], [], [], [], [], []
     for trajectory, start, length in runs:
         translations.append(trajectory.motion[0][start : start + length])

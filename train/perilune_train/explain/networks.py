@@ -1,4 +1,4 @@
-"""The networks that are explained and their images: loading, and the terrain that the networks were fitted to."""
+"""Load the networks to explain and their images, and check the terrain that the networks were fitted to."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,12 +30,12 @@ from perilune_train.training.runs import choose_device, load_weights
 
 
 def folder_of(checkpoint: Path) -> Path:
-    """The folder with config.yaml of a checkpoint: its run's, or that of an installed network's weights."""
+    """The folder with a checkpoint's config.yaml: the run folder, or the folder of an installed network's weights."""
     return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
 
 
 def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainConfig) -> Detector:
-    """Load a detector that runs at scale 1 only, since masks belong to one scale, on the device of `settings`."""
+    """Load a detector on the device of `settings`, at scale 1 only, because masks belong to one scale."""
     evaluation = config.evaluation.model_copy(update={"scales": (1.0,)})
     return open_detector(checkpoint, config.model_copy(update={"evaluation": evaluation, "device": settings.device}))
 
@@ -43,9 +43,9 @@ def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainC
 def terrain_marks(
     networks: Mapping[str, tuple[Path, Address]], allow_overlap: bool, split: str = "test"
 ) -> tuple[dict[str, str], Metrics]:
-    """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
+    """Terrain marks and entries of metrics.json by network, from each network's checkpoint and dataset.
 
-    Raises UserError if a network was fitted to terrain of its dataset's frames of `split`, unless `allow_overlap`.
+    Raises UserError if a network was fitted to the terrain of the frames in `split` (unless `allow_overlap`).
     """
     marks: dict[str, str] = {}
     metrics: Metrics = {}
@@ -87,7 +87,7 @@ class ExplainedNavigator:
     network: StackNavigator
     """The network."""
     architecture: dict[str, Any]
-    """Its form, as its checkpoint states it."""
+    """Architecture settings stored in the checkpoint."""
     pairs: Pairs
     """Test pairs."""
     known_pairs: Pairs

@@ -1,4 +1,4 @@
-"""Settings from which a network is rebuilt, as stored with its weights; checked before anything is built."""
+"""Architecture settings stored with a network's weights; they are checked before the network is rebuilt."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -44,7 +44,7 @@ class _Scales(Section):
 
 
 class NavigatorArchitecture(Section):
-    """Architecture of a navigator. Weights of older versions lack the settings with a default."""
+    """Architecture of a navigator. Settings with a default are missing from weights of older versions."""
 
     fusion: Literal["warp", "stack"]
     size_px: Annotated[int, Field(ge=32, le=4096, multiple_of=32)]
@@ -84,6 +84,6 @@ def check_architecture_of(model: type[Section], architecture: Mapping[str, Any],
 
 
 def without_memory(build: Callable[[], nn.Module]) -> nn.Module:
-    """Build a network whose tensors have shapes but no memory, to compare the shapes with those of a file."""
+    """Build a network whose tensors have shapes but no memory, so that their shapes can be compared with a file."""
     with torch.device("meta"):
         return build()

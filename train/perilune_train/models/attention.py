@@ -13,8 +13,9 @@ AMPLITUDE = 0.5
 class MeanAndMax(torch.autograd.Function):
     """Mean and maximum of a tensor along one dimension, which is kept with length 1.
 
-    Equal to x.mean and x.amax, but the backward pass writes the gradient once and in the layout of x, which saves an
-    eighth of a training step on a CPU. If several elements are the maximum, the first gets its gradient.
+    The results equal x.mean and x.amax, but the backward pass writes the gradient once and in the memory layout of x.
+    This saves an eighth of a training step on a CPU. If several elements share the maximum, the first one gets the
+    gradient.
     """
 
     @staticmethod
@@ -29,7 +30,7 @@ class MeanAndMax(torch.autograd.Function):
     def backward(ctx: Any, mean_grad: Tensor, max_grad: Tensor) -> tuple[Tensor, None]:
         (where,) = ctx.saved_tensors
         share = mean_grad / ctx.shape[ctx.dim]
-        # Use the memory order of x, since scatter_ copies a tensor of another order twice.
+        # Use the memory order of x, because scatter_ copies a tensor in another order twice.
         order = ctx.order
         grad = share.expand(ctx.shape).permute(order).contiguous()
         grad.scatter_(order.index(ctx.dim), where.permute(order), (share + max_grad).permute(order))
@@ -38,7 +39,7 @@ class MeanAndMax(torch.autograd.Function):
 
 def mean_and_max(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """Mean and maximum of a tensor along one dimension, which is kept with length 1."""
-    # A GPU finds the index of a maximum slowly, and a compiler can join the two plain reductions.
+    # On a GPU use plain reductions: finding the index of a maximum is slow, and a compiler can fuse the two reductions.
     return (x.mean(dim, keepdim=True), x.amax(dim, keepdim=True)) if x.is_cuda else MeanAndMax.apply(x, dim)
 
 
@@ -48,14 +49,14 @@ class CBAM(nn.Module):
     F'  = M_c(F) F,   M_c(F)  = s(W1 relu(W0 avg(F)) + W1 relu(W0 max(F))), avg and max over the image;
     F'' = M_s(F') F', M_s(F') = s(f_7x7 [avg(F'); max(F')]), avg and max over the channels.
 
-    Plain form: s is the sigmoid. Both gates are between 0 and 1 and start near 0.5, so that one module scales its input
-    by about 0.25. Identity form: s is twice the sigmoid, and W1 and f_7x7 start at zero. Both gates are between 0 and 2
-    and exactly 1 at initialisation, so that a pretrained backbone keeps its features. Long training drives spatial
-    gates of this form to a constant 2. Centred form: the channel gate of the identity form, and
-    M_s(F') = 1 + 0.5 tanh(n(f_7x7 [avg(F'); max(F')])), where n is a batch norm without weights: over pixels and frames
-    the gate is between 0.5 and 1.5 and centred, and it cannot become constant.
+    Plain form: s is the sigmoid. Both gates are between 0 and 1 and start near 0.5, so one module scales its input by
+    about 0.25. Identity form: s is twice the sigmoid, and W1 and f_7x7 start at zero. Both gates are between 0 and 2
+    and are exactly 1 at initialisation, so a pretrained backbone keeps its features. Long training drives spatial gates
+    of this form to a constant 2. Centred form: the channel gate is as in the identity form, and M_s(F') = 1 + 0.5
+    tanh(n(f_7x7 [avg(F'); max(F')])), where n is a batch norm without weights. The spatial gate is between 0.5 and 1.5,
+    is centred over pixels and frames, and cannot become constant.
 
-    Shape: (N, C, H, W) to the same. The layers have no bias, as in the equations.
+    Input and output have the shape (N, C, H, W). The layers have no bias, as in the equations.
     """
 
     def __init__(self, channels: int, reduction: int = 16, kernel: int = 7, form: Form = "plain"):
@@ -74,7 +75,7 @@ class CBAM(nn.Module):
     def channel_gate(self, x: Tensor) -> Tensor:
         """M_c (N, C, 1, 1) of features (N, C, H, W)."""
         pooled = torch.stack(mean_and_max(x.flatten(2), 2))[..., 0]
-        # W1 is linear: summing before it gives the equation's sum with one matrix product less.
+        # W1 is linear, so summing before it gives the sum in the equation with one matrix product fewer.
         logits = self.excite(torch.relu(self.squeeze(pooled)).sum(0))
         return (self.scale * torch.sigmoid(logits))[:, :, None, None]
 

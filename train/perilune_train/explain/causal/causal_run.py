@@ -1,4 +1,4 @@
-"""One causal run: the effect of single craters on masks, detections and poses, from frames rendered without them."""
+"""Run a causal analysis: the effect of removing single craters on masks, detections and poses."""
 
 import json
 from dataclasses import dataclass
@@ -54,14 +54,14 @@ _BATCH = 8
 
 @dataclass(frozen=True, slots=True)
 class PoseInputs:
-    """Descents with and without some craters, and the network that estimates their poses."""
+    """Descents with and without some craters, and the network that estimates poses from them."""
 
     dataset: Address
     """Navigation dataset with all craters."""
     counterfactual: Address
-    """The same descents without some craters."""
+    """Dataset of these descents rendered without some craters."""
     checkpoint: Path
-    """best.ckpt of a stack navigator."""
+    """Path to best.ckpt of a stack navigator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +71,13 @@ class CausalInputs:
     dataset: Address
     """Detection dataset with all craters."""
     counterfactual: Address
-    """The same frames without some craters, from `perilune-render counterfactual`."""
+    """Dataset of these frames without some craters, from `perilune-render counterfactual`."""
     split: str = "test"
     """Split of the frames."""
     turned: Address | None = None
-    """The same frames under another Sun, with all craters."""
+    """Dataset of these frames with all craters under another Sun; None to skip the comparison of Suns."""
     pose: PoseInputs | None = None
-    """Inputs for poses."""
+    """Inputs for the effect on poses; None to skip it."""
 
 
 def causal_folder(named: NamedRun) -> RunFolder:
@@ -93,13 +93,13 @@ def causal_run(
     inputs: CausalInputs,
     allow_overlap: bool = False,
 ) -> RunFolder:
-    """Measure what removed craters change in masks, detections and poses; writes runs/explain/<name>-causal.
+    """Measure how removing craters changes masks, detections and poses; writes runs/explain/<name>-causal.
 
-    `checkpoint` has the weights of the detector. `gate` is the gate of the headline, chosen on other frames. A finished
-    run with equal inputs stays unchanged.
+    `checkpoint` contains the detector's weights. `gate` is the gate that the headline is about; it must be chosen on
+    other frames. A finished run with equal inputs is left unchanged.
 
-    Raises UserError if the existing run has other settings or inputs; if an input is missing or invalid; or if the
-    network was fitted to terrain of the frames (unless `allow_overlap`).
+    Raises UserError if an existing run has different settings or inputs, if an input is missing or invalid, or if the
+    network was fitted to the terrain of the frames (unless `allow_overlap`).
     """
     run = causal_folder(named)
     dataset, split, turned, pose = inputs.dataset, inputs.split, inputs.turned, inputs.pose
@@ -130,7 +130,7 @@ def causal_run(
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
     pairs = crater_pairs(opened, open_single(inputs.counterfactual), removed, split, config.labels)
-    # Report faults of the other inputs before anything is written.
+    # Report errors in the other inputs before writing anything.
     if turned is not None:
         same_frames(opened, open_single(turned), split)
     if pose is not None:
@@ -172,7 +172,7 @@ def causal_run(
 def _versions(
     dataset: Dataset, pairs: CraterPairs, split: str, labels, settings: ExplainConfig, rng: np.random.Generator
 ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[float, float] | None]]:
-    """All versions of the frames by name, and the shifts of the placebo regions."""
+    """The frames in all versions, by name, and the shifts of the placebo regions."""
     whole = load_split(dataset, split, labels)
     index_of = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
     frames = frames_of(whole, [index_of[name] for name in pairs.frames["frame_id"]], settings.ring_factors)
@@ -190,7 +190,7 @@ def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
 
 
 def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, checkpoint: Path) -> pd.DataFrame:
-    """Similarity of the masks of the same poses under both Suns: map, change, frame_index, pearson.
+    """Similarity between the masks of each pose under the two Suns. Columns: map, change, frame_index, pearson.
 
     Raises UserError if the second dataset has frames that the first does not have.
     """

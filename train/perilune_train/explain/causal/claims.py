@@ -1,7 +1,7 @@
 """Claims of a causal run: figures, intervals, placebos and verdicts.
 
-Scenes are independent, views of one scene are not. So a verdict comes from the mean change of each scene, by sign flips
-over scenes. Intervals are by bootstrap over scenes and decide nothing.
+Scenes are independent; views of one scene are not. A verdict is therefore based on the mean change of each scene,
+tested by sign flips over scenes. Intervals come from a bootstrap over scenes and do not affect verdicts.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,10 @@ from perilune_train.records.spread import MIN_UNITS
 
 NO_PLACEBO = "undecided: no placebo"
 _BOTH_WAYS = MIN_UNITS + 1
-"""Number of scenes that a two-sided test needs: the smallest p of five scenes is 2 / 32, above `LEVEL`."""
+"""Number of scenes that a two-sided test needs. With five scenes the smallest p would be 2 / 32, which is above
+`LEVEL`."""
 _FEW = 0.1
-"""Largest share of craters that are found after removal, divided by the share found before."""
+"""Largest ratio between the shares of craters detected after removal and before removal."""
 _VIEW = ["crater", "scene_id", "frame_id"]
 _VERSIONS = ["factual", "rendered", "inpainted", "placebo"]
 
@@ -39,8 +40,9 @@ def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tes
     """Whether a gate reacts to single craters.
 
     `effects` is the table of `mask_effects`, `gates` the table of `by_gate`. The change may have either sign, so p is
-    two-sided. The change must also exceed the placebo's change in size, paired over the views that have both: change -
-    placebo and change + placebo, with the sign of the mean change, are tested, and the larger p counts.
+    two-sided. The change must also be larger in magnitude than the placebo's change, paired over the views that have
+    both. For this, change - placebo and change + placebo are tested, with the sign of the mean change, and the larger p
+    counts.
     """
     views = _views(effects[effects["map"] == gate], "change")
     changed = _scene_means(views["rendered"], views)
@@ -69,9 +71,10 @@ def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tes
 def detection_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
     """Whether the detector finds a crater because of its appearance.
 
-    `effects` is the table of `detection_effects` with `found`. Two one-sided tests must pass: found with the crater
-    minus found without it, and found with other ground inpainted minus found without the crater. The share found
-    without the crater must also be below a tenth of the share found with it.
+    `effects` is the table of `detection_effects` with the column `found`. Two one-sided tests must pass. The crater
+    must be detected more often when it is present than when it is removed. It must also be detected more often when
+    other ground is inpainted than when the crater is removed. In addition, the share detected after removal must be
+    below a tenth of the share detected before.
     """
     views = _views(effects, "found")
     lost = views["factual"] - views["rendered"]
@@ -92,9 +95,9 @@ def detection_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
 
 
 def pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
-    """Whether removed craters raise the navigator's error; one-sided.
+    """Whether removing craters increases the navigator's error; one-sided.
 
-    `effects` is the table of `pose_effects`. There is no placebo: both versions are rendered.
+    `effects` is the table of `pose_effects`. No placebo is needed because both versions are rendered.
     """
     before, after, moved_m = (float(np.sqrt((effects[name] ** 2).mean())) for name in ("before", "after", "moved_m"))
     harm = effects["after"] - effects["before"]
@@ -112,19 +115,19 @@ def pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
 
 
 def _views(effects: pd.DataFrame, value: str) -> pd.DataFrame:
-    """One row for each view of a crater: its ids, and a column for each version; NaN where a version has no value."""
+    """One row per view of a crater, with its ids and a column for each version; NaN where a version has no value."""
     table = effects.pivot(index=_VIEW, columns="version", values=value)
     return table.reindex(columns=_VERSIONS).reset_index()
 
 
 def _scene_means(values: pd.Series, rows: pd.DataFrame) -> NDArray[np.float64]:
-    """Mean of the finite values (N,) of each scene that has any (S,); `rows` (N) has the column scene_id."""
+    """Mean (S,) of the finite values (N,) of each scene that has finite values; `rows` (N) has the column scene_id."""
     known = values[np.isfinite(values)]
     return known.groupby(rows.loc[known.index, "scene_id"]).mean().to_numpy(np.float64)
 
 
 def _p(by_scene: NDArray[np.float64], *, both_ways: bool = False) -> float:
-    """p that a mean is above 0, by sign flips over scenes; doubled if the sign was chosen on the same scenes."""
+    """p of a mean above 0, by sign flips over scenes; doubled if the sign was chosen on these scenes (`both_ways`)."""
     if len(by_scene) < (_BOTH_WAYS if both_ways else MIN_UNITS):
         return float("nan")
     p = unit_sign_flip_p(by_scene)
@@ -138,7 +141,7 @@ def _ends(values: pd.Series, rows: pd.DataFrame, rng: np.random.Generator) -> tu
 
 
 def _verdict(n_scenes: int, n_placebo: int | None, needed: int, holds: bool) -> str:
-    """`n_placebo` is the number of scenes with a placebo, None if the claim has none."""
+    """The verdict as text. `n_placebo` is the number of scenes with a placebo; None if the claim has no placebo."""
     if n_scenes < needed:
         return f"undecided: fewer than {needed} scenes"
     if n_placebo == 0:
@@ -151,7 +154,7 @@ def _verdict(n_scenes: int, n_placebo: int | None, needed: int, holds: bool) -> 
 def _interval(
     ends: tuple[float, float], n_scenes: int, p: float, p_placebo: float = float("nan"), unit: str = "", digits: int = 2
 ) -> str:
-    """The column "interval": ends of the bootstrap, number of scenes, and p of the sign flips."""
+    """Text of the column "interval": ends of the bootstrap interval, number of scenes, and p of the sign flips."""
     low, high = (f"{end:.{digits}f}" for end in ends)
     parts = [f"{low} to {high}{unit} ({n_scenes} scenes)" if np.isfinite(ends[0]) else "none: fewer than 5 scenes"]
     parts += [f"p {p:.4f}"] if np.isfinite(p) else []

@@ -1,14 +1,14 @@
 """How masks, detections and poses change when single craters are removed.
 
-Three changes of the same frame are compared, in an ellipse around each crater:
+Three changes of a frame are compared in an ellipse around each crater:
 
-- rendered: the crater is removed from the ground and the frame is rendered again. Pixels
-  outside its reach stay equal, except for one or two grey values where the automatic exposure changes.
-- inpainted: the same ellipse is filled from its surroundings, which removes the crater's pixels.
-- placebo: an ellipse of the same shape on ground without labelled craters is filled in the same way. The effect of
+- rendered: the crater is removed from the ground and the frame is rendered again. Pixels outside the crater's reach
+  stay equal, except for one or two grey values where the automatic exposure changes.
+- inpainted: the ellipse is filled from its surroundings, which removes the crater's pixels.
+- placebo: an ellipse of equal shape on ground without labelled craters is filled in this way. It shows the effect of
   filling alone.
 
-A gate reacts to craters if the rendered change moves its mask and the placebo does not.
+A gate reacts to craters if the rendered change alters its mask and the placebo does not.
 """
 
 from collections import Counter
@@ -33,8 +33,8 @@ from perilune_train.motion.network import predict, target_of
 from perilune_train.motion.pose import predict_pose
 
 REACH = 1.4
-"""Semi-axes of the region around a crater, divided by the crater's semi-axes: the outermost ring of the paper's mask
-G."""
+"""Ratio of the semi-axes of the region around a crater to the crater's semi-axes. The region ends at the outermost ring
+of the paper's mask G."""
 _INPAINT_RADIUS_PX = 3
 _TRIES = 200
 _MIN_IOU = 0.5
@@ -51,9 +51,11 @@ def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, flo
 
 
 def empty_shift(crater: pd.Series, occupied: NDArray[np.bool_], rng: np.random.Generator) -> tuple[float, float] | None:
-    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if there is none.
+    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if none was
+    found.
 
-    `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free.
+    `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free or the
+    number of tries is used up.
     """
     height, width = occupied.shape
     reach = REACH * crater["ellipse_a_px"] + 1
@@ -76,11 +78,11 @@ def inpainted(image: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> NDArray[np
 def filled_frames(
     pairs: CraterPairs, occupied: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[tuple[float, float] | None]]:
-    """Frames with the removed craters inpainted, frames with placebo regions inpainted, and the shifts of these
+    """Inpaint the removed craters, and placebo regions; returns both sets of frames and the shifts of the placebo
     regions.
 
-    Both are (N, height, width); there is one shift for each row of `pairs.craters`. `occupied` (N, height, width) are
-    pixels in or near labelled craters.
+    Both sets are (N, height, width). There is one shift for each row of `pairs.craters`. `occupied` (N, height, width)
+    are pixels in or near labelled craters.
     """
     shape = pairs.factual.shape[1:]
     without, placebo = (np.zeros(pairs.factual.shape, bool) for _ in range(2))
@@ -105,11 +107,12 @@ def filled_frames(
 def mask_effects(
     pairs: CraterPairs, masks: dict[str, Masks], shifts: Sequence[tuple[float, float] | None]
 ) -> pd.DataFrame:
-    """Change of every gate in the region of every crater, in standard deviations of the gate.
+    """Change of every gate's mask in the region of every crater, in standard deviations of the mask.
 
-    `masks` has the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean over
-    the region of the factual mask minus the mean of the other version's mask: above 0 the gate is stronger with the
-    crater. Columns: those of `pairs.craters`, map, version, change; NaN for a placebo without free ground.
+    `masks` holds the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean of
+    the factual mask over the region minus the mean of the other version's mask. A change above 0 means that the gate is
+    stronger with the crater. Columns: all of `pairs.craters`, then map, version, change. The change is NaN for a
+    placebo without free ground.
     """
     shape, rows = pairs.factual.shape[1:], []
     for (_, crater), shift in zip(pairs.craters.iterrows(), shifts, strict=True):
@@ -132,9 +135,10 @@ def mask_effects(
 def detection_effects(
     pairs: CraterPairs, detect: Callable[[NDArray[np.uint8]], list[Detections]], versions: dict[str, NDArray[np.uint8]]
 ) -> pd.DataFrame:
-    """Highest score of a detection that matches each crater's box (IoU 0.5), in each version of its frame; 0 if none.
+    """Highest score of a detection that matches each crater's box (IoU 0.5) in each version of the frame; 0 if no
+    match.
 
-    `versions` are frames (N, height, width) by name. Columns: those of `pairs.craters`, version, score.
+    `versions` are frames (N, height, width) by name. Columns: all of `pairs.craters`, then version, score.
     """
     boxes = pairs.craters[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     image, rows = pairs.craters["image"].to_numpy(), []
@@ -151,7 +155,7 @@ def detection_effects(
 def with_found(effects: pd.DataFrame, threshold: float, shifts: Sequence[tuple[float, float] | None]) -> pd.DataFrame:
     """The table of `detection_effects` with the column found: 1 if the score reaches the threshold, else 0.
 
-    NaN for the placebo of a crater without free ground (a shift of None): nothing was inpainted for it.
+    For a crater without free ground (a shift of None) nothing was inpainted, so found is NaN for the placebo.
     """
     missing = np.array([shift is None for shift in shifts], bool)[effects["crater"].to_numpy(int)]
     is_found = (effects["score"] >= threshold).astype(float)
@@ -165,11 +169,11 @@ def _facts(pairs: CraterPairs) -> pd.DataFrame:
 def pose_effects(
     navigator: StackNavigator, architecture: dict[str, Any], factual: Dataset, counterfactual: Dataset, split: str
 ) -> pd.DataFrame:
-    """Errors of each pair of consecutive frames with all craters (before) and without the removed ones (after).
+    """Position errors of each pair of consecutive frames, with all craters (before) and after removal (after).
 
     Columns: frame_id (scene/trajectory/step), scene_id, before, after (position errors, metres), moved_m (length of the
-    difference between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory: its
-    pairs would not be consecutive; render it with as many frames per trajectory as the dataset has.
+    difference between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory,
+    because its pairs would not be consecutive. Render it with as many frames per trajectory as the dataset has.
     """
     check_descents(factual, counterfactual, split)
     originals = {trajectory.ids: trajectory for trajectory in load_split(factual, split)}
@@ -188,7 +192,8 @@ def pose_effects(
 
 
 def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> None:
-    """Raise UserError unless the trajectories of a split of the second dataset have all frames of the first one."""
+    """Raise UserError unless the split of the second dataset has every frame of its trajectories in the first
+    dataset."""
     whole, changed = (
         Counter(frame_table(dataset, split)[_TRAJECTORY].agg("/".join, axis=1)) for dataset in (factual, counterfactual)
     )

@@ -22,28 +22,27 @@ _MOST_BYTES = 64 * 2**20
 
 @dataclass(frozen=True)
 class CraterPairs:
-    """N frames rendered twice: on the ground, and on the same ground without some craters."""
+    """N frames rendered twice, with all craters and without some of them."""
 
     factual: NDArray[np.uint8]
     """Frames with all craters (N, height, width)."""
     counterfactual: NDArray[np.uint8]
-    """The same frames without the removed craters (N, height, width)."""
+    """These frames without the removed craters (N, height, width)."""
     frames: pd.DataFrame
     """frame_id and scene_id of the frames (N rows)."""
     craters: pd.DataFrame
-    """A row for each removed crater in each frame that shows it whole: image (index of the frame), frame_id, scene_id,
+    """One row per removed crater and frame that shows the whole crater: image (index of the frame), frame_id, scene_id,
     crater_id, ellipse and box in pixels, radius_px, depth_ratio, sun_elevation_deg."""
 
 
 def crater_pairs(
     factual: Dataset, counterfactual: Dataset, removed: pd.DataFrame, split: str, selection: Selection
 ) -> CraterPairs:
-    """Load the frames of a counterfactual dataset and the corresponding frames of the dataset that it was rendered
-    from.
+    """Load the frames of a counterfactual dataset and the matching frames of the dataset it was rendered from.
 
-    `removed` is the table of `read_removed`. Only craters that `selection` accepts in the factual frame, whole in the
-    image, are listed. Raises UserError if there are none, or if the second dataset has frames that the first does not
-    have.
+    `removed` is the table of `read_removed`. The result lists only craters that `selection` accepts in the factual
+    frame and that are wholly in the image. Raises UserError if there are no such craters, or if the second dataset has
+    frames that the first dataset lacks.
     """
     known, rows = same_frames(factual, counterfactual, split)
     craters = _shown(factual, removed, rows, split, selection)
@@ -55,7 +54,7 @@ def crater_pairs(
 
 
 def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The frames of a split that both datasets have: both `frame_table`s, in one order.
+    """The frames of a split that both datasets contain, as two `frame_table`s in equal order.
 
     Raises UserError if the second dataset has frames that the first does not have.
     """

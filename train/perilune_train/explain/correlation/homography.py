@@ -1,4 +1,4 @@
-"""The ground plane's homography of the true pose, and images moved by it."""
+"""Homography of the ground plane from true poses, and images warped by it."""
 
 import cv2
 import numpy as np
@@ -21,13 +21,13 @@ def true_homography(
     position_2_m: Array,
     rotation_2_camera_from_site: Array,
 ) -> Array:
-    """Homography (3, 3) from image coordinates, pixels, of frame 1 to image coordinates of frame 2, from the true
+    """Homography (3, 3) of the ground from pixel coordinates in frame 1 to pixel coordinates in frame 2, from true
     poses.
 
     Takes positions (3,) in metres, O_L, and rotations (3, 3). The plane is the mean ground, z = 0 of O_L. The paper
-    speaks of "the affine transformation matrix defined by groundtruth pose" without a definition. Deviation: a
-    homography, which is exact on the plane where an affine map is not. Raises ValueError if frame 1 is not above the
-    plane.
+    uses "the affine transformation matrix defined by groundtruth pose" without defining it. Deviation from the paper:
+    this is a homography, which is exact on the plane; an affine map is not. Raises ValueError if frame 1 is not above
+    the plane.
     """
     if position_1_m[2] <= 0:
         raise ValueError(f"altitude is {position_1_m[2]} m, not above 0")
@@ -39,7 +39,7 @@ def true_homography(
 
 
 def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool_]:
-    """Which pixels (height, width) of frame 1 see ground that is inside frame 2, which has the same shape."""
+    """Mask (height, width) of the pixels of frame 1 whose ground is also in frame 2, which has an equal shape."""
     height, width = shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     moved = apply_homography(homography, np.stack([u, v], axis=-1))
@@ -47,7 +47,8 @@ def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool
 
 
 def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array) -> Array:
-    """An image of frame 2 (height, width), resampled bilinearly at the pixels of frame 1; its edge continues outside.
+    """Resample an image of frame 2 (height, width) bilinearly at the pixels of frame 1; edge pixels are repeated
+    outside.
 
     `homography` (3, 3) maps image coordinates of frame 1 to frame 2.
     """

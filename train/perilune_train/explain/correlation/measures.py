@@ -1,4 +1,4 @@
-"""PCC1 to PCC4 of the paper for each image or pair, as rows of one long table.
+"""Compute PCC1 to PCC4 of the paper for each image or pair, as rows of one long table.
 
 Columns: task, kind, map, measure, frame_id, scene_id, value. Means, intervals and tests are computed from these rows.
 """
@@ -34,14 +34,14 @@ PCC1_SIGN = (
 
 @dataclass(frozen=True, slots=True)
 class FrameTargets:
-    """Maps that the maps of N frames are correlated with, and the names of the frames."""
+    """Targets of N frames with which maps are correlated, and the names of the frames."""
 
     truth: Maps
     """The paper's masks G (N, height, width): 1 on background, 0 in craters."""
     brightness: Maps
     """Brightness of the frames (N, height, width)."""
     gradient: Maps
-    """Length of the gradient of the brightness (N, height, width)."""
+    """Magnitude of the brightness gradient (N, height, width)."""
     frame_ids: Sequence[str]
     """Ids of the frames (N)."""
     scene_ids: Sequence[str]
@@ -53,7 +53,8 @@ class PairTargets:
     """True motions of N pairs of frames, and the names of the pairs."""
 
     homographies: Sequence[Array]
-    """Homographies (3, 3) of the N pairs, from image coordinates of the upper, earlier frame to those of the lower."""
+    """Homographies (3, 3) of the N pairs, from image coordinates of the earlier (upper) frame to the later (lower)
+    frame."""
     pair_ids: Sequence[str]
     """Ids of the pairs (N)."""
     scene_ids: Sequence[str]
@@ -65,11 +66,11 @@ def detector_values(
 ) -> pd.DataFrame:
     """The long table of PCC1 and PCC2 for every map (N, height, width).
 
-    pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background: above 0 the map is lower on
-    craters. pcc1_craterness is the correlation with 1 - G: above 0 the map is higher on craters. pcc1_partial is the
-    partial correlation with 1 - G given brightness and gradient. pcc2 of frame n is the mean
-    correlation of the map with the same map of all other frames m, or of those of other scenes if `other_scenes`; the
-    paper uses one unspecified m. Undefined values are NaN.
+    pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background. A value above 0 means that
+    the map is lower on craters. pcc1_craterness is the correlation with 1 - G. A value above 0 means that the map is
+    higher on craters. pcc1_partial is the partial correlation with 1 - G given brightness and gradient. pcc2 of frame n
+    is the mean correlation of its map with this gate's maps of all other frames m; with `other_scenes`, only of frames
+    in other scenes. The paper uses one unspecified m. Undefined values are NaN.
     """
     scenes = np.asarray(targets.scene_ids)
     paired = scenes[:, None] != scenes[None] if other_scenes else ~np.eye(len(scenes), dtype=bool)
@@ -93,13 +94,14 @@ def detector_values(
 
 
 def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pixels: bool = True) -> pd.DataFrame:
-    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the pair's.
+    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the pair's id.
 
-    pcc3 and pcc4 are over the same pixels, the part of the upper frame that is in the lower one. The paper uses all
-    pixels, at least for PCC3, and does not define the moved map outside the overlap: in pcc3_all_pixels and
-    pcc4_all_pixels it is 0, the default of OpenCV. If one half is constant, both values of that kind (overlap or all
-    pixels) are NaN, because their means must be over the same pairs. pcc4_minus_pcc3 is what the true motion adds, over
-    the overlap. Without `all_pixels` only the measures over the overlap are computed, in half the time.
+    pcc3 and pcc4 use the overlap: the pixels of the upper frame whose ground is also in the lower frame. The paper uses
+    all pixels, at least for PCC3, and does not define the moved map outside the overlap. In pcc3_all_pixels and
+    pcc4_all_pixels the moved map is 0 there, which is OpenCV's default. If one half is constant, both values of that
+    kind (overlap or all pixels) are NaN, because their means must be over equal sets of pairs. pcc4_minus_pcc3 is the
+    increase due to the true motion, over the overlap. Without `all_pixels` only the measures over the overlap are
+    computed, which takes half the time.
     """
     height, width = (size // part for size, part in zip(next(iter(masks.values())).shape[1:], (2, 1), strict=True))
     seen = np.stack([seen_in_second((height, width), homography) for homography in targets.homographies])
@@ -128,14 +130,14 @@ def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pix
 
 
 def _mean_defined(values: Array, wanted: NDArray[np.bool_]) -> Array:
-    """Mean (N,) over each row of the wanted values (N, M) that are not NaN; NaN if there are none."""
+    """Mean (N,) of the wanted values that are not NaN in each row of (N, M); NaN for a row without such values."""
     used = wanted & ~np.isnan(values)
     counts = used.sum(1)
     return np.where(counts > 0, np.where(used, values, 0.0).sum(1) / np.maximum(counts, 1), np.nan)
 
 
 def _table(names: dict[str, str], values: Array, ids: Sequence[str], scenes: Sequence[str]) -> pd.DataFrame:
-    """Rows of the long table for one measure of one map; `names` has the columns that are the same in all rows."""
+    """Rows of the long table for one measure of one map; `names` holds the columns that are constant over all rows."""
     if not len(values) == len(ids) == len(scenes):
         raise ValueError(f"{len(values)} maps, {len(ids)} frame names and {len(scenes)} scene names")
     varying = {"frame_id": list(ids), "scene_id": list(scenes), "value": np.asarray(values, np.float64)}

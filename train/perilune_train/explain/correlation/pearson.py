@@ -10,19 +10,19 @@ from perilune_shared.geometry.frames import Array
 Maps = NDArray[np.floating]
 """Maps (N, height, width) of N images."""
 _ROUNDING = 1e-6
-"""Variation below this share of the values is a rounding error of float32."""
+"""Variation below this share of the values counts as a rounding error of float32."""
 
 
 def pearson(a: ArrayLike, b: ArrayLike, seen: NDArray[np.bool_] | None = None) -> float:
-    """Pearson correlation of two maps over the pixels `seen`; NaN if one is constant or no pixel is seen."""
+    """Pearson correlation of two maps over the pixels `seen`; NaN if a map is constant or `seen` is empty."""
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
     return float(pearson_rows(x[None], y[None], None if seen is None else seen[None])[0])
 
 
 def pearson_rows(maps: Maps, targets: Maps, seen: NDArray[np.bool_] | None = None) -> Array:
-    """Correlation (N,) of each of N maps (N, ...) with its own target (N, ...), over the pixels `seen` (N, ...).
+    """Correlation (N,) of each of N maps (N, ...) with its target (N, ...), over the pixels `seen` (N, ...).
 
-    NaN where one of the two is constant or no pixel is seen. Raises ValueError if the shapes differ.
+    NaN where the map or the target is constant, or no pixel is `seen`. Raises ValueError if the shapes differ.
     """
     if maps.shape != targets.shape:
         raise ValueError(f"shapes {maps.shape} and {targets.shape} differ")
@@ -32,17 +32,18 @@ def pearson_rows(maps: Maps, targets: Maps, seen: NDArray[np.bool_] | None = Non
 def partial_rows(maps: Maps, targets: Maps, givens: Sequence[Maps]) -> Array:
     """Partial correlation (N,) of each map (N, ...) with its target (N, ...), given the other maps (N, ...).
 
-    Pearson correlation of the residuals after regression of both on the givens and a constant, by least squares. NaN
-    where a residual is constant, which means that the givens determine the map or the target.
+    The map and the target are each regressed on the givens and a constant by least squares; the result is the Pearson
+    correlation of the residuals. NaN where a residual is constant: there the givens determine the map or the target.
     """
     basis = given_basis(givens)
     return partial_of_rows(standardised_rows(maps), residual_rows(standardised_rows(targets), basis), basis)
 
 
 def partial_of_rows(rows: Array, residuals: Array, basis: Sequence[Array]) -> Array:
-    """`partial_rows` of standardised maps (N, P) and the `residual_rows` (N, P) of their targets.
+    """The partial correlations of `partial_rows`, from standardised maps (N, P) and `residual_rows` (N, P) of the
+    targets.
 
-    The residuals are orthogonal to the basis, so that only the length of the map's own residual is needed.
+    The target's residuals are orthogonal to the basis, so only the length of the map's residual is needed.
     """
     left = np.sqrt(
         np.maximum(1 - sum((dot_rows(rows, basis_rows) ** 2 for basis_rows in basis), np.zeros(len(rows))), 0)
@@ -51,14 +52,14 @@ def partial_of_rows(rows: Array, residuals: Array, basis: Sequence[Array]) -> Ar
 
 
 def dot_rows(a: Array, b: Array) -> Array:
-    """Product (N,) of each row of two arrays (N, P)."""
+    """Dot product (N,) of each pair of rows of two arrays (N, P)."""
     return np.einsum("np,np->n", a, b)
 
 
 def standardised_rows(maps: Maps, seen: NDArray[np.bool_] | None = None) -> Array:
-    """Maps (N, ...) as rows (N, P) of mean 0 and length 1, so that a product is a correlation; 0 where not `seen`.
+    """Maps (N, ...) as rows (N, P) of mean 0 and length 1, so that a dot product is a correlation; 0 where not `seen`.
 
-    NaN if constant or not seen at all.
+    A row is NaN if the map is constant or no pixel is `seen`.
     """
     flat = maps.reshape(len(maps), -1)
     rows = np.zeros(flat.shape)
@@ -77,7 +78,7 @@ def standardised_rows(maps: Maps, seen: NDArray[np.bool_] | None = None) -> Arra
 
 
 def given_basis(givens: Sequence[Maps]) -> list[Array]:
-    """Orthonormal rows (N, P) that span the centred givens (N, ...); zero where a given depends on those before it."""
+    """Orthonormal rows (N, P) that span the centred givens (N, ...); zero where a given depends on earlier givens."""
     basis: list[Array] = []
     for given in givens:
         rows = _without(np.nan_to_num(standardised_rows(given)), basis)
@@ -87,20 +88,22 @@ def given_basis(givens: Sequence[Maps]) -> list[Array]:
 
 
 def residual_rows(rows: Array, basis: Sequence[Array]) -> Array:
-    """Residuals (N, P), of length 1, of standardised maps (N, P) after regression on a basis; NaN if constant."""
+    """Residuals (N, P), scaled to length 1, of standardised maps (N, P) after regression on a basis; NaN if
+    constant."""
     residuals = _without(rows, basis)
     lengths = np.linalg.norm(residuals, axis=1)
     return residuals / np.where(lengths > _ROUNDING, lengths, np.nan)[:, None]
 
 
 def is_constant(values: ArrayLike) -> bool:
-    """Whether the standard deviation of the values is at most 1e-6 of the largest absolute value, a rounding error."""
+    """Whether the standard deviation is at most 1e-6 of the largest absolute value, which counts as a rounding
+    error."""
     array = np.asarray(values, np.float64)
     return bool(np.std(array) <= _ROUNDING * max(float(np.abs(array).max()), 1e-30))
 
 
 def _without(rows: Array, basis: Sequence[Array]) -> Array:
-    """Rows (N, P) without their components along the basis; subtracted twice, because of rounding."""
+    """Rows (N, P) without their components along the basis, which are subtracted twice to limit rounding errors."""
     for _ in range(2):
         for basis_rows in basis:
             rows = rows - dot_rows(rows, basis_rows)[:, None] * basis_rows

@@ -1,7 +1,7 @@
-"""Attention gates forced to their mean: what the output loses without a gate's pattern.
+"""Force attention gates to their means, to measure how much the output loses without their patterns.
 
-If a gate's pattern matters, replacing its spatial mask by its mean over pixels and frames changes the output. The
-channel gates stay. A mask that follows craters may still have no effect; a correlation cannot tell.
+If a gate's pattern matters, replacing its spatial mask by its mean over pixels and frames changes the output. Channel
+gates are unchanged. This test is needed because a mask that correlates with craters may have no effect on the output.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ def gate_means(masks: Masks) -> dict[str, float]:
 
 
 def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """What is forced together: each gate alone, the gates of each stage ("stage 3"), and all gates."""
+    """Sets of gates that are forced together: each gate alone, the gates of each stage ("stage 3"), and all gates."""
     stages = sorted({block[2] for block in blocks})
     alone = {block: (block,) for block in blocks}
     together = {f"stage {stage}": tuple(block for block in blocks if block[2] == stage) for stage in stages}

@@ -1,4 +1,4 @@
-"""Localisation of maps on craters: pointing game, relevance mass and ROC-AUC, each with its chance level."""
+"""Measure how well maps locate craters: pointing game, relevance mass and ROC-AUC, with chance levels."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ from perilune_train.explain.correlation.pearson import is_constant
 MEASURES = ("auc", "relevance_mass", "pointing")
 """Measures in which gates are tested against nulls."""
 TOLERANCE_PX = 3
-"""Distance, pixels, from a crater's pixel within which the top pixel of a map is a hit."""
+"""Largest distance, pixels, from a crater pixel at which the top pixel of a map counts as a hit."""
 
 
 def localisation(
@@ -24,12 +24,12 @@ def localisation(
     task: str,
     kind: str,
 ) -> pd.DataFrame:
-    """Long table of the localisation of each map (N, height, width) on the craters' pixels (N, height, width).
+    """Long table of how well each map (N, height, width) locates the crater pixels (N, height, width).
 
     `sign` is 1, or -1 for a map that is weaker on craters; determine it on validation frames. `frames` has columns
     frame_id and scene_id in the order of the maps. Columns of the table: task, kind, map, measure, frame_id, scene_id,
     value. Measures: pointing, relevance_mass, auc, pointing_chance, relevance_mass_chance; the chance level of auc is
-    0.5. Values are NaN where the map is constant, or no pixel or every pixel is a crater's.
+    0.5. Values are NaN where the map is constant, or where no pixel or every pixel is in a crater.
     """
     rows = []
     for name, images_map in maps.items():
@@ -44,13 +44,14 @@ def localisation(
 
 
 def localised(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> dict[str, float]:
-    """Measures of one map (height, width), larger on craters, against the craters' pixels (height, width).
+    """Localisation measures of one map (height, width) that is larger on craters, given the crater pixels (height,
+    width).
 
     pointing: 1 if the map's largest pixel is within TOLERANCE_PX of a crater, else 0 (Zhang et al. 2018, doi
-    10.1007/s11263-017-1059-x); with ties, the share of the tied pixels. Its chance level is the area share of the
-    craters with the tolerance around them. relevance_mass: share of the map, shifted to minimum 0, within craters
-    (Arras et al. 2022, doi 10.1016/j.inffus.2021.11.008); its chance level is the craters' area share. auc: probability
-    that a crater's pixel is larger than another pixel, ties count half.
+    10.1007/s11263-017-1059-x). With ties, it is the share of tied pixels that are hits. Its chance level is the share
+    of the image area within the tolerance of craters. relevance_mass: share of the map, shifted to minimum 0, within
+    craters (Arras et al. 2022, doi 10.1016/j.inffus.2021.11.008). Its chance level is the share of the image area in
+    craters. auc: probability that a crater pixel has a larger value than a pixel outside craters; ties count half.
     """
     near = within(craters, TOLERANCE_PX)
     if is_constant(relevance) or craters.all() or not craters.any():
@@ -67,7 +68,7 @@ def localised(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> di
 
 
 def within(craters: NDArray[np.bool_], distance_px: float) -> NDArray[np.bool_]:
-    """Pixels (height, width) whose centre is within a distance of the centre of a crater's pixel."""
+    """Pixels (height, width) whose centre is within a distance of the centre of a crater pixel."""
     if not craters.any():
         return craters
     distance = cv2.distanceTransform((~craters).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -75,7 +76,7 @@ def within(craters: NDArray[np.bool_], distance_px: float) -> NDArray[np.bool_]:
 
 
 def area_under_curve(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> float:
-    """ROC-AUC of the pixels by the Mann-Whitney statistic; ties have their mean rank."""
+    """ROC-AUC of the pixels by the Mann-Whitney statistic; ties get their mean rank."""
     inside = int(craters.sum())
     ranks = rankdata(relevance.ravel())[craters.ravel()]
     return float((ranks.sum() - inside * (inside + 1) / 2) / (inside * (craters.size - inside)))

@@ -1,4 +1,4 @@
-"""Performance of a network on single images, which interventions change."""
+"""Performance of a network on single images, compared before and after an intervention."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,8 @@ class DetectionPerformance:
     """Range of radii that is evaluated, pixels."""
 
     def __call__(self, images: NDArray[np.uint8]) -> Values:
-        """AP at IoU 0.5 (the paper's sum) of each frame, from images (N, height, width): (N,), NaN without labels."""
+        """AP at IoU 0.5 (the paper's sum) of each frame (N,), from images (N, height, width); NaN for frames without
+        labels."""
         detections = []
         for start in range(0, len(images), _BATCH):
             boxes, scores = self.detector.predict(images[start : start + _BATCH])
@@ -49,12 +50,12 @@ class DetectionPerformance:
 
 @dataclass(frozen=True)
 class MotionPerformance:
-    """Position error of a stack navigator on runs of consecutive pairs, each run from the initial state of the LSTM."""
+    """Position error of a stack navigator on runs of pairs, each from the initial state of the LSTM."""
 
     navigator: StackNavigator
     """The network, in evaluation mode."""
     truth_m: Values
-    """True translations, O_C of the earlier frame, or positions, O_L, (runs, pairs, 3), metres."""
+    """True translations (O_C of the earlier frame) or positions (O_L), metres, (runs, pairs, 3)."""
     mean_m: Values
     """Mean of the truth over the training set (3,), metres."""
     spread_m: Values
@@ -63,7 +64,7 @@ class MotionPerformance:
     """Width of the network's frames."""
 
     def __call__(self, images: NDArray[np.uint8]) -> Values:
-        """Position error (n,), metres, of n = runs * pairs stacked pairs (n, 2 height, width)."""
+        """Position errors (n,), metres, of the n = runs * pairs stacked pairs (n, 2 height, width)."""
         runs, pairs = self.truth_m.shape[:2]
         first, second = stacked_input(images, self.size_px)
         device = next(self.navigator.parameters()).device

@@ -1,4 +1,4 @@
-"""The permutation null: how large a correlation is if masks and targets of different scenes are exchanged."""
+"""The permutation null: the correlation that remains when the targets of different scenes are exchanged."""
 
 from collections.abc import Sequence
 
@@ -17,21 +17,21 @@ from perilune_train.records.spread import MIN_UNITS
 NULL = "permutation"
 """Name of the null in the table of differences."""
 DRAWS = 1000
-"""Permutations of a test."""
+"""Number of permutations in a test."""
 _PAIR_STEP = 4
-"""Pixels from one sample of a stacked mask to the next one, in both directions."""
+"""Sampling step of stacked masks, pixels, in both directions."""
 
 
 def permuted(
     correlations: ArrayLike, scene_ids: Sequence[str], rng: np.random.Generator, n_draws: int = DRAWS
 ) -> tuple[float, float]:
-    """Mean over permutations, and one-sided p, of the mean of the diagonal of correlations (N, N).
+    """Permutation test of the mean diagonal of correlations (N, N): mean over permutations, and one-sided p.
 
-    Element (n, m) is the correlation of mask n with target m. Exchanges the targets of whole scenes, which are the
-    independent units. A frame gets the frame at the same relative position in the other scene's frames, so that
-    altitudes stay alike. p is (1 + draws that reach the observed mean) / (1 + n_draws) (Phipson & Smyth 2010, doi
+    Element (n, m) is the correlation of mask n with target m. The targets of whole scenes are exchanged, because scenes
+    are the independent units. Each frame gets the target at its relative position in the other scene, so that altitudes
+    stay similar. p is (1 + draws that reach the observed mean) / (1 + n_draws) (Phipson & Smyth 2010, doi
     10.2202/1544-6115.1585). With S scenes it is about 1 / S! at least. For a gate that is weaker on craters, pass the
-    negative. NaN values are left out; both are NaN if no diagonal value is defined.
+    negated correlations. NaN values are left out; both are NaN if no diagonal value is defined.
     """
     values = np.asarray(correlations, np.float64)
     if np.isnan(np.diagonal(values)).all():
@@ -54,8 +54,8 @@ def permuted(
 def detector_permutations(masks: Masks, targets: FrameTargets, signs: Signs, rng: np.random.Generator) -> pd.DataFrame:
     """Rows of the permutation null for pcc1_craterness and pcc1_partial, with the columns of `null_differences`.
 
-    Masks are (N, height, width); `signs` are those of `validation_signs`. PCC2 has no such
-    null: it does not depend on the order of the frames.
+    Masks are (N, height, width); `signs` come from `validation_signs`. There is no permutation null for PCC2, because
+    PCC2 does not depend on the order of the frames.
     """
     basis = given_basis([targets.brightness, targets.gradient])
     craterness = standardised_rows(1 - targets.truth)
@@ -76,9 +76,9 @@ def detector_permutations(masks: Masks, targets: FrameTargets, signs: Signs, rng
 def pair_permutations(masks: Masks, targets: PairTargets, rng: np.random.Generator) -> pd.DataFrame:
     """Rows of the permutation null for pcc3, pcc4 and pcc4_minus_pcc3, with the columns of `null_differences`.
 
-    Upper halves are compared with the lower halves of the pairs of other scenes, moved by the homography of their own
-    pair. Stacked masks (N, 2 height, width) are sampled every fourth pixel, since all N x N combinations are computed;
-    values therefore differ slightly from those of `pair_values`.
+    Upper halves are compared with lower halves of pairs in other scenes. Each lower half is moved by the homography of
+    the pair that it belongs to. Stacked masks (N, 2 height, width) are sampled every fourth pixel, since all N x N
+    combinations are computed; values therefore differ slightly from the values of `pair_values`.
     """
     scale = np.diag([1 / _PAIR_STEP, 1 / _PAIR_STEP, 1.0])
     small = [scale @ homography @ np.linalg.inv(scale) for homography in targets.homographies]

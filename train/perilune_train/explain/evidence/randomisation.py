@@ -1,4 +1,4 @@
-"""Masks under randomised weights: a sanity check of the masks (Adebayo et al. 2018, arXiv 1810.03292)."""
+"""Compare masks before and after randomising weights, as a sanity check (Adebayo et al. 2018, arXiv 1810.03292)."""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
@@ -39,20 +39,22 @@ def cascade(
     rng_seed: int,
     run: Callable[[AttentionDarknet53], object] | None = None,
 ) -> Iterator[tuple[str, AttentionDarknet53]]:
-    """Copies of a backbone with more and more stages randomised, and the names of the steps.
+    """Yield the name of each step and a copy of the backbone, with more stages randomised at each step.
 
-    "top_down" randomises stage 5, then 5 and 4, ... as in Adebayo et al.; "bottom_up" the stem and stage 1, then also
-    stage 2, ... The steps are named "stages 4-5" and "stages 1-2"; the last one of both is "all". A stage includes its
-    own attention. The copies are in evaluation mode. The original and the random state of PyTorch are unchanged.
+    "top_down" randomises stage 5, then stages 5 and 4, and so on, as in Adebayo et al. "bottom_up" randomises the stem
+    and stage 1, then also stage 2, and so on. Steps have names such as "stages 4-5" and "stages 1-2"; the last step of
+    each direction is "all". A stage includes its attention gates. The copies are in evaluation mode. The original and
+    the random state of PyTorch are unchanged.
 
-    A forward mask depends only on the stages up to its own. So top-down randomisation leaves the masks of lower stages
-    exactly as they were, and the bottom-up cascade is the informative one: it tells whether deep masks need the trained
-    features below them. (In the original, saliency maps come from gradients, which pass all layers.)
+    A mask of the forward pass depends only on stages up to the gate. Top-down randomisation therefore does not change
+    masks of lower stages. The bottom-up cascade is more informative: it shows whether deep masks need the trained
+    features of lower stages. (In Adebayo et al., saliency maps come from gradients, which pass through all layers.)
 
-    Weights are drawn as PyTorch's layers do by default. Deviation from the untrained network: the attention's weights
-    are drawn too, where the identity form starts with zeros, because a constant mask has no similarity to compare. The
-    batch norms of randomised stages get the statistics of the images that `run` passes through a backbone
-    (`calibrate`); without it mean 0 and variance 1, with which deep gates of the plain form are constant.
+    Weights are drawn with the default initialisation of PyTorch's layers. This differs from an untrained network of the
+    identity form, whose attention weights start at zero: a constant mask has no similarity to compare, so attention
+    weights are drawn too. With `run`, the batch norms of randomised stages get the statistics of the images that it
+    passes through a backbone (`calibrate`). Without `run`, they have mean 0 and variance 1, and deep gates of the plain
+    form are constant.
     """
     changed = copy.deepcopy(backbone).eval()
     parts: list[nn.Module] = []
@@ -60,7 +62,7 @@ def cascade(
     order = range(count, 0, -1) if direction == "top_down" else range(1, count + 1)
     for step, stage in enumerate(order, start=1):
         with torch.random.fork_rng(devices=[]):
-            # Each stage has its own seed, so that both directions draw equal weights for it.
+            # Each stage has a separate seed, so that both directions draw equal weights for a stage.
             torch.manual_seed(int(np.random.SeedSequence([rng_seed, stage]).generate_state(1)[0]))
             for part in _parts(changed, stage):
                 _reset(part)
@@ -75,9 +77,10 @@ def cascade(
 def calibrate(
     backbone: AttentionDarknet53, parts: Sequence[nn.Module], run: Callable[[AttentionDarknet53], object]
 ) -> None:
-    """Set mean and variance of the batch norms of some parts of a backbone to those of the images of `run`.
+    """Set mean and variance of the batch norms in `parts` from the images that `run` uses.
 
-    `run` passes images through the backbone; several batches are averaged. Leaves these batch norms in evaluation mode.
+    `run` passes images through the backbone; statistics of several batches are averaged. The batch norms are left in
+    evaluation mode.
     """
     norms = [module for part in parts for module in part.modules() if isinstance(module, nn.BatchNorm2d)]
     momenta = [norm.momentum for norm in norms]
@@ -95,17 +98,18 @@ def calibrate(
 def similarity(trained: Masks, other: Masks, step: str = "") -> pd.DataFrame:
     """Similarity of each gate's masks (N, height, width) to the trained ones: columns map, step, spearman, ssim.
 
-    Means over the images, without the undefined: `spearman` is Spearman's rank correlation over pixels, NaN if a mask
-    is constant; `ssim` the mean structural similarity (Wang et al. 2004, doi 10.1109/TIP.2003.819861), with the range
-    of the trained mask as its dynamic range, NaN if that mask is constant. Deviation: masks wider than 64 px are
-    averaged to that width first, which is nearly the resolution of stage 2 for frames of 256 px.
+    Both columns are means over the images with defined values. `spearman` is Spearman's rank correlation over pixels;
+    it is undefined if a mask is constant. `ssim` is the mean structural similarity (Wang et al. 2004, doi
+    10.1109/TIP.2003.819861). Its dynamic range is the range of the trained mask, and it is undefined if that mask is
+    constant. Deviation: masks wider than 64 px are first averaged to a width of 64 px, close to the resolution of stage
+    2 for frames of 256 px.
     """
     rows = []
     for name, trained_maps in trained.items():
         a, b = _small(trained_maps), _small(other[name])
         ranks = [np.stack([rankdata(values) for values in maps.reshape(len(maps), -1)]) for maps in (a, b)]
         spearman = pearson_rows(*ranks)
-        # Ranks of rounding errors would not be constant.
+        # Test the values, since ranks of rounding errors are not constant.
         spearman[[is_constant(x) or is_constant(y) for x, y in zip(a, b, strict=True)]] = np.nan
         ssim = np.array([_ssim(x, y) for x, y in zip(a, b, strict=True)])
         rows.append({"map": name, "step": step, "spearman": _mean(spearman), "ssim": _mean(ssim)})
@@ -115,10 +119,10 @@ def similarity(trained: Masks, other: Masks, step: str = "") -> pd.DataFrame:
 def randomised(
     network: WithBackbone, masks_of: Callable[[NDArray[np.uint8]], Masks], images: NDArray[np.uint8], seed: int
 ) -> pd.DataFrame:
-    """Similarity of the masks of `images` to those of both cascades of a network: direction, step, map, spearman, ssim.
+    """Similarity of a network's masks to its masks under both cascades: direction, step, map, spearman, ssim.
 
-    `masks_of` gives the masks of `network`, whose backbone is exchanged while it is called and then restored. The
-    batch norms of randomised stages get the statistics of the images.
+    `masks_of` returns the masks of `network` for images. The backbone of `network` is replaced while `masks_of` is
+    called, and restored at the end. The batch norms of randomised stages get the statistics of `images`.
     """
     trained, backbone, tables = masks_of(images), network.backbone, []
 
@@ -165,7 +169,7 @@ def _small(maps: NDArray[np.floating]) -> Array:
 
 
 def _ssim(a: Array, b: Array) -> float:
-    """Mean structural similarity of two maps with the range of `a`, mirrored at the edge; NaN if `a` is constant."""
+    """Mean structural similarity of two maps; dynamic range of `a`, edges mirrored; NaN if `a` is constant."""
     if is_constant(a):
         return float("nan")
 

@@ -1,4 +1,4 @@
-"""Removal of the pixels that a map attends to, against two controls and the least attended pixels."""
+"""Remove the pixels that a map attends to, and compare with two controls and the least attended pixels."""
 
 from collections.abc import Callable, Mapping
 from typing import Literal
@@ -15,7 +15,7 @@ Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
 CONTROLS = ("random", "shifted")
 _FILLINGS: tuple[Filling, ...] = ("inpaint", "mean")
 BLOCK_PX = 8
-"""Side of the removed blocks, pixels: inpainting cannot restore them as it restores single pixels."""
+"""Side of the removed blocks, pixels. Inpainting can restore single pixels, but not blocks of this size."""
 _BINS = 10
 _INPAINT_RADIUS_PX = 3
 _WINDOW_PX = 31
@@ -31,7 +31,8 @@ def chosen_pixels(
 ) -> NDArray[np.bool_]:
     """The blocks with the largest ("most") or smallest ("least") means of sign * map, as pixels (height, width).
 
-    Their number is the share of all blocks, rounded. Ties, as where a gate is at its bound, are broken at random.
+    The number of blocks is `share` of all blocks, rounded. Ties, which occur where a gate is at its bound, are broken
+    at random.
     """
     means = sign * block_means(map_, block_px).ravel()
     order = np.lexsort((rng.random(means.size), -means if which == "most" else means))
@@ -41,10 +42,10 @@ def chosen_pixels(
 def random_like(
     image: NDArray[np.uint8], chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX
 ) -> NDArray[np.bool_]:
-    """Random blocks of an image (height, width) of the same brightness as the chosen ones.
+    """Random blocks of an image (height, width) whose brightness is distributed as in the chosen blocks.
 
-    From each decile of the image's block means come as many blocks as in `chosen`. Chosen blocks may be drawn again,
-    so that the control depends on brightness only; this makes it the harder to beat.
+    Each decile of the image's block means contributes as many blocks as in `chosen`. Chosen blocks may be drawn again,
+    so that the control depends on brightness only. This makes the control harder to beat.
     """
     means = block_means(image, block_px).ravel()
     decile = np.empty(means.size, int)
@@ -58,7 +59,7 @@ def random_like(
 
 
 def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX) -> NDArray[np.bool_]:
-    """The chosen blocks flipped, rotated and shifted circularly at random: an equal shape at another position.
+    """The chosen blocks, flipped, rotated and circularly shifted at random: an equal shape at another position.
 
     Images that are not square are rotated by 0 or 180 degrees.
     """
@@ -73,8 +74,8 @@ def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: 
 def removed(image: NDArray[np.uint8], chosen: NDArray[np.bool_], how: Filling) -> NDArray[np.uint8]:
     """The image (height, width) with the chosen pixels replaced.
 
-    "inpaint": by Telea's method (2004, doi 10.1080/10867651.2004.10487596), radius 3 px. "mean": by the mean of the
-    pixels not chosen in a window of 31 px, or in the image if the window has none.
+    "inpaint" uses Telea's method (2004, doi 10.1080/10867651.2004.10487596) with a radius of 3 px. "mean" uses the mean
+    of the pixels that are not chosen in a window of 31 px, or in the image if the window has no such pixels.
     """
     if not chosen.any() or chosen.all():
         raise ValueError(f"{int(chosen.sum())} of {chosen.size} pixels chosen, expected some but not all")
@@ -99,11 +100,11 @@ def removal_effect(
 ) -> pd.DataFrame:
     """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
 
-    `maps` are (N, height, width); `sign` is 1, or -1 for a map that is weaker on craters. `measure` runs once, and once
-    for each combination of map, which and how. Columns: map, which ("most", "least", "random": blocks of the brightness
-    of "most", "shifted": blocks of the shape of "most"), how, frame_index, overlap (share of the removed pixels that
-    are among the most attended ones), before, after. In images of two frames stacked in height, replacements at the
-    seam use pixels of both.
+    `maps` are (N, height, width); `sign` is 1, or -1 for a map that is weaker on craters. `measure` runs once on the
+    unchanged images, and once for each combination of map, which and how. Columns: map, which ("most", "least",
+    "random": blocks of the brightness of "most", "shifted": blocks of the shape of "most"), how, frame_index, overlap
+    (share of the removed pixels that are among the most attended ones), before, after. If an image is two frames
+    stacked in height, replacements at the seam use pixels of both frames.
     """
     before = np.asarray(measure(images))
     tables = []
@@ -134,14 +135,14 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     """Mean harm of each removal, and its ratio to the harm of the stronger control, by map and how.
 
     `effects` is the table of `removal_effect`. Harm is the mean over frames of before - after, or of after - before if
-    lower values are better. Columns: map, how, most, least, random, shifted (harms), control (the control that harms
-    more), ratio (most / control; NaN unless the control's harm is above 0), overlap (mean share of the control's pixels
-    that are among the most attended ones; where the other pixels do no harm, the ratio is about 1 / overlap). A harm is
-    NaN if no frame has a value.
+    lower values are better. Columns: map, how; most, least, random, shifted (harms, NaN if no frame has a value);
+    control (the control with the larger harm); ratio (most / control, NaN unless the control's harm is above 0);
+    overlap (mean share of the control's pixels that are among the most attended ones). If only the most attended pixels
+    matter, the ratio is about 1 / overlap.
     """
     change = effects["before"] - effects["after"]
     harm = effects.assign(harm=change if higher_is_better else -change)
-    # A pivot table would leave out maps and removals without any value.
+    # A pivot table would drop maps and removals that have no values.
     means = harm.groupby(["map", "how", "which"])["harm"].mean()
     table = effects[["map", "how"]].drop_duplicates(ignore_index=True)
     pairs = list(zip(table["map"], table["how"], strict=True))
@@ -158,7 +159,7 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
 def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:
     """Means (rows, columns) of the blocks of values (height, width), from the upper left.
 
-    Blocks at the right and at the lower edge are smaller if a side is not a multiple of block_px.
+    Blocks at the right and lower edges are smaller if a side of the image is not a multiple of block_px.
     """
     sums, sizes = (_block_sums(array, block_px) for array in (values, np.ones(values.shape)))
     return sums / sizes

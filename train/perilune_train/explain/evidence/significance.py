@@ -1,4 +1,4 @@
-"""Means, intervals and tests against null maps, from the long table of values of each frame."""
+"""Compute means, intervals and tests against null maps, from the long table of values per frame."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ UNDECIDED = f"undecided: fewer than {MIN_UNITS} scenes"
 UNDEFINED = "undefined: the mask is constant"
 BEATS = "beats every null"
 PAIRWISE = ("pcc2",)
-"""Measures whose value for a frame is a mean over its pairs with the other frames."""
+"""Measures whose value for a frame is a mean over the frame's pairs with other frames."""
 _FLIPS = 4096
-"""Number of sign flips; with up to 12 units, all flips."""
+"""Number of random sign flips; with up to 12 units, all flips are used instead."""
 _GROUP = ["task", "kind", "map", "measure"]
 
 
 def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """One row for each task, kind, map and measure: value, low, high, n_units, unit, undefined, count.
 
-    `value` is the mean over the frames where it is defined, `low` and `high` its 95 % interval by bootstrap over units.
-    The unit is the scene; the trajectory, the part of frame_id before its last "/", if there is one scene. NaN with
-    fewer than 5 units. `undefined` is the number of NaN among the `count` values. Of PAIRWISE measures each pair of
-    frames counts in both (`pairwise`).
+    `value` is the mean over the frames with a defined value. `low` and `high` are the ends of its 95 % interval, by
+    bootstrap over units; they are NaN with fewer than 5 units. The unit is the scene. If there is only one scene, the
+    unit is the trajectory, which is the part of frame_id before the last "/". `undefined` is the number of NaN among
+    the `count` values. For PAIRWISE measures, each pair of frames counts in both frames (`pairwise`).
     """
     rows = []
     for _, task in table.groupby("task", sort=False):
@@ -43,7 +43,7 @@ def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
 
 
 def validation_signs(table: pd.DataFrame) -> dict[tuple[str, str, str], float]:
-    """Sign, 1 or -1, of the mean of every PCC1 on validation frames, by task, measure and map; 1 if undefined."""
+    """Sign of the mean of each PCC1 measure on validation frames, by task, measure and map; 1 if undefined."""
     rows = table[table["measure"].str.startswith("pcc1")]
     means = rows.groupby(["task", "measure", "map"], as_index=False)["value"].mean()
     keys = zip(means["task"], means["measure"], means["map"], strict=True)
@@ -54,18 +54,20 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
     """One row for each map of `kind` and each null that applies to it: the difference map - null, paired over frames.
 
     Columns: task, measure, map, null, value and null_value (means over all frames of the map), difference, low, high,
-    n_units, unit, p_bootstrap, p. "edge/stage_3" applies to the gates of stage 3, "untrained/B_11" to B_11, a name
-    without "/" to all. Frames where one of the two is undefined are left out. A null without any value is left out.
+    n_units, unit, p_bootstrap, p. The null "edge/stage_3" applies to the gates of stage 3, "untrained/B_11" to B_11,
+    and a name without "/" to all gates. Frames where the map or the null is undefined are left out. A null without any
+    value is left out.
 
-    PCC1 may have either sign: each map's values are multiplied by its sign on validation frames, `signs`. So a map is
-    compared by the strength that it was expected to have, and no sign is chosen on the frames of the table.
+    PCC1 may have either sign. The values of each map are therefore multiplied by the map's sign on validation frames
+    (`signs`), and no sign is chosen on the frames of the table.
 
-    p_bootstrap: one-sided, (1 + resampled differences at most 0) / 1001 over units. Its resolution is 0.001, but with S
-    units it can be that small by chance with probability 2^-S, and is too small for S below about 20. p: one-sided
-    sign-flip test over units, exact if differences are symmetric around 0; all 2^S flips up to 12 units, else 4096. Its
-    resolution is 2^-S: 0.031 with 5 scenes, 0.002 with 9. Use p for decisions.
+    p_bootstrap is one-sided: (1 + number of resampled differences at most 0) / 1001, resampled over units. Its
+    resolution is 0.001, but with S units it reaches 0.001 by chance with probability 2^-S. It is too small for S below
+    about 20. p is from a one-sided sign-flip test over units, which is exact if differences are symmetric around 0. It
+    uses all 2^S flips for up to 12 units, else 4096. Its resolution is 2^-S: 0.031 with 5 scenes, 0.002 with 9 scenes.
+    Use p for decisions.
 
-    Raises ValueError if a sign of a PCC1 is missing.
+    Raises ValueError if the sign of a PCC1 measure is missing.
     """
     rows = []
     for name, task in table.groupby("task", sort=False):
@@ -92,10 +94,11 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
 
 
 def pairwise(measure: str, values: Array) -> Array:
-    """Values (N,) of frames whose spread over units is that of their mean; unchanged unless the measure is PAIRWISE.
+    """Values (N,) of frames, rescaled if PAIRWISE so that resampling units gives the spread of the mean.
 
-    The mean over all pairs of frames is a U-statistic of order 2: a unit moves it by twice the deviation of its own
-    mean over pairs (Hoeffding 1948, doi 10.1214/aoms/1177730196). Deviations from the mean are doubled, the mean stays.
+    The mean over all pairs of frames is a U-statistic of order 2. A unit changes this mean by twice the deviation of
+    the unit's mean over pairs (Hoeffding 1948, doi 10.1214/aoms/1177730196). Deviations from the mean are therefore
+    doubled; the mean does not change.
     """
     if measure not in PAIRWISE:
         return values
@@ -103,10 +106,10 @@ def pairwise(measure: str, values: Array) -> Array:
 
 
 def unit_sign_flip_p(values: Array) -> float:
-    """One-sided p of a mean above 0 of the values (U,) of independent units, by sign flips.
+    """One-sided p, by sign flips, of a mean above 0 for the values (U,) of independent units.
 
-    All 2^U flips up to 12 units, else 4096 random ones of a fixed seed. Units without a value, NaN, are left out; NaN
-    if none has one.
+    Uses all 2^U flips for up to 12 units, else 4096 random flips with a fixed seed. Units with NaN are left out.
+    Returns NaN if no unit has a value.
     """
     values = values[np.isfinite(values)]
     if not len(values):
@@ -116,7 +119,7 @@ def unit_sign_flip_p(values: Array) -> float:
 
 
 def _flips(units: int, rng: np.random.Generator) -> Array:
-    """Signs, 1 or -1, of units (flips, units): all, or 4096 with the first row all 1."""
+    """Signs, 1 or -1, of units (flips, units): all combinations, or 4096 of which the first row is all 1."""
     if 2**units <= _FLIPS:
         return 1.0 - 2.0 * (np.arange(2**units)[:, None] >> np.arange(units) & 1)
     return np.vstack([np.ones(units), rng.choice([-1.0, 1.0], (_FLIPS - 1, units))])
@@ -125,14 +128,15 @@ def _flips(units: int, rng: np.random.Generator) -> Array:
 def against_nulls(differences: pd.DataFrame) -> pd.DataFrame:
     """One row for each task, measure and gate: value, n_units, unit, p, p_adjusted, beats_all, verdict.
 
-    Takes the rows of `null_differences`. p is the largest over all nulls, which is a test of "beats all of them"
-    without a correction for their number (Berger 1982, doi 10.1080/00401706.1982.10487790). p_adjusted is corrected for
-    the number of gates of the task and measure (Benjamini & Hochberg 1995, doi 10.1111/j.2517-6161.1995.tb02031.x); an
-    undefined p counts as 1. `beats_all`: p_adjusted is below 0.05, the gate's mean is larger than that of each null,
-    and at least 5 scenes have values; trajectories of one scene are not enough.
+    `differences` is the table of `null_differences`. p is the largest p over all nulls, which tests whether a gate
+    beats all nulls; it needs no correction for their number (Berger 1982, doi 10.1080/00401706.1982.10487790).
+    p_adjusted is corrected for the number of gates of the task and measure (Benjamini & Hochberg 1995, doi
+    10.1111/j.2517-6161.1995.tb02031.x); an undefined p counts as 1. A gate `beats_all` if p_adjusted is below 0.05, the
+    gate's mean exceeds the mean of each null, and at least 5 scenes have values. Trajectories of one scene do not
+    suffice.
 
-    With S scenes p is at least 2^-S. One gate out of 23 can pass alone with 9 scenes or more; with 5 scenes at least 15
-    gates have to pass together.
+    With S scenes, p is at least 2^-S. With 9 scenes or more, a single gate out of 23 can pass alone. With 5 scenes, at
+    least 15 gates must pass together.
     """
     rows = []
     for (task, measure), family in differences.groupby(["task", "measure"], sort=False):
@@ -206,7 +210,7 @@ class _Frames:
         return aligned
 
     def mean(self, values: Array) -> _Mean:
-        """Mean of the defined values (N,) and its interval; none for images, which are not independent."""
+        """Mean of the defined values (N,) and its interval; no interval for images, which are not independent."""
         rows = np.flatnonzero(np.isfinite(values))
         spread = spreads(lambda drawn: {"mean": _ratio(drawn, rows, values)}, rows, self.resamples)["mean"]
         unit, n_units = self.resamples.unit, len(np.unique(self.resamples.of_row[rows]))
@@ -236,7 +240,7 @@ class _Frames:
 
 
 def _ratio(drawn: Resamples, rows: Rows, values: Array) -> Array:
-    """Mean of values (N,) over `rows` in every resample (R,); NaN where a resample has none of them."""
+    """Mean of values (N,) over `rows` in every resample (R,); NaN where a resample contains none of these rows."""
     counts = drawn.totals(rows)
     return np.where(counts > 0, drawn.totals(rows, values[rows]) / np.maximum(counts, 1), np.nan)
 
@@ -267,6 +271,6 @@ def _verdict(rows: pd.DataFrame, p_adjusted: float) -> tuple[bool, str]:
     weaker = (rows["p"] >= LEVEL) | (rows["difference"] <= 0)
     if p_adjusted < LEVEL and not weaker.any():
         return True, BEATS
-    # If only the correction for the number of gates fails, name the null with the largest p.
+    # If the gate fails only because of the correction for the number of gates, name the null with the largest p.
     names = rows.loc[weaker if weaker.any() else rows["p"] == rows["p"].max(), "null"]
     return False, "does not beat: " + ", ".join(sorted(set(names)))

@@ -1,4 +1,4 @@
-"""Similarity of masks under noise, shifts, another lens, and between two renderings of the same poses."""
+"""Measure how similar masks stay under noise, shifts and another lens, and between two renderings of the poses."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,11 +17,12 @@ class Changes:
     """Changes of images under which masks are compared."""
 
     noise_dn: tuple[float, ...] = (2.0, 5.0)
-    """Standard deviations of added noise, grey values of 255."""
+    """Standard deviations of added noise, in grey values (0 to 255)."""
     shifts_px: tuple[tuple[int, int], ...] = ((1, 0), (0, 1), (3, -2))
     """Shifts to the right and down, pixels."""
     lenses: tuple[float, ...] = (-0.05, 0.05)
-    """Radial distortions: relative change of the distance from the centre at half the image width. Below 0: barrel."""
+    """Radial distortions: relative change of the distance from the centre at half the image width. Negative values are
+    barrel distortion."""
 
 
 DEFAULT_CHANGES = Changes()
@@ -42,10 +43,10 @@ def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
 
 
 def lens_map(height: int, width: int, distortion: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row (height, width) in an image of the pixel that another lens shows at each pixel.
+    """Columns and rows (height, width) in the original image of the pixels seen through another lens.
 
-    r = r' (1 - distortion r'^2), with r' the distance from the middle through the new lens, in half widths, and r that
-    through the old one. 0 is the middle of the first pixel, as for cv2.remap.
+    r = r' (1 - distortion r'^2), where r' is the distance from the image centre under the new lens and r under the
+    original lens, both in half widths. Coordinate 0 is the centre of the first pixel, as in cv2.remap.
     """
     x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
     factor = 1 - distortion * (x**2 + y**2) / (width / 2) ** 2
@@ -60,12 +61,12 @@ def stability(
     changes: Changes = DEFAULT_CHANGES,
     stacked: int = 1,
 ) -> pd.DataFrame:
-    """Pearson correlation of the masks of images (N, height, width) with those of the changed images.
+    """Pearson correlation of the masks of images (N, height, width) with the masks of the changed images.
 
     Columns: map, change ("noise 2 DN", "shift 3 -2 px", "lens -5 %"), frame_index, pearson (NaN if a mask is constant).
-    A shift is undone before masks are compared, over the pixels that both images show. For another lens, the image is
-    resampled, and so is the mask of the original (`lens_map`). `stacked` is the number of frames stacked in height in
-    each image; each of them is changed.
+    A shift is undone before masks are compared over the pixels that both images show. For another lens, the image and
+    the mask of the original image are resampled (`lens_map`). `stacked` is the number of frames stacked in height in
+    each image; each frame is changed separately.
     """
     before = masks_of(images)
     tables = []
@@ -78,7 +79,7 @@ def stability(
             return shifted(frames, dx, dy).reshape(values.shape)
 
         after = {name: moved(gate_masks, -dx, -dy) for name, gate_masks in masks_of(moved(images)).items()}
-        # A pixel is in both images if no shift filled it in.
+        # A pixel is in both images unless the shift filled it with an edge pixel.
         inside = np.zeros((images.shape[1] // stacked, images.shape[2]), bool)
         height, width = inside.shape
         inside[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)] = True
@@ -103,7 +104,7 @@ def stability(
 def between(
     masks_a: Mapping[str, NDArray[np.floating]], masks_b: Mapping[str, NDArray[np.floating]], change: str
 ) -> pd.DataFrame:
-    """Pearson correlation of masks (N, height, width) of the same poses rendered twice.
+    """Pearson correlation between masks (N, height, width) of poses that are rendered twice.
 
     Columns as in `stability`, with `change` as the change's name.
     """

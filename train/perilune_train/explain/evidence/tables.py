@@ -1,11 +1,11 @@
-"""Results of one network as tables, which an explain run computes and its page reads."""
+"""Tables of results for one network, computed by an explain run and read by its page."""
 
 from dataclasses import dataclass, field
 
 import pandas as pd
 
 TABLES = ("values", "summary", "differences", "tested", "gates", "removal", "randomisation", "stability")
-"""Tables of `Evidence` in the order of their computation; each is written as <name>.parquet."""
+"""Tables of `Evidence` in the order in which they are computed; each is written as <name>.parquet."""
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class Evidence:
     summary: pd.DataFrame
     """Means and intervals of the values (`significance.summary`)."""
     differences: pd.DataFrame
-    """Each gate against each null (`significance.null_differences`)."""
+    """Comparison of each gate with each null (`significance.null_differences`)."""
     tested: pd.DataFrame
-    """Each gate against all nulls (`significance.against_nulls`)."""
+    """Comparison of each gate with all nulls together (`significance.against_nulls`)."""
     gates: pd.DataFrame
     """Performance with gates forced to their means: scope, frame_id, scene_id, before, after."""
     removal: pd.DataFrame
@@ -31,7 +31,7 @@ class Evidence:
     signs: dict[str, int] = field(default_factory=dict)
     """Sign of each map's craterness on validation images."""
     strongest: str = ""
-    """The gate up to stride 8 of the strongest craterness on validation images."""
+    """The gate up to stride 8 with the strongest craterness on validation images."""
 
     def with_task(self, task: str) -> dict[str, pd.DataFrame]:
         """All tables by name, with the column `task` first."""

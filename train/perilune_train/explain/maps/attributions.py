@@ -1,7 +1,7 @@
-"""Attribution maps of the detector by Grad-CAM, integrated gradients and occlusion (Captum).
+"""Compute attribution maps of the detector by Grad-CAM, integrated gradients and occlusion (Captum).
 
-All maps are float32 (N, height, width) at the size of the given frames. Frames are normalised, so that 0 is each
-frame's mean grey; the baseline of integrated gradients and of occlusion is 0.
+All maps are float32 (N, height, width) and as large as the given frames. Frames are normalised, so 0 is the mean grey
+of each frame. The baseline of integrated gradients and of occlusion is 0.
 """
 
 from typing import Protocol
@@ -21,7 +21,7 @@ from perilune_train.models.yolo import YOLOv3
 class DetectorTarget(nn.Module):
     """Sum of the objectness of the predictors that score at least `min_score` on the unchanged image.
 
-    The best predictor of an image always belongs to the sum. The network must be in evaluation mode.
+    The best predictor of an image is always in the sum. The network must be in evaluation mode.
     """
 
     def __init__(self, network: YOLOv3, min_score: float = 0.5):
@@ -47,7 +47,7 @@ class DetectorTarget(nn.Module):
 
     @torch.no_grad()
     def fixed(self, grey: Tensor) -> tuple[Tensor, ...]:
-        """Which predictors belong to the sum (N, K); it stays the same while the images are changed."""
+        """Mask (N, K) of the predictors in the sum; it stays fixed while the images are changed."""
         scores = self.scores(grey)
         return ((scores >= self.min_score) | (scores == scores.amax(1, keepdim=True)),)
 
@@ -65,8 +65,8 @@ def last_of_stage(backbone: AttentionDarknet53, stage: int) -> nn.Module:
 def grad_cam(target: DetectorTarget, frames: NDArray[np.float32], stage: int | None = None) -> NDArray[np.float32]:
     """Grad-CAM (N, height, width) of normalised frames, on the last layer of a stage 1..5, resized to the frames.
 
-    Selvaraju et al. 2017, doi 10.1109/ICCV.2017.74, with their ReLU. The default layer is `target.last_layer`. A
-    map can be zero everywhere, as on stage 2 of the installed detector, where every weighted sum is negative.
+    Selvaraju et al. 2017, doi 10.1109/ICCV.2017.74, with their ReLU. The default layer is `target.last_layer`. A map is
+    zero everywhere if every weighted sum is negative; this happens on stage 2 of the installed detector.
     """
     method = LayerGradCam(target, target.last_layer if stage is None else last_of_stage(target.backbone, stage))
 
@@ -79,10 +79,10 @@ def grad_cam(target: DetectorTarget, frames: NDArray[np.float32], stage: int | N
 def integrated_gradients(
     target: DetectorTarget, frames: NDArray[np.float32], n_steps: int = 16, signed: bool = False
 ) -> NDArray[np.float32]:
-    """Absolute integrated gradients (N, height, width) of normalised frames, from mean grey to the frame.
+    """Absolute integrated gradients (N, height, width) of normalised frames; the path is from mean grey to the frame.
 
-    Sundararajan et al. 2017, arXiv 1703.01365, by Gauss-Legendre quadrature with `n_steps` points. `signed` keeps the
-    sign: the sum over pixels is then the target's change from mean grey to the frame.
+    Sundararajan et al. 2017, arXiv 1703.01365, by Gauss-Legendre quadrature with `n_steps` points. With `signed` the
+    sign is kept, and the sum over pixels is the change of the target from mean grey to the frame.
     """
     method = IntegratedGradients(target)
 
@@ -98,7 +98,8 @@ def occlusion(
 ) -> NDArray[np.float32]:
     """Decrease of the target (N, height, width) where a square window of normalised frames is set to mean grey.
 
-    Zeiler & Fergus 2014, doi 10.1007/978-3-319-10590-1_53. A pixel has the mean over the windows that contain it.
+    Zeiler & Fergus 2014, doi 10.1007/978-3-319-10590-1_53. The value at a pixel is the mean over the windows that
+    contain it.
     """
     method = Occlusion(target)
 
@@ -115,7 +116,7 @@ def occlusion(
 
 
 _BATCH = 8
-"""Images that pass the network together."""
+"""Number of images that pass through the network in one batch."""
 
 
 class _Method(Protocol):

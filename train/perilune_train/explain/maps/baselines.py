@@ -58,9 +58,9 @@ BASELINES: dict[str, Callable[[Images], Map]] = {
 def baseline_maps(images: Images, px_per_input_px: float = 1.0) -> Masks:
     """Every baseline of images (N, height, width) at the resolution of each stage: "edge/stage_1", "edge/stage_2", ...
 
-    A smooth map correlates better with the smooth ground truth than a sharp one. So each baseline is averaged over the
-    pixels of the stage's feature map, stride 2 to 32, and enlarged like the masks. `px_per_input_px` is the width of
-    the images divided by the width of the network's input.
+    A smooth map correlates better with the smooth ground truth than a sharp map. Each baseline is therefore averaged to
+    the resolution of the stage's feature map (stride 2 to 32) and enlarged as the masks are. `px_per_input_px` is the
+    width of the images divided by the width of the network's input.
     """
     maps: Masks = {}
     for name, function in BASELINES.items():

@@ -19,9 +19,9 @@ _WHITE = (255, 255, 255)
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Sequence[float]) -> None:
     """Draw a PNG sheet: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
 
-    Below each frame is the height of its camera, `height_m`, metres.
-    All masks of the sheet share one scale, from the smallest to the largest value. Below each mask is its own range, or
-    "constant" if it does not vary.
+    `height_m` is the height of each frame's camera, metres, which is written below the frame. All masks of the sheet
+    share one scale, from the smallest to the largest value. The range of each mask, or "constant" if the mask does not
+    vary, is written below the mask.
     """
     low = min(float(gate_masks.min()) for gate_masks in masks.values())
     high = max(float(gate_masks.max()) for gate_masks in masks.values())
@@ -42,7 +42,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
 
 
 def caption(block: str, mask: NDArray[np.floating]) -> str:
-    """A block's name with the range of its mask, or with "constant" and the value."""
+    """A block's name with the range of its mask, or with "constant" and the value if the mask does not vary."""
     span = f"constant {mask.mean():.3f}" if is_constant(mask) else f"{mask.min():.3f}-{mask.max():.3f}"
     return f"{block} {span}"
 

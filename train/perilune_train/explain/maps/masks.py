@@ -1,4 +1,4 @@
-"""Spatial attention masks of the trained networks, and a file of them for a viewer of frames."""
+"""Compute spatial attention masks of trained networks, and write them to a file for an image viewer."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,11 +16,11 @@ from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
 
 Masks = dict[str, NDArray[np.float32]]
-"""Block "B_ij" to masks (N, height, width) of N images, resized to the size of the frames."""
+"""Masks (N, height, width) of N images by block "B_ij", resized to the size of the frames."""
 
 _BATCH = 8
 LARGEST_PX = 64
-"""Largest width of a stored mask; masks of deep gates have fewer pixels of their own."""
+"""Largest width of a stored mask, pixels. Native masks of deep gates are smaller."""
 
 
 def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
@@ -41,7 +41,7 @@ def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> 
 
 
 def navigator_masks(navigator: StackNavigator, pairs: NDArray[np.uint8], size_px: int, where: Path) -> Masks:
-    """Masks (N, 2 height, width) of pairs (N, 2 height, width), the earlier frame above; input `size_px` wide."""
+    """Masks (N, 2 height, width) of pairs (N, 2 height, width), earlier frame above; the input is `size_px` wide."""
     device = next(navigator.parameters()).device
     first, second = stacked_input(pairs, size_px)
     inputs = [
@@ -82,7 +82,7 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
 def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
     """Write an .npz file with frame_ids (N,), blocks (B,), low (B,), high (B,), and uint8 masks (N, h, w) by block.
 
-    0 to 255 stand for `low` to `high`, the range of the block's masks (N, height, width).
+    Values 0 to 255 represent the range `low` to `high` of the block's masks (N, height, width).
     """
     arrays: dict[str, np.ndarray] = {}
     for block, block_masks in masks.items():

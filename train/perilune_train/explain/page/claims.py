@@ -1,4 +1,4 @@
-"""All statements on the gates of a run, each with its figure, interval, nulls, verdict and picture."""
+"""Claims about the gates of a run, each with figure, interval, nulls, verdict and picture."""
 
 import math
 from collections.abc import Collection
@@ -14,16 +14,16 @@ from perilune_train.explain.evidence.tables import Evidence
 from perilune_train.records.spread import MIN_UNITS
 
 LEAST_DEVIATION = 0.02
-"""Smallest standard deviation over pixels and images of a mask that does not count as constant."""
+"""Smallest standard deviation, over pixels and images, at which a mask does not count as constant."""
 _REMOVES = "removing the 20 %"
 STILL_FROM = 37
-"""The paper: PCC4 is above PCC3 up to B_36, below from B_37."""
+"""The paper states that PCC4 is above PCC3 up to B_36, and below PCC3 from B_37 on."""
 DEEP_GATES = tuple(f"B_4{k}" for k in (8,)) + tuple(f"B_5{k}" for k in (1, 2, 3, 4))
 DEEP_ALIKE = 0.75
 LOCALISATION = {"auc": "ROC-AUC", "relevance_mass": "relevance mass", "pointing": "pointing game"}
-"""Measures of localisation and their names."""
+"""Localisation measures and their display names."""
 HARM_RATIO = 3.0
-"""Removing attended pixels should do at least this many times as much harm as the stronger control."""
+"""Smallest ratio of the harm of removing attended pixels to the harm of the stronger control."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Claim:
     """One statement; all fields are texts for a table."""
 
     claim: str
-    """The statement, and who makes it."""
+    """The statement, and its author."""
     figure: str
     """The measured figure."""
     interval: str
-    """Its 95 % interval over scenes, or why there is none."""
+    """The 95 % interval over scenes, or the reason why there is no interval."""
     nulls: str
-    """The figure of the nulls or controls."""
+    """The figures of the nulls or controls."""
     verdict: str
     """holds, does not hold, or undecided, with the reason."""
     picture: str
@@ -60,21 +60,21 @@ def row_of(evidence: Evidence, measure: str, name: str) -> pd.Series:
 
 
 def interval_text(row: pd.Series) -> str:
-    """The interval and the units of a row of the summary, or that there is no interval."""
+    """Text with the interval and the units of a row of the summary, or that there is no interval."""
     if math.isfinite(row["low"]) and math.isfinite(row["high"]):
         return f"{row['low']:.2f} to {row['high']:.2f} ({row['n_units']} units: {row['unit']})"
     return f"none: {row['n_units']} units ({row['unit']})"
 
 
 def scenes_of(rows: pd.DataFrame) -> int:
-    """The number of scenes behind rows of a summary: 1 if their units are trajectories of one scene."""
+    """The number of scenes in rows of a summary; 1 if the units are trajectories of one scene."""
     return int(rows["n_units"].min()) if len(rows) and (rows["unit"] == "scene").all() else 1
 
 
 def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Collection[str] = ()) -> list[Claim]:
-    """Claims on the detector; `deviations` are the standard deviations of the masks over pixels and images.
+    """Claims about the detector; `deviations` are the standard deviations of the masks over pixels and images.
 
-    `guided` are gates whose masks were trained to follow labels; the claims say so.
+    `guided` are gates whose masks were trained to follow labels; the claims mention this.
     """
     strongest = evidence.strongest
     follows = f"Detector: the mask of {strongest} follows craters"
@@ -94,7 +94,7 @@ def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Co
 
 
 def navigator_claims(evidence: Evidence, deviations: dict[str, float]) -> list[Claim]:
-    """Claims on the stack navigator."""
+    """Claims about the stack navigator."""
     strongest, unit = evidence.strongest, "position error of a pair, m"
     alike = f"Navigator: both halves of the mask of {strongest} mark the same ground (PCC4)"
     return [
@@ -148,7 +148,7 @@ def against_nulls(evidence: Evidence, measure: str, gate: str, claim: str, pictu
 
 
 def null_means(evidence: Evidence, measure: str, gate: str) -> str:
-    """The mean of each null of a gate; a null whose map is constant in every image is undefined and not tested."""
+    """Means of a gate's nulls, as text. A null whose map is constant in every image is undefined and not tested."""
     rows = evidence.differences[(evidence.differences["measure"] == measure) & (evidence.differences["map"] == gate)]
     texts = [f"{row.null} {row.null_value:.2f}" for row in rows.itertuples()]
     values = evidence.values[(evidence.values["measure"] == measure) & (evidence.values["map"] == f"untrained/{gate}")]
@@ -175,13 +175,13 @@ def shallow(evidence: Evidence) -> Claim:
 
 
 def beating_gates(evidence: Evidence, measure: str, stages: str = "123") -> list[str]:
-    """Gates of some stages that beat every null in a measure, corrected for the number of gates."""
+    """Gates of the given stages that beat every null in a measure, corrected for the number of gates."""
     rows = evidence.tested[(evidence.tested["measure"] == measure) & evidence.tested["beats_all"]]
     return rows.loc[rows["map"].str[2].isin(list(stages)), "map"].tolist()
 
 
 def deep_alike(evidence: Evidence) -> Claim:
-    """Whether deep masks of two frames are alike, as the paper claims."""
+    """Whether deep masks of different frames are similar, as the paper claims."""
     gates = [gate for gate in DEEP_GATES if gate in set(evidence.summary["map"])]
     rows = [row_of(evidence, "pcc2", gate) for gate in gates]
     values = [float(row["value"]) for row in rows]
@@ -207,10 +207,10 @@ def _null_value(evidence: Evidence, measure: str, gate: str, null: str) -> float
 
 
 def located(evidence: Evidence, measure: str) -> Claim:
-    """Whether the strongest gate locates craters better than its nulls and than attribution methods.
+    """Whether the strongest gate locates craters better than its nulls and the attribution methods.
 
-    A method is compared over the frames that have its map, paired, by sign flips of whole scenes. With fewer than five
-    such scenes the comparison is undecided.
+    Each method is compared with the gate over the frames that have the method's map, paired, by sign flips of scenes.
+    With fewer than five such scenes, the comparison is undecided.
     """
     gate = evidence.strongest
     row = row_of(evidence, measure, gate)
@@ -239,7 +239,7 @@ def located(evidence: Evidence, measure: str) -> Claim:
 
 
 def _paired(evidence: Evidence, measure: str, gate: str, name: str) -> tuple[float, float, int]:
-    """Of an attribution method: its mean, p of "the gate is better" over the same frames, and the number of scenes."""
+    """Mean of an attribution method, p of "the gate is better" over its frames, and the number of scenes."""
     rows = evidence.values[evidence.values["measure"] == measure]
     table = rows[rows["map"].isin([gate, name])].pivot_table(
         index=["scene_id", "frame_id"], columns="map", values="value", aggfunc="first"
@@ -252,7 +252,7 @@ def _paired(evidence: Evidence, measure: str, gate: str, name: str) -> tuple[flo
 
 
 def motion(evidence: Evidence, *, moving: bool) -> Claim:
-    """Sign of PCC4 - PCC3 of the gates up to B_36, or from B_37 on, with the nulls of these gates."""
+    """Whether PCC4 - PCC3 has the sign that the paper states, for gates up to B_36 (`moving`) or from B_37 on."""
     rows = evidence.summary[(evidence.summary["measure"] == "pcc4_minus_pcc3") & (evidence.summary["kind"] == "gate")]
     number = rows["map"].str[2:].astype(int)
     rows = rows[number < STILL_FROM] if moving else rows[number >= STILL_FROM]
@@ -284,14 +284,14 @@ def motion(evidence: Evidence, *, moving: bool) -> Claim:
 
 
 def removal_row(evidence: Evidence, *, higher_is_better: bool) -> pd.Series:
-    """Harm of removing the strongest gate's pixels (a row of `removal_summary`), by the less favourable filling."""
+    """Harm of removing the strongest gate's pixels (a row of `removal_summary`), for the less favourable filling."""
     table = removal_summary(evidence.removal, higher_is_better)
     rows = table[table["map"] == evidence.strongest]
     return rows.iloc[int(np.argmin(rows["ratio"].fillna(-np.inf).to_numpy()))]
 
 
 def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
-    """Whether removing attended pixels hurts HARM_RATIO times as much as the stronger control."""
+    """Whether removing attended pixels does at least HARM_RATIO times as much harm as the stronger control."""
     row = removal_row(evidence, higher_is_better=higher_is_better)
     controls = (
         f"random {row['random']:.3f}, same shape elsewhere {row['shifted']:.3f}, least attended {row['least']:.3f}"
@@ -315,7 +315,7 @@ def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, hig
 
 
 def forced_harm(evidence: Evidence, *, higher_is_better: bool) -> dict[str, float]:
-    """Mean harm over frames of forcing each gate, each stage and all gates to their means, by name."""
+    """Mean harm, over frames, of forcing each gate, each stage and all gates to their means, by name."""
     harm = _harms(evidence, higher_is_better).groupby("scope", sort=False)["harm"].mean()
     return {str(scope): float(value) for scope, value in harm.items()}
 

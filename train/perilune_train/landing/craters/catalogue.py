@@ -12,31 +12,31 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.neighbours import Grid, grid_of, nearest
 
 LEAST_DIAMETER_M = 5.0
-"""Smallest diameter, metres, in a catalogue that is made from a dataset, by default."""
+"""Default smallest crater diameter, metres, in a catalogue made from a dataset."""
 Chosen = NDArray[np.integer] | NDArray[np.bool_]
-"""An index or a mask."""
+"""Selection of craters: an index array or a boolean mask."""
 
 
 @dataclass(frozen=True)
 class Catalogue:
-    """N craters as circles in space."""
+    """N craters, each a circle in space."""
 
     centre_m: Array
-    """Centres of the rims (N, 3), metres, O_L."""
+    """Rim centres (N, 3), metres, O_L."""
     normal: Array
-    """Unit normals of the rims (N, 3), O_L."""
+    """Unit normals of the rim planes (N, 3), O_L."""
     radius_m: Array
-    """Radii of the rims (N,), metres."""
+    """Rim radii (N,), metres."""
     position_sigma_m: float
-    """Standard deviation of the position of a crater, per axis, metres."""
+    """Standard deviation of a crater's position, per axis, metres."""
     radius_sigma_share: float
-    """Standard deviation of a radius, divided by it."""
+    """Standard deviation of a radius, as a share of the radius."""
 
     def __len__(self) -> int:
         return len(self.radius_m)
 
     def part(self, chosen: Chosen) -> "Catalogue":
-        """Some of the craters."""
+        """The catalogue of the chosen craters only."""
         places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
         # `take` is many times as fast as indexing.
         centre_m, normal, radius_m = (
@@ -45,7 +45,7 @@ class Catalogue:
         return replace(self, centre_m=centre_m, normal=normal, radius_m=radius_m)
 
     def ground_m(self, position_m: Array, count: int) -> float:
-        """Median height of the `count` craters nearest to a position, over ground: (2,) or (3,), O_L."""
+        """Median height, metres, of the `count` craters horizontally nearest to a position (2,) or (3,), O_L."""
         near = nearest(self._grid, float(position_m[0]), float(position_m[1]), count)
         return median(self.centre_m[near, 2].tolist())
 
@@ -56,12 +56,12 @@ class Catalogue:
 
 @dataclass(frozen=True, slots=True)
 class CatalogueErrors:
-    """Errors of a catalogue that was made from images of an orbiter."""
+    """Errors of a catalogue made from orbiter images."""
 
     position_sigma_m: float = 1.0
     """Standard deviation of the position, per axis, metres."""
     diameter_sigma_share: float = 0.03
-    """Standard deviation of the diameter, divided by it."""
+    """Standard deviation of the diameter, as a share of the diameter."""
     missing_share: float = 0.1
     """Share of the real craters that the catalogue lacks."""
     false_share: float = 0.05
@@ -69,7 +69,7 @@ class CatalogueErrors:
 
 
 def exact_catalogue(dataset: Dataset, scene_id: str, least_diameter_m: float) -> Catalogue:
-    """All craters of a scene of at least a diameter, largest first, without errors."""
+    """All craters of a scene that have at least the given diameter, largest first, without errors."""
     columns = ["x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
     rows = dataset.table("craters", columns, scene_id=scene_id).to_pandas()
     rows = rows[rows["diameter_m"] >= least_diameter_m].sort_values("diameter_m", ascending=False)
@@ -78,7 +78,7 @@ def exact_catalogue(dataset: Dataset, scene_id: str, least_diameter_m: float) ->
 
 
 def with_errors(exact: Catalogue, errors: CatalogueErrors, rng: np.random.Generator) -> Catalogue:
-    """The catalogue with random errors; false craters have the sizes of true ones and lie anywhere among them."""
+    """The catalogue with random errors. False craters have sizes of real craters and random positions among them."""
     kept = exact.part(rng.random(len(exact)) >= errors.missing_share)
     n_false = round(len(kept) * errors.false_share / (1 - errors.false_share))
     model = kept.part(rng.integers(len(kept), size=n_false))

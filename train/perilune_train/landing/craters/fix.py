@@ -1,9 +1,9 @@
-"""A camera's pose from craters that are matched to a catalogue, starting near the true pose.
+"""Estimate a camera's pose by matching craters to a catalogue, from a start near the true pose.
 
-Each round projects the catalogue into the image, matches sightings and craters one to one within a gate, and takes a
-Gauss-Newton step on the centres and sizes of the ellipses with Tukey's weights (Beaton & Tukey 1974, doi
-10.1080/00401706.1974.10489171). The gate narrows from round to round. The centres of the ellipses are projected
-exactly: they differ from the images of the circles' centres.
+Each round projects the catalogue into the image and matches sightings and craters one to one within a gate. It then
+takes a Gauss-Newton step that fits the centres and sizes of the ellipses with Tukey's weights (Beaton & Tukey 1974, doi
+10.1080/00401706.1974.10489171). The gate narrows from round to round. The ellipse centres are computed exactly, because
+the centre of a circle does not project to the centre of its ellipse.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ _GATES_PX = (6.0, 3.0, 1.5, 0.0, 0.0, 0.0)
 """Uncertainty of the pose in each round, pixels, in addition to the noise of the sightings."""
 _GATE_SIGMAS = 3.5
 _FARTHEST_PX, _SMALLER = 64.0, 0.8
-"""Craters farther outside the image than this, or smaller than this share of the smallest radius, are left out of all
-rounds. The start is right to a few pixels, and the rounds consider craters up to 18 px outside the image."""
+"""All rounds leave out craters farther outside the image than this, or smaller than this share of the smallest radius
+to match. The start is correct to a few pixels, and the rounds consider craters up to 18 px outside the image."""
 _TUKEY = 4.685
 COMMON_PX = 0.08
-"""Standard deviation of an error that all centres of a frame share, pixels."""
+"""Standard deviation, pixels, of the error that all centres in a frame share."""
 _LEAST_SIZE = 0.7
 """Radius of the smallest crater to match, as a share of the radius of the smallest sighting."""
 _LEAST_MATCHES = 6
@@ -42,29 +42,29 @@ class PosePrior:
     pose: Pose
     """Expected pose."""
     covariance: Array
-    """Covariance (6, 6) of a step of the pose: shift in O_L, metres, then turn from the left in O_C, radians."""
+    """Covariance (6, 6) of a pose error: translation (metres, O_L), then rotation from the left (radians, O_C)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A pose from craters."""
+    """A pose estimated from craters."""
 
     pose: Pose
     """Estimated pose."""
     covariance: Array
-    """Covariance (6, 6) of a step of the pose, as in `PosePrior`."""
+    """Covariance (6, 6) of the pose error, as in `PosePrior`."""
     sighting: NDArray[np.integer]
-    """Matched sightings (K,)."""
+    """Indices of the matched sightings (K,)."""
     crater: NDArray[np.integer]
-    """Their craters in the catalogue (K,)."""
+    """Index in the catalogue of the crater of each match (K,)."""
     weight: Array
     """Weights of the matches (K,), from 0 for outliers to 1."""
     rms_px: float
-    """Root mean square distance of the matches, per axis."""
+    """Root mean square distance between matched centres, per axis."""
 
 
 def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, start: Pose) -> Fix | None:
-    """Estimate the pose that fits best, from a start that is right to a few pixels; None if too few sightings match."""
+    """Estimate the best-fitting pose from a start that is correct to a few pixels; None if too few sightings match."""
     if not len(sightings):
         return None
     precision = np.linalg.inv(prior.covariance)
@@ -92,7 +92,7 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
         pose = pose.changed(np.linalg.solve(normal, gradient))
     if len(sighting) < _LEAST_SHARE * len(sightings):
         return None
-    # Do not let stated errors that are too small make the fix look more certain than its residuals.
+    # If the assumed errors are too small for the residuals, enlarge the covariance to match the residuals.
     squares = np.sum(weight[:, None] * (error[:, :2] / centre_sigma[:, None]) ** 2)
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
@@ -108,8 +108,9 @@ def _normal_equations(
 ) -> tuple[Array, Array, Array]:
     """Weights (K,) of K matches, normal matrix (6, 6) and right side (6,) of a Gauss-Newton step of the pose.
 
-    `error` (K, 3) are the differences of centre and size, `centre_sigma` (K,) and `size_sigma` their standard
-    deviations, `gate_px` the uncertainty of the pose, and `jacobian` (K, 3, 6) the derivatives by the step.
+    `error` (K, 3) holds the differences in centre and size. `centre_sigma` (K,) and `size_sigma` are the standard
+    deviations of these differences. `gate_px` is the uncertainty of the pose, and `jacobian` (K, 3, 6) holds the
+    derivatives with respect to the step.
     """
     weight, normal, right = np.empty(len(error)), np.zeros((6, 6)), np.zeros(6)
     for k in range(len(error)):
@@ -129,6 +130,6 @@ def _normal_equations(
 
 
 def _offset(pose: Pose, prior: Pose) -> Array:
-    """The step (6,) from the prior's pose to a pose."""
+    """The step (6,) from the prior pose to `pose`."""
     turn = rotation_vectors(pose.rotation_camera_from_site @ prior.rotation_camera_from_site.T)
     return np.concatenate([pose.position_m - prior.position_m, turn])

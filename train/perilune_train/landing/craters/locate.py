@@ -1,4 +1,4 @@
-"""A pose from one frame: near an expected pose, in an area, or anywhere over the catalogue."""
+"""Estimate a pose from one frame: near an expected pose, within an area, or anywhere over the catalogue."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,20 @@ from perilune_train.landing.craters.search import N_TESTED, Area, search
 from perilune_train.landing.craters.sightings import Sightings
 
 _NEAR_PX = 6.0
-"""Standard deviation of the expected pose, in pixels on the ground, up to which no search is needed."""
+"""Largest standard deviation of the expected pose, in pixels on the ground, for which no search is needed."""
 _LEAST_AGREED = 8
 _LEAST_SHARE = 0.25
-"""Smallest number, and smallest share of the tested sightings, that must agree with a hypothesis."""
+"""Smallest number of sightings, and smallest share of the tested sightings, that must agree with a hypothesis."""
 _AHEAD = 1.5
-"""Factor by which the best hypothesis must have more agreeing sightings than the second best."""
+"""Smallest ratio of agreeing sightings between the best and the second-best hypothesis."""
 _SIGMAS = 3.5
 _REACHES = (1.0, 3.0)
-"""Radii of the searches, as multiples of the radius that the prior suggests: the prior may be wrong."""
+"""Search radii, tried in turn, as multiples of the radius that the prior suggests. The larger one is tried because the
+prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
 _LEAST_MARGIN = 0.06
-"""Smallest margin of the altitude in a search, as a share of it: the ground is not level."""
+"""Smallest altitude margin in a search, as a share of the altitude. It is needed because the ground is not level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +35,14 @@ class Located:
     fix: Fix
     """The fix."""
     searched: bool
-    """Whether the fix was found by a search, not near the expected pose."""
+    """True if a search found the fix; False if it was found near the expected pose."""
 
 
 def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior) -> Located | None:
-    """Estimate the pose of a frame from its craters: near the expected pose if that is certain enough, else by a
-    search.
+    """Estimate the pose of a frame from its craters, near the expected pose or by a search.
 
-    None if too few sightings can be matched, or if two places explain them about equally well.
+    Searches if the expected pose is too uncertain or no fix is found near it. Returns None if too few sightings match,
+    or if two poses explain them about equally well.
     """
     ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
     altitude_m = float(prior.pose.position_m[2] - ground_m)
@@ -66,8 +67,7 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
 def lost_in_space(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
 ) -> Located | None:
-    """Search an area for the pose of a frame, with a tilt known to about a degree; None if the result is not
-    certain."""
+    """Search an area for the pose of a frame whose tilt is known to about 1 degree; None if uncertain."""
     hypotheses = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
     least = max(_LEAST_AGREED, _LEAST_SHARE * min(len(sightings), N_TESTED))
     if not hypotheses or hypotheses[0].n_agreed < least:
@@ -83,10 +83,10 @@ def lost_in_space(
 
 
 def _same(first: Pose, second: Pose) -> bool:
-    """Whether two hypotheses differ no more than by the error of a hypothesis."""
+    """Whether two hypotheses differ by no more than the error expected of one hypothesis."""
     return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 
 def _around(pose: Pose) -> PosePrior:
-    """A weak prior around a pose: the fix then rests on the sightings, and no sighting is counted twice."""
+    """A weak prior around a pose. The fix then depends on the sightings alone, and no sighting is counted twice."""
     return PosePrior(pose, np.diag(np.square([300.0] * 3 + [np.radians(3.0)] * 3)))

@@ -4,7 +4,7 @@ Steps:
 
 1. `within_reach` (neighbours.py) lists the pairs whose centres are close enough.
 2. `_best` computes the cost of each pair and drops pairs beyond the gate.
-3. `assigned` chooses the pairs: as many as possible and, of these, those of least total cost.
+3. `assigned` chooses the one-to-one assignment with the most pairs and, among these, the least total cost.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from perilune_train.compiled import compiled
 from perilune_train.landing.craters.neighbours import within_reach
 
 _ALONE = 1e6
-"""Cost of leaving a sighting without a crater. It exceeds what any exchange of pairs saves, so that as many sightings
+"""Cost of leaving a sighting without a crater. It is larger than any saving from exchanging pairs, so as many sightings
 as possible are matched."""
 
 
@@ -29,18 +29,17 @@ class Circles(NamedTuple):
     size: Array
     """Logarithms of the radii (N,)."""
     sigma_px: Array
-    """Standard deviations of the centres, on each axis (N,)."""
+    """Standard deviation of each centre, per axis (N,)."""
 
 
 def matched(
     seen: Circles, craters: Circles, size_variance: float, gate: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """The one-to-one assignment with the most pairs within a gate and, of these, the least total cost.
+    """The one-to-one assignment with the most pairs within a gate and, among these, the least total cost.
 
-    The cost of a pair is half of its squared distance, divided by the variance on each axis, plus the squared
-    difference of the sizes, divided by `size_variance`. It must be below the square of `gate`. Returns the matched
-    sightings (K,), in increasing order, their craters (K,), and the differences of centre and size (K, 3), sighting
-    minus crater.
+    The cost of a pair is half of the squared distance divided by the variance per axis, plus the squared difference in
+    size divided by `size_variance`. The cost must be below the square of `gate`. Returns the matched sightings (K,), in
+    increasing order, their craters (K,), and the differences in centre and size (K, 3), sighting minus crater.
     """
     farthest_px = np.max(craters.sigma_px, initial=0.0)
     reach_px = gate * np.sqrt(2 * (seen.sigma_px**2 + farthest_px**2))
@@ -56,7 +55,7 @@ def _best(
     crater: NDArray[np.int64],
     limits: tuple[float, float],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """`matched` over the pairs that `within_reach` lists; `limits` are the variance of the sizes and the gate."""
+    """Match the pairs that `within_reach` lists, as `matched` does; `limits` are the size variance and the gate."""
     size_variance, gate = limits
     kept, kept_crater, cost, count = np.zeros_like(first), np.empty_like(crater), np.empty(len(crater)), 0
     for i in range(len(seen.size)):
@@ -81,17 +80,15 @@ def _best(
 
 @compiled
 def assigned(first: NDArray[np.int64], crater: NDArray[np.int64], cost: Array, n_craters: int) -> NDArray[np.int64]:
-    """The crater of each sighting (M,), or -1, in the assignment with the most pairs and, of these, the least total
-    cost.
+    """The crater of each sighting (M,), or -1, in the assignment with the most pairs and, among these, the least cost.
 
-    `first` and `crater` list the pairs as `within_reach` does. Adds one sighting after the other, each along the
-    shortest path of exchanges (Crouse 2016, doi 10.1109/TAES.2016.140952), over the listed pairs only. A sighting may
-    stay alone at the cost `_ALONE`.
+    `first` and `crater` list the pairs as `within_reach` does. The sightings are added one at a time, each along the
+    shortest path of exchanges among the listed pairs (Crouse 2016, doi 10.1109/TAES.2016.140952). A sighting may stay
+    unmatched at the cost `_ALONE`.
     """
     n = len(first) - 1
     partner, taken = np.full(n, -1), np.full(n_craters, -1)
-    # Dual prices of sightings and craters: reduced costs stay at least 0, so that Dijkstra's search finds the shortest
-    # path.
+    # Dual prices of sightings and craters keep all reduced costs at 0 or above, as Dijkstra's search requires.
     price, discount = np.zeros(n), np.zeros(n_craters)
     shortest, before = np.full(n_craters, np.inf), np.empty(n_craters, np.int64)
     done = np.zeros(n_craters, np.bool_)
@@ -138,7 +135,7 @@ def assigned(first: NDArray[np.int64], crater: NDArray[np.int64], cost: Array, n
                 discount[j] -= length - shortest[j]
             done[j] = False
             shortest[j] = np.inf
-        # Exchange partners along the path, starting at its end.
+        # Exchange partners along the path, from the end to the start.
         if end < 0:
             end, partner[alone] = partner[alone], -1
         while end >= 0:

@@ -15,20 +15,21 @@ class Grid(NamedTuple):
     points: Array
     """The points (N, 2)."""
     n: int
-    """Number of rows, and of columns."""
+    """Number of rows, equal to the number of columns."""
     corner: Array
     """Smallest coordinates (2,)."""
     side: Array
-    """Sides of a cell (2,)."""
+    """Side lengths of a cell (2,)."""
     begin: NDArray[np.int64]
-    """Index in `order` of the first point of each cell, row by row, and the number of points at the end (n^2 + 1,)."""
+    """Index (n^2 + 1,) in `order` of the first point of each cell, row by row; the last element is the number of
+    points."""
     order: NDArray[np.int64]
     """Indices of the points, sorted by cell (N,)."""
 
 
 @compiled
 def grid_of(points: Array) -> Grid:
-    """Points (N, 2) in a grid."""
+    """Sort points (N, 2) into a grid."""
     n = int(np.ceil(np.sqrt(max(len(points), 1))))
     corner, side = np.zeros(2), np.ones(2)
     if len(points):
@@ -50,7 +51,7 @@ def grid_of(points: Array) -> Grid:
 
 @compiled
 def _cell(coordinate: float, corner: float, side: float, n: int) -> int:
-    """Index of the cell along an axis; the nearest cell for a coordinate outside the grid."""
+    """Index along one axis of the cell at a coordinate; outside the grid, of the nearest cell."""
     return int(min(max((coordinate - corner) / side, 0.0), n - 1.0))
 
 
@@ -58,8 +59,8 @@ def _cell(coordinate: float, corner: float, side: float, n: int) -> int:
 def within_reach(positions: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For each of M positions (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
 
-    Returns the index of the first pair of each position, with the number of pairs at the end (M + 1,), then the point
-    of each pair.
+    Returns the index of the first pair of each position, followed by the number of pairs (M + 1,), and the point of
+    each pair.
     """
     grid = grid_of(others)
     first, other, count = np.zeros(len(positions) + 1, np.int64), np.empty(8 * len(positions) + 1, np.int64), 0

@@ -1,4 +1,4 @@
-"""One descent through the filter: measurements in order of time, an estimate at every frame."""
+"""Run the filter over a descent: process measurements in time order and return an estimate at every frame."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Instruments:
     range_time_s: Array
     """Times of the ranges (n,), seconds since the first frame."""
     range_m: Array
-    """Distances to the ground along -Z_B (n,), metres; NaN where the altimeter measured none."""
+    """Distances to the ground along -Z_B (n,), metres; NaN where the altimeter measured no distance."""
 
     @classmethod
     def of_trajectory(cls, dataset: Dataset, ids: tuple[str, str], grade: InertialGrade) -> "Instruments":
@@ -46,7 +46,7 @@ class Instruments:
 
 
 def together(flights: Sequence[Instruments]) -> Instruments:
-    """The instruments of F flights as one, with the times and the ranges of the first flight."""
+    """Combine the instruments of F flights; times and ranges are taken from the first flight."""
     inertial = [flight.inertial for flight in flights]
     rate = np.stack([measured.angular_rate_radps for measured in inertial])
     force = np.stack([measured.specific_force_mps2 for measured in inertial])
@@ -55,10 +55,10 @@ def together(flights: Sequence[Instruments]) -> Instruments:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What the filter estimates at a frame."""
+    """Estimate of the filter at one frame."""
 
     frame: int
-    """Number of the frame in the descent."""
+    """Index of the frame in the descent."""
     state: State
     """State after the frame."""
     status: Status
@@ -70,8 +70,8 @@ class Estimate:
 def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
     """Run a filter over a descent.
 
-    `seen` yields the sightings of each frame, at increasing times (n,); it is advanced by one at each frame. Inertial
-    measurements that are not finite count as missing; measurements from before the lander's state are ignored.
+    `seen` yields the sightings of each frame and is advanced once per frame; `frame_time_s` (n,) increases. Inertial
+    measurements that are not finite count as missing. Measurements from before the lander's state are ignored.
     """
     for (estimate,) in fly_together(
         [lander], instruments, frame_time_s, ((frame_sightings,) for frame_sightings in seen)
@@ -82,10 +82,10 @@ def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Ite
 def fly_together(
     landers: Sequence[Lander], instruments: Instruments, frame_time_s: Array, seen: Iterable[Sequence[Sightings]]
 ) -> Iterator[list[Estimate]]:
-    """Run the filters of F flights over descents with measurements at the same times, faster than one by one.
+    """Run F filters over flights with measurements at equal times; this is faster than one flight at a time.
 
-    `seen` yields the sightings of all flights, frame by frame. Inertial noise, the noise of a range and relief are
-    those of the first lander.
+    `seen` yields the sightings of all flights, frame by frame. The first lander sets the inertial noise, range noise
+    and relief of all flights.
     """
     times = np.concatenate([instruments.range_time_s, frame_time_s])
     is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])

@@ -1,9 +1,9 @@
 """The filter in flight: one call for each measurement, in order of time.
 
 inertial, coast   propagate the state
-range             update it by a distance to the ground below
+range             update the state with the distance to the ground below
 sightings         match craters (locate.py), then one of three:
-                  - the fix fits the state: update by its craters (`craters_update`)
+                  - the fix fits the state: update with its craters (`craters_update`)
                   - the fix contradicts the state, and the previous fix did so too, with an equal offset: replace
                     position and attitude (`_restart`)
                   - otherwise ignore the frame
@@ -32,15 +32,14 @@ from perilune_train.landing.filter.stretch import Stretch
 from perilune_train.landing.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
-"""tracking: the last frame was matched to craters. coasting: it was not. lost: no frame was matched for 15 s, or a fix
-contradicts the state."""
+"""tracking: the last frame was matched to the catalogue. coasting: the last frame was not matched. lost: no frame was
+matched for 15 s, or a fix contradicts the state."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
-"""Default standard deviations, metres, of a range, and of the ground's height about the height of the nearest
-craters."""
+"""Default standard deviations, metres, of a range and of the ground's height relative to the nearest craters."""
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
-"""Standard deviation of the velocity on each axis, metres per second, that is added when a fix contradicts the
-state."""
+"""Standard deviation per axis, metres per second, added to the velocity when a fix that contradicts the state replaces
+it."""
 _NEAREST = 10
 """Number of nearest craters whose median height is taken as the height of the ground below."""
 
@@ -58,7 +57,7 @@ class Surroundings:
     range_sigma_m: float
     """Standard deviation of a range, metres."""
     relief_m: float
-    """Standard deviation of the ground's height about the height of the nearest craters, metres."""
+    """Standard deviation of the ground's height relative to the nearest craters, metres."""
 
 
 def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
@@ -82,12 +81,12 @@ class _Contradiction:
     time_s: float
     """Time of its frame."""
     offset_m: Array
-    """Position of the fix minus position of the state (3,), metres, O_L."""
+    """Position of the fix minus the position in the state (3,), metres, O_L."""
     covariance: Array
-    """Covariance (3, 3) of the position of the fix."""
+    """Covariance (3, 3) of the fix's position."""
 
     def agrees(self, later: "_Contradiction") -> bool:
-        """Whether a later fix has the same offset, within the errors of both fixes and of the velocity."""
+        """Whether a later fix has an equal offset, within the errors of both fixes and of the velocity."""
         step_s = later.time_s - self.time_s
         spread = self.covariance + later.covariance + np.eye(3) * (_UNKNOWN_VELOCITY_MPS * step_s) ** 2
         return passes_gate(later.offset_m - self.offset_m, spread)
@@ -96,7 +95,8 @@ class _Contradiction:
 class Lander:
     """State and status of a lander; every method takes one measurement.
 
-    With `keep_poses` the state keeps the pose of every frame, and later measurements correct it: a smoother.
+    With `keep_poses` the state keeps the pose of every frame, and later measurements correct these poses. This makes
+    the filter a smoother.
     """
 
     def __init__(self, state: State, noise: InertialNoise, around: Surroundings, keep_poses: bool = False):
@@ -115,7 +115,7 @@ class Lander:
 
     @property
     def surroundings(self) -> Surroundings:
-        """What the lander knows of its camera and of the ground."""
+        """What the lander knows about its camera and the ground."""
         return self._around
 
     @property
@@ -136,12 +136,11 @@ class Lander:
         return self._since
 
     def inertial(self, measured: Increments) -> None:
-        """Propagate to the end of inertial measurements; those that are older than the state or not finite are
-        ignored."""
+        """Propagate by inertial measurements; ignore measurements that are not finite or older than the state."""
         self._stretch.inertial(measured)
 
     def coast(self, until_s: float) -> None:
-        """Propagate without inertial measurements: constant velocity and attitude, with growing uncertainty."""
+        """Propagate without inertial measurements, at constant velocity and attitude and with growing uncertainty."""
         self._stretch.coast(until_s)
 
     def range(self, range_m: float) -> bool:
@@ -178,10 +177,10 @@ class Lander:
         return located
 
     def _replaces(self, fix: Fix) -> bool:
-        """Whether to replace the state by a fix that contradicts it: only if the previous fix had the same offset.
+        """Whether a fix that contradicts the state replaces it: only if the previous fix had an equal offset.
 
-        A fix whose attitude contradicts the state is itself wrong, since a gyroscope does not jump, unless the state is
-        lost.
+        Unless the state is lost, a fix whose attitude contradicts it is wrong, because the attitude from a gyroscope
+        does not jump.
         """
         expected, state = self._expected(), self.state
         turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)
@@ -200,7 +199,7 @@ class Lander:
         self.status = "lost" if self._late or self._contradiction is not None else "coasting"
 
     def _restart(self, located: Located) -> None:
-        """Take position and attitude from a fix, and add `_UNKNOWN_VELOCITY_MPS` to the uncertainty of the velocity."""
+        """Take position and attitude from a fix, and enlarge the velocity's uncertainty by `_UNKNOWN_VELOCITY_MPS`."""
         fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
         state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
         covariance = state.covariance.copy()
@@ -220,8 +219,7 @@ class Lander:
         )
 
     def _expected(self) -> PosePrior:
-        """The expected pose of the camera, with its covariance (6, 6): shift, metres, O_L, then turn from the left,
-        radians, O_C."""
+        """The expected camera pose and the covariance (6, 6) of its error, as in `PosePrior`."""
         rotation_camera_from_body, state = self._around.rotation_camera_from_body, self.state
         pose_parts = [*range(3), *range(6, 9)]
         to_camera = np.zeros((6, 6))

@@ -1,4 +1,4 @@
-"""Craters, and poses from craters, as measurements of the state."""
+"""Measurement models of the filter: craters, and poses estimated from craters."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,15 @@ from perilune_train.landing.filter.state import (
 from perilune_train.landing.filter.update import passes_gate, updated
 
 _LEAST_WEIGHT = 0.1
-"""Matches with a smaller weight in the fix are not used."""
+"""Matches with a smaller weight in the fix are ignored."""
 _ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
-"""Parts of the error state that displace all sightings."""
+"""Parts of the error state that displace every sighting."""
 
 
 def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
-    """Whether a pose of the camera passes the gate.
+    """Whether a camera pose is close enough to the state to pass the gate.
 
-    `covariance` (6, 6) has the shift in O_L, metres, then the turn from the left in O_C, radians.
+    `covariance` (6, 6) is the covariance of the pose error, as in `PosePrior`.
     """
     innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
     spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
@@ -37,12 +37,12 @@ def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_
 
 
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Shift and turn (6,) from the expected pose, and their derivative (6, 21) by the error state."""
+    """Translation and rotation (6,) from the expected pose, and their derivative (6, 21) by the error state."""
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
     by_error = np.zeros((6, N_ERRORS))
     by_error[:3, POSITION] = np.eye(3)
-    # R_camera_from_site = C R^T, and R exp(e) in the place of R turns it by -C e from the left.
+    # R_camera_from_site = C R^T. Replacing R by R exp(e) rotates it by -C e from the left.
     by_error[3:, ATTITUDE] = -rotation_camera_from_body
     return np.concatenate([pose.position_m - state.position_m, turn]), by_error
 
@@ -55,13 +55,13 @@ def craters_update(
     camera: Camera,
     rotation_camera_from_body: Array,
 ) -> State:
-    """Update by the craters that a fix has matched; their offsets over ground are parts of the state.
+    """Update with the craters that a fix has matched; their horizontal offsets are parts of the state.
 
-    Craters in view that are not matched stay in the state: if a crater is missed in one frame, its catalogue error must
-    not count as new information in the next.
+    Craters in view that are not matched stay in the state. Otherwise, if the detector missed a crater in one frame, the
+    next frame would treat the crater's catalogue error as independent.
 
-    The measurement is linearised about the pose of the fix, which is closer to the truth than the state (iterated
-    filter, Bell & Cathey 1993, doi 10.1109/9.250476).
+    The measurement is linearised about the fix, which is closer to the true pose than the state is (iterated filter,
+    Bell & Cathey 1993, doi 10.1109/9.250476).
     """
     used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
     sighting, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
@@ -74,7 +74,7 @@ def craters_update(
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
     from_fix = np.concatenate([state.position_m - fix.pose.position_m, turn])
-    # Shifting a crater looks like shifting the camera the other way.
+    # Shifting a crater has the effect of shifting the camera in the opposite direction.
     by_offset = -by_pose[:, :, :2]
     pattern = common_pattern(camera.rays(seen.centre_px)[:, :2])
     predicted = (
@@ -86,8 +86,8 @@ def craters_update(
     by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
     innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
-    # Height errors of the catalogue shift craters in the image, away from its centre. They are added as noise: as parts
-    # of the state they gave equal errors and normalised errors, for a state half as large again.
+    # Height errors of the catalogue shift craters in the image radially. They are added as noise. As parts of the state
+    # they gave equal errors and normalised errors, with a state half as large again.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
     noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
@@ -97,11 +97,11 @@ def craters_update(
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
-    """Covariance of N sightings with the error state (2 N, M) and with each other (2 N, 2 N), without measurement
-    noise.
+    """Covariances of N sightings without noise: with the error state (2 N, M) and with each other (2 N, 2 N).
 
-    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are the derivatives of the sightings by the errors `_ALL_SEE` and by
-    the offsets of their craters, which are the craters `crater` (N,) of the state. All other derivatives are zero.
+    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are the derivatives of the sightings with respect to the errors
+    `_ALL_SEE` and to the offsets of their craters. `crater` (N,) gives the index in the state of each sighting's
+    crater. All other derivatives are zero.
     """
     by_error = by_error.reshape(-1, len(_ALL_SEE))
     crossed = by_error @ state.covariance[_ALL_SEE]
@@ -114,8 +114,7 @@ def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offs
 
 @compiled
 def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDArray[np.int64]) -> None:
-    """Add the contribution of the craters' offsets to `crossed` of `_crossed`; they begin at rows `first` of the
-    state."""
+    """Add the contribution of craters' offsets, which begin at rows `first` of the state, to `crossed`."""
     for k in range(len(first)):
         east = first[k]
         for axis in range(2):
@@ -126,8 +125,7 @@ def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDA
 
 @compiled
 def _add_own(spread: Array, by_offset: Array, crossed: Array, first: NDArray[np.int64]) -> None:
-    """Add the contribution of the craters' offsets to `spread` of `_crossed`; they begin at rows `first` of the
-    state."""
+    """Add the contribution of craters' offsets, which begin at rows `first` of the state, to `spread`."""
     for row in range(len(crossed)):
         for k in range(len(first)):
             east = first[k]

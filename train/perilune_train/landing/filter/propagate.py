@@ -17,12 +17,12 @@ from perilune_train.landing.filter.state import (
 )
 
 _INERTIAL = 15
-"""Number of parts of the error state that inertial measurements change; they come first."""
+"""Number of elements of the error state that inertial measurements change; these are the first ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """N measurements of an inertial unit, means over intervals, in order of time, for one flight or for F."""
+    """N inertial measurements in time order, each a mean over an interval, for one flight or for F flights."""
 
     time_s: Array
     """Ends of the intervals (N,), seconds since the first frame."""
@@ -42,7 +42,7 @@ class Increments:
         return len(self.time_s)
 
     def part(self, chosen: slice | Array) -> "Increments":
-        """Some of the measurements."""
+        """The chosen measurements only."""
         rate, force = self.angular_rate_radps[..., chosen, :], self.specific_force_mps2[..., chosen, :]
         return Increments(self.time_s[chosen], self.interval_s[chosen], rate, force)
 
@@ -53,13 +53,13 @@ class Increments:
         return self if finite.all() else self.part(finite)
 
     def until(self, time_s: float) -> "Increments":
-        """A single measurement, cut at a time within its interval."""
+        """Cut a single measurement at a time within its interval."""
         interval_s = np.maximum(time_s - (self.time_s - self.interval_s), 0.0)
         return Increments(np.array([time_s]), interval_s, self.angular_rate_radps, self.specific_force_mps2)
 
 
 def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, unit: InertialErrors) -> Array:
-    """Standard deviations (15,) of the first errors of `State` at the start, from the deviations on each axis."""
+    """Initial standard deviations (15,) of the first 15 elements of the error state, from the deviations per axis."""
     gyro_bias_radps = np.radians(unit.gyro_bias_deg_per_h) / HOUR_S
     force_bias_mps2 = unit.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
     return np.repeat([position_m, velocity_mps, np.radians(attitude_deg), gyro_bias_radps, force_bias_mps2], 3)
@@ -80,7 +80,7 @@ class InertialNoise:
 
     @classmethod
     def of(cls, errors: InertialErrors) -> "InertialNoise":
-        """From the errors of a grade."""
+        """The noise of an inertial unit with the errors of a grade."""
         per_s, milli_g = np.radians(1) / HOUR_S, STANDARD_GRAVITY_MPS2 / 1000
         return cls(
             np.radians(errors.angular_random_walk_deg) ** 2 / HOUR_S,
@@ -92,7 +92,7 @@ class InertialNoise:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """The moving parts of the states of F flights."""
+    """The parts of the states of F flights that change with time."""
 
     position_m: Array
     """Positions (F, 3), O_L."""
@@ -108,12 +108,12 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motions of F flights over the same time, and their effect on the first 15 parts of the error state."""
+    """Motions of F flights over one time span, and their effect on the first 15 elements of the error state."""
 
     end: Moving
-    """The moving parts at the end."""
+    """The state at the end of the span."""
     change: Array
-    """Derivative (F, 15, 15) of the errors at the end by those at the start."""
+    """Derivative (F, 15, 15) of the errors at the end with respect to the errors at the start."""
     added: Array
     """Covariance (F, 15, 15) that the noise of the inertial unit adds."""
 
@@ -147,11 +147,11 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
 
 
 def _changes(middle: Array, half: Array, force: Array, step_s: Array) -> Array:
-    """Derivatives (N, F, 15, 15) of the errors after each step by the errors before it.
+    """Derivatives (N, F, 15, 15) of the errors after each step with respect to the errors before that step.
 
-    An error of the attitude turns the measured force; errors of the biases are integrated over the step. `middle` and
-    `half` (N, F, 3, 3) are the attitudes at the middle of the steps, and the turns from the start of each step to its
-    middle.
+    An attitude error rotates the measured force; bias errors are integrated over the step. `middle` (N, F, 3, 3) holds
+    the attitudes at the middle of the steps, and `half` (N, F, 3, 3) the rotations from the start to the middle of each
+    step.
     """
     step = step_s[:, None, None, None]
     by_turn = -middle @ cross_matrices(force)

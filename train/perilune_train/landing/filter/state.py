@@ -1,21 +1,21 @@
-"""State of the lander, and small errors of it.
+"""State of the lander, and the error state of the filter.
 
 Parts of the error state, in this order:
 
-    POSITION     shift, metres, O_L                                              3
+    POSITION     translation, metres, O_L                                        3
     VELOCITY     change of velocity, metres per second, O_L                      3
-    ATTITUDE     turn of the body from the right, radians, O_B                   3
+    ATTITUDE     rotation applied from the right, radians, O_B                   3
     GYRO_BIAS    error of the gyroscope's bias, radians per second, O_B          3
     FORCE_BIAS   error of the accelerometer's bias, metres per second^2, O_B     3
     COMMON       image error that all sightings of craters share, pixels         5
     GROUND       height of the ground below, metres                              1
     (craters)    offset of each crater in view over ground, metres, O_L          2 each
-    (poses)      shift and turn of each kept pose, as POSITION and ATTITUDE      6 each
+    (poses)      translation and rotation of each kept pose, as above            6 each
 
-Errors of the catalogue, of the detector and of the ground's height repeat from frame to frame. A filter that treats
-them as noise averages them over frames and states too small a covariance, so they are parts of the state. Poses of
-earlier frames are kept on request: later measurements correct them, which makes the filter a smoother (stochastic
-cloning, Roumeliotis & Burdick 2002, doi 10.1109/ROBOT.2002.1014801).
+Errors of the catalogue, of the detector and of the ground's height repeat from frame to frame. If the filter treated
+them as noise, it would average them over frames and report too small a covariance. They are therefore parts of the
+state. On request the state also keeps the poses of earlier frames. Later measurements correct these poses, which makes
+the filter a smoother (stochastic cloning, Roumeliotis & Burdick 2002, doi 10.1109/ROBOT.2002.1014801).
 """
 
 from dataclasses import dataclass, field, replace
@@ -30,7 +30,7 @@ POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
 COMMON, GROUND = slice(15, 20), slice(20, 21)
 N_ERRORS = 21
-"""Parts of the error state without craters and kept poses."""
+"""Number of elements of the error state without craters and kept poses."""
 
 _COMMON_SIGMAS_PX = np.array([0.08, 0.08, 0.15, 0.2, 0.2])
 """Standard deviations of the shared image error, pixels, measured on the validation scenes of `shipped-nav`."""
@@ -53,13 +53,13 @@ class State:
     force_bias_mps2: Array
     """Bias of the accelerometer (3,), O_B."""
     common_px: Array
-    """Coefficients (5,), pixels, of the error that all sightings share, see `common_pattern`."""
+    """Coefficients (5,), pixels, of the image error that all sightings share; see `common_pattern`."""
     ground_m: float
     """Height of the ground below, relative to the median height of the nearest craters of the catalogue."""
     craters: NDArray[np.integer]
-    """Craters in view (n,): rows of the catalogue."""
+    """Craters in view (n,), as rows of the catalogue."""
     offsets_m: Array
-    """Offsets (n, 2), x and y in O_L, of their detected centres from those of the catalogue."""
+    """Offsets (n, 2), metres, x and y in O_L, of the detected centres of these craters from the catalogue's centres."""
     covariance: Array
     """Covariance of the error state (21 + 2 n + 6 m, 21 + 2 n + 6 m)."""
     past_position_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -73,7 +73,8 @@ class State:
     ) -> "State":
         """The state at the first frame.
 
-        `sigmas` (15,) are the standard deviations of the first 15 errors, `relief_m` that of the ground's height.
+        `sigmas` (15,) are the standard deviations of the first 15 errors; `relief_m` is the standard deviation of the
+        ground's height.
         """
         none = np.zeros(3)
         covariance = np.diag(np.square(np.concatenate([sigmas, _COMMON_SIGMAS_PX, [relief_m]])))
@@ -103,7 +104,7 @@ class State:
         )
 
     def keeping_pose(self) -> "State":
-        """The state with its present pose added to the kept poses."""
+        """The state with the current pose added to the kept poses."""
         pose = [*range(3), *range(6, 9)]
         wider = np.concatenate([np.eye(len(self.covariance)), np.eye(len(self.covariance))[pose]])
         return replace(
@@ -116,8 +117,7 @@ class State:
         )
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
-        """The state with the offsets of `craters` (n,) alone; `sigma_m` (n,) are the standard deviations of new
-        ones."""
+        """The state with the offsets of exactly `craters` (n,); new offsets have standard deviations `sigma_m` (n,)."""
         row_of = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
         row_of[self.craters] = np.arange(len(self.craters))
         before = row_of[craters]
@@ -134,14 +134,15 @@ class State:
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
-        """Shift and turn (6,) from the kept pose of an earlier frame to the true pose, and their covariance (6, 6)."""
+        """Translation and rotation (6,) from an earlier frame's kept pose to the true pose, and their covariance (6,
+        6)."""
         turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
         start = N_ERRORS + 2 * len(self.craters) + 6 * number
         parts = slice(start, start + 6)
         return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[parts, parts]
 
     def pose_error(self, position_m: Array, rotation_site_from_body: Array) -> Array:
-        """Shift and turn (6,) from the estimated to the true pose."""
+        """Translation and rotation (6,) from the estimated pose to the true pose."""
         turn = rotation_vectors(self.rotation_site_from_body.T @ rotation_site_from_body)
         return np.concatenate([position_m - self.position_m, turn])
 
@@ -180,8 +181,9 @@ def rotation_matrices(turns_rad: Array) -> Array:
 def common_pattern(ray: Array) -> Array:
     """Derivatives (n, 2, 5) of the image error that all sightings share, at rays (n, 2) on the plane at depth 1.
 
-    A shift, a scale and two terms that grow with the square of the distance from the image centre. Errors of position,
-    altitude and tilt displace craters in the same way, so a single frame cannot tell them apart.
+    The error is a shift, a scale and two terms that grow with the square of the distance from the image centre. Errors
+    of position, altitude and tilt displace craters in this pattern too, so one frame cannot distinguish them from the
+    image error.
     """
     x, y = ray.T
     zero, ones = np.zeros_like(x), np.ones_like(x)

@@ -1,4 +1,4 @@
-"""Updates of the state by measurements, and a gate on the normalised innovation squared."""
+"""Measurement update of the state, and the gate on the normalised innovation squared."""
 
 from functools import cache
 
@@ -11,28 +11,28 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.filter.state import State
 
 GATE_SHARE = 0.001
-"""Share of right measurements that the gate refuses."""
+"""Share of correct measurements that the gate rejects."""
 
 
 def passes_gate(difference: Array, covariance: Array) -> bool:
-    """Whether a difference (n,) is likely enough for its covariance (n, n)."""
+    """Whether a difference (n,) is consistent with its covariance (n, n)."""
     return float(difference @ np.linalg.solve(covariance, difference)) <= gate(len(difference))
 
 
 @cache
 def gate(n_parts: int) -> float:
-    """Largest normalised innovation squared that is accepted, for a measurement of `n_parts` numbers."""
+    """Largest accepted normalised innovation squared for a measurement of `n_parts` numbers."""
     return float(chi2.isf(GATE_SHARE, n_parts))
 
 
 def updated(state: State, innovation: Array, crossed: Array, spread: Array) -> State:
     """The state after a measurement, without a gate.
 
-    `innovation` (n,) is the measurement minus its prediction, `crossed` (n, N) its covariance with the error state, and
-    `spread` (n, n) its own covariance, including the noise of the measurement.
+    `innovation` (n,) is the measurement minus its prediction. `crossed` (n, N) is the covariance of the innovation with
+    the error state, and `spread` (n, n) is the covariance of the innovation, including measurement noise.
     """
     root = np.linalg.cholesky(spread)
-    # In units in which the parts of the innovation are independent and of deviation 1. The transposes need no copies.
+    # Scale the innovation so that its elements are independent with deviation 1. The transposes need no copies.
     innovation = solve_triangular(root, innovation, lower=True, check_finite=False)
     crossed = dtrsm(1.0, root.T, crossed.T, side=1).T
     covariance = crossed.T @ crossed

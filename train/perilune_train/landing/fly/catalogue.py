@@ -1,4 +1,4 @@
-"""The crater catalogue of a descent: in the site's frame, or by latitude and longitude. It is untrusted input."""
+"""Read the crater catalogue of a descent, in the site frame or by latitude and longitude. It is untrusted input."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ _SETTING = "prior.catalogue_columns"
 _SITE_FRAME: dict[str, Kind] = dict.fromkeys((*CRATER_COLUMNS, *NORMAL_COLUMNS), "number")
 _HEIGHT = "height_m"
 _REACH_M = 200_000.0
-"""Distance from the site up to which craters of a catalogue by latitude and longitude are used, metres."""
+"""Largest distance from the site, metres, at which craters listed by latitude and longitude are used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +29,13 @@ class CatalogueUse:
     """How a catalogue is read."""
 
     position_sigma_m: float
-    """Standard deviation of a crater's position on each axis."""
+    """Standard deviation of a crater's position, per axis, metres."""
     diameter_sigma_share: float
-    """Standard deviation of a crater's diameter, divided by it."""
+    """Standard deviation of a crater's diameter, as a share of the diameter."""
     site_deg: tuple[float, float] | None = None
-    """Latitude and longitude of the site, for catalogues by latitude and longitude."""
+    """Latitude and longitude of the site, degrees; needed for a catalogue by latitude and longitude."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Columns of such a catalogue; empty to recognise them."""
+    """Column names of a catalogue by latitude and longitude; if empty, they are recognised automatically."""
 
 
 def read_catalogue(path: Path, use: CatalogueUse) -> Catalogue:
@@ -69,7 +69,7 @@ def _in_site_frame(columns: Columns, use: CatalogueUse) -> Catalogue:
 
 
 def _by_latitude(path: Path, use: CatalogueUse) -> Catalogue:
-    """Read a catalogue by latitude and longitude; prints how many of its craters are used."""
+    """Read a catalogue by latitude and longitude, and print how many of its craters are used."""
     listed = read_craters(path, _SETTING, use.columns, [_HEIGHT])
     if use.site_deg is None:
         expected = "site_latitude_deg and site_longitude_deg in prior.yaml, since the catalogue has no x_m, y_m, z_m"

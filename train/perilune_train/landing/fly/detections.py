@@ -1,4 +1,4 @@
-"""Craters in the frames of a descent: found by the network of a run or by a function of the user, or from a table."""
+"""Crater detections in the frames of a descent, from the network of a run, a user's function or a table."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,24 +24,24 @@ from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.training.runs import RunFolder
 
 Detect = Callable[[Path], Detections]
-"""Returns the craters in the image of a file. Raises UnreadableFrame if the image cannot be decoded."""
+"""Function that detects the craters in an image file. It raises UnreadableFrame if the image cannot be decoded."""
 Detector = Callable[[NDArray[np.uint8]], ArrayLike | Any]
-"""A function of the user: grey image (height, width) in, craters out; see `by_function`."""
+"""A user's function that takes a grey image (height, width) and returns craters; see `by_function`."""
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 _COLUMNS: dict[str, Kind] = {"image": "text", **dict.fromkeys((*_BOX, "score"), "number")}
 _ROW = ("x", "y", "width", "height", "score")
 _FAR_PX = 1e6
 """Largest coordinate of a box, pixels."""
 _MOST_PER_FRAME = 10_000
-"""Maximum number of craters in a frame. The matching of craters needs some dozens."""
+"""Maximum number of craters in a frame. Matching needs only a few dozen."""
 
 
 class UnreadableFrame(UserError):
-    """An image that cannot be decoded; the flight goes on without its craters."""
+    """An image cannot be decoded. The flight continues without craters from this frame."""
 
 
 def by_network(run: Path) -> Detect:
-    """Find craters with the network of a detect run, at the threshold that the run chose."""
+    """Detect craters with the network of a detect run, at the threshold that the run chose."""
     config, threshold = config_of_run(run), chosen_threshold(run)
     detector = open_detector(RunFolder(run).best, config)
     tiling = replace(Tiling(), scales=tuple(config.evaluation.scales))
@@ -49,7 +49,7 @@ def by_network(run: Path) -> Detect:
 
 
 def by_function(detector: Detector) -> Detect:
-    """Find craters with a function of the user.
+    """Detect craters with a user's function.
 
     It takes a grey image, uint8 (height, width), and returns an array (N, 5) of x, y, width, height, score: the centre
     and the size of the box around the rim, pixels from the outer corner of the first pixel, and a score from 0 to 1.
@@ -62,10 +62,10 @@ def by_function(detector: Detector) -> Detect:
 def by_table(path: Path, frames: list[Path]) -> Detect:
     """Take craters from a CSV or Parquet table with the columns of `detections.parquet` of `detect predict`.
 
-    These are image (the name of the frame's file), x0_px, y0_px, x1_px, y1_px (the box around the rim, pixels from the
+    The columns are image (file name of the frame), x0_px, y0_px, x1_px, y1_px (the box around the rim, pixels from the
     outer corner of the first pixel) and score (0 to 1). A frame without rows has no craters. Raises UserError if the
-    file cannot be read, lacks a column, names another image, or holds a number that is not finite, a box without area,
-    or too many rows of a frame.
+    file cannot be read, lacks a column or names an image that is not in the descent. Also raises UserError on a number
+    that is not finite, a box without area, or too many rows for one frame.
     """
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
@@ -98,7 +98,7 @@ def _grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _checked(found: Any, path: Path) -> Detections:
-    """The craters that a function of the user has returned for an image."""
+    """Check the craters that a user's function has returned for an image."""
     found = getattr(found, "table", found)
     is_table = isinstance(found, pd.DataFrame)
     names, expected = (*_BOX, "score") if is_table else _ROW, f"an array (N, 5) of {', '.join(_ROW)}, or a table"

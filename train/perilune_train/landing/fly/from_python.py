@@ -1,4 +1,4 @@
-"""Fly the filter from Python, with any detector: `perilune.fly`.
+"""Fly the filter from Python with any detector (`perilune.fly`).
 
 estimates = fly("descent", detector=lambda image: my_network(image))
 """
@@ -19,7 +19,7 @@ from perilune_train.shipped.models import shipped_run
 def fly(
     files: DescentFiles | str | PathLike[str], detector: Detector | None = None, out: str | PathLike[str] | None = None
 ) -> pd.DataFrame:
-    """Estimate position, velocity and attitude at each frame of a descent from craters, inertial unit and ranges.
+    """Estimate position, velocity and attitude at each frame from craters, inertial measurements and ranges.
 
     Args:
         files: The files of the descent, or the folder that `perilune-train navigate descent` has written.
@@ -32,10 +32,11 @@ def fly(
     Returns:
         One row per frame: `file`, `time_s`, `status` (tracking, coasting or lost), position and velocity in the frame
         O_L (`x_m`, `velocity_x_mps`, ...), attitude (`rotation_w`, ...), standard deviations (`sigma_x_m`, ...),
-        `n_matched` craters, and with truth.csv the errors (`error_x_m`, ..., `error_attitude_deg`).
+        number of matched craters (`n_matched`) and, if truth.csv exists, errors (`error_x_m`, ...,
+        `error_attitude_deg`).
 
     Raises:
-        UserError: A file is missing or wrong, or the detector returns anything else.
+        UserError: A file is missing or invalid, or the detector returns an invalid value.
 
     Example:
         def detect(image):

@@ -1,4 +1,4 @@
-"""A picture of a flight: path, errors or deviations with bands of three sigma, craters matched."""
+"""Draw a flight: path, position errors with three-sigma bands, and number of matched craters."""
 
 from pathlib import Path
 
@@ -12,11 +12,11 @@ from perilune_train.records.pictures import save_figure
 _STATUS = {"tracking": ("tab:blue", "o"), "coasting": ("tab:orange", "s"), "lost": ("tab:red", "x")}
 
 _START = 3
-"""Frames at the start that do not set the scale of an axis."""
+"""Number of first frames that do not affect the scale of the axes."""
 
 
 def draw_flight(path: Path, estimates: pd.DataFrame) -> None:
-    """Draw the estimates of a flight, one row per frame; with true poses the errors within their bands."""
+    """Draw the estimates of a flight, one row per frame; if true poses are known, also the errors."""
     figure = Figure(figsize=(14, 8), layout="constrained")
     axes = figure.subplots(2, 3)
     for status, (colour, marker) in _STATUS.items():
@@ -41,13 +41,13 @@ def draw_flight(path: Path, estimates: pd.DataFrame) -> None:
 
 
 def draw_band(place: Axes, estimates: pd.DataFrame, axis: str) -> None:
-    """Draw three standard deviations of the position on one axis (x, y or z) and, where it is known, the error."""
+    """Draw three standard deviations of the position on one axis (x, y or z) and, if known, the error."""
     time_s, band = estimates["time_s"], 3 * estimates[f"sigma_{axis}_m"].to_numpy()
     place.fill_between(time_s, -band, band, color="tab:blue", alpha=0.2, linewidth=0, label="3 sigma")
     error = estimates.get(f"error_{axis}_m", pd.Series(0.0, estimates.index)).to_numpy()
     if f"error_{axis}_m" in estimates:
         place.plot(time_s, error, color="black", linewidth=1.5, label="error")
-    # The start is uncertain by far more than the rest of the flight.
+    # The uncertainty at the start is far larger than in the rest of the flight.
     late = slice(min(_START, len(band) - 1), None)
     height = 1.2 * max(float(band[late].max()), float(np.abs(error[late]).max()))
     place.set_ylim(-height, height)

@@ -1,4 +1,4 @@
-"""Fly the filter over the files of one descent and write what it estimates."""
+"""Fly the filter over the files of one descent and write its estimates."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -36,10 +36,10 @@ _NOTHING = Detections(np.zeros((0, 4)), np.zeros(0))
 
 @dataclass(frozen=True, slots=True)
 class DescentFiles:
-    """The files of one descent; `perilune-train navigate descent` writes an example of all of them."""
+    """The files of one descent; `perilune-train navigate descent` writes an example of each."""
 
     frames: Path
-    """Folder of images with frames.csv: file, time_s."""
+    """Folder of images with frames.csv (columns file, time_s)."""
     camera: Path
     """Intrinsics and mounting: camera.yaml."""
     catalogue: Path
@@ -47,15 +47,15 @@ class DescentFiles:
     imu: Path
     """Inertial measurements: imu.csv."""
     prior: Path
-    """Expected state at the first frame, and errors of all that is measured: prior.yaml."""
+    """Expected state at the first frame, and errors of all measurements: prior.yaml."""
     ranges: Path | None = None
     """Ranges of a laser altimeter: ranges.csv."""
     truth: Path | None = None
-    """True poses, for errors beside the estimates: truth.csv."""
+    """True poses, from which errors of the estimates are computed: truth.csv."""
 
     @classmethod
     def of_folder(cls, folder: str | PathLike[str]) -> "DescentFiles":
-        """The files of a folder by their usual names; ranges.csv and truth.csv may be absent."""
+        """The files of a folder under their usual names; ranges.csv and truth.csv may be absent."""
         root = Path(folder)
         needed = (root / name for name in ("frames", "camera.yaml", "catalogue.parquet", "imu.csv", "prior.yaml"))
         optional = (root / name for name in ("ranges.csv", "truth.csv"))
@@ -67,9 +67,9 @@ class Descent:
     """The files of one descent, read and checked."""
 
     camera: CameraRecord
-    """Camera and its mounting."""
+    """Camera intrinsics and mounting."""
     prior: FlightPrior
-    """Expected state at the first frame, and errors of what is measured."""
+    """Expected state at the first frame, and errors of the measurements."""
     frames: FrameFiles
     """Frames and their times."""
     instruments: Instruments
@@ -77,11 +77,11 @@ class Descent:
     catalogue: Catalogue
     """Craters of the landing site."""
     truth: Truth | None
-    """True poses of the frames, where they are known."""
+    """True poses of the frames; None if unknown."""
 
 
 def read_descent(files: DescentFiles) -> Descent:
-    """Read all files of a descent. Raises UserError on the first that is missing or wrong."""
+    """Read all files of a descent. Raises UserError on the first missing or invalid file."""
     record, expected = read_camera(files.camera), read_prior(files.prior)
     craters = read_catalogue(files.catalogue, expected.catalogue_use)
     frames = read_frame_files(files.frames, record.intrinsics())
@@ -101,8 +101,8 @@ def fly_descent(
 ) -> pd.DataFrame:
     """Fly the filter over a descent with the craters that `detect` finds; returns one row per frame.
 
-    Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`, if it is given, or nothing. `tell`
-    receives a line for each frame; `live` is a picture that is drawn again after each.
+    Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`; writes nothing if `out` is None.
+    `tell` receives one line of text per frame. `live` is the path of a picture that is redrawn after every frame.
     """
     rows: list[dict[str, object]] = []
     faults: dict[int, str] = {}
@@ -125,7 +125,7 @@ def fly_descent(
 
 
 def doubts_of(descent: Descent, *, is_lost: bool = False) -> list[str]:
-    """Reasons to doubt the units of the inertial measurements; more of them after a flight that lost its position."""
+    """Reasons to doubt the units of the inertial measurements; a lost flight needs less evidence."""
     mounting, expected = np.array(descent.camera.rotation_camera_from_body), descent.prior
     sigmas = expected.position_sigma_m, expected.velocity_sigma_mps
     prior = Prior(_start(descent), *sigmas, mounting[2], float(descent.frames.time_s[-1]))
@@ -147,7 +147,7 @@ def _lander(descent: Descent) -> Lander:
 
 
 def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
-    """Craters of one frame after the other; a frame that cannot be read has none, and its fault is noted."""
+    """Yield the craters of each frame; an unreadable frame has no craters, and `faults` receives its error message."""
     for number, path in enumerate(descent.frames.paths):
         try:
             found = detect(path)
@@ -157,7 +157,7 @@ def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iter
 
 
 def sightings_of(found: Detections, camera: Camera) -> Sightings:
-    """Detections as the pinhole camera that covers the view would have them; those that no ray reaches are left out."""
+    """Convert detections to the pinhole camera that covers the view; leaves out detections without a valid ray."""
     boxes = np.asarray(found.boxes, np.float64)
     if not any(camera.distortion):
         return Sightings.of_boxes(boxes, found.scores)

@@ -1,4 +1,4 @@
-"""Tables of a descent: frames.csv, imu.csv and ranges.csv, or files of EuRoC and TUM-VI. All are untrusted input."""
+"""Read frames.csv, imu.csv and ranges.csv of a descent, or files of EuRoC and TUM-VI. All are untrusted input."""
 
 import re
 from dataclasses import dataclass
@@ -30,16 +30,16 @@ _EUROC_SAMPLES = (
     tuple(f"{kind}_RS_S_{axis}" for kind in "wa" for axis in "xyz"),
     tuple(f"{kind}_{axis}" for kind in ("omega", "alpha") for axis in "xyz"),
 )
-"""Rates and specific forces in files of EuRoC and TUM-VI, and of Kalibr."""
+"""Column names of rates and specific forces in files of EuRoC and TUM-VI, and in files of Kalibr."""
 _GAP = 5
-"""A distance of samples of more than this many times the median is a gap."""
+"""An interval between samples longer than this many times the median is a gap."""
 _LARGEST_S = 1e11
-"""Above every clock in seconds; milliseconds since 1970 are 1e12."""
+"""Largest valid time in seconds. Times in milliseconds since 1970 are about 1e12 and exceed it."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFiles:
-    """Frames in the order of time."""
+    """Frames in time order."""
 
     paths: list[Path]
     """Image files (n)."""
@@ -48,10 +48,10 @@ class FrameFiles:
 
 
 def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
-    """Read frames.csv of a folder: file, time_s; or data.csv of EuRoC, with its images in the folder data.
+    """Read frames.csv (columns file, time_s) of a folder, or EuRoC's data.csv with the images in the folder data.
 
-    Raises UserError if times do not increase, a file is missing or outside the folder, or an image is not of the
-    camera's size.
+    Raises UserError if times do not increase, a file is missing or outside the folder, or an image differs in size from
+    the camera.
     """
     path = folder / FRAMES_FILE
     if not path.exists() and (folder / _EUROC_FRAMES_FILE).is_file():
@@ -76,7 +76,7 @@ def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
 
 
 def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
-    """Read imu.csv, or samples as of EuRoC, and ranges.csv. Empty values and NaN are missing measurements.
+    """Read imu.csv (or samples in EuRoC's format) and ranges.csv. Empty values and NaN are missing measurements.
 
     Raises UserError on a missing column, a value that is not a number, or times that do not increase.
     """
@@ -88,7 +88,7 @@ def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
 
 
 def read_euroc(path: Path, limits: TableLimits, columns: dict[str, Kind]) -> Columns:
-    """Read columns by their names without units; the header may be a comment."""
+    """Read columns, named without their units; the header may be a comment."""
     names, is_comment = _header(path, limits)
     plain = {name: plain_name(name) for name in names}
     missing = [name for name in columns if name not in plain.values()]
@@ -111,7 +111,7 @@ def column_names(path: Path, limits: TableLimits) -> list[str]:
 
 
 def _header(path: Path, limits: TableLimits) -> tuple[list[str], bool]:
-    """Names of the columns, and whether they are in a comment: one before the first row that begins with a time."""
+    """Names of the columns, and whether they come from a comment that starts with the time column."""
     with open_table(path, limits, header=()) as table:
         first = table.peek()
         for comment in reversed(table.comments):
@@ -137,7 +137,7 @@ def _read_inertial(path: Path) -> Increments:
 
 
 def _of_samples(path: Path, names: tuple[str, ...]) -> Increments:
-    """Means over the intervals between samples at single times, in nanoseconds. Gaps are left out."""
+    """Means over the intervals between samples whose times are in nanoseconds. Gaps are left out."""
     table = read_euroc(path, INERTIAL, {_TIME_NS: "integer", **dict.fromkeys(names, "number")})
     if table.n_rows < 2:
         raise UserError(path, "rows", table.n_rows, "at least two measurements")
@@ -174,7 +174,7 @@ def _increasing(table: Columns) -> Array:
 
 
 def _check_steps(table: Columns, end_s: Array, interval_s: Array) -> None:
-    """Raises UserError if times of measurements have another unit than their intervals."""
+    """Raises UserError if the times of measurements are in a different unit from their intervals."""
     if len(end_s) < 2:
         return
     step, interval = float(np.median(np.diff(end_s))), float(np.median(interval_s))
@@ -185,7 +185,7 @@ def _check_steps(table: Columns, end_s: Array, interval_s: Array) -> None:
 
 
 def unit_of(ratio: float) -> tuple[str, float] | None:
-    """The unit of time that a ratio to seconds suggests, with the number of it in a second."""
+    """The unit of time that a ratio to seconds suggests, and how many of these units make a second."""
     for name, per_s in (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)):
         if per_s / 5 < ratio < 5 * per_s:
             return name, per_s

@@ -1,4 +1,4 @@
-"""truth.csv: true poses of the frames of a descent, for errors beside the estimates."""
+"""Read truth.csv, the true poses of the frames of a descent, and compute the errors of estimates."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ class Truth:
 
 
 def read_truth(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Truth:
-    """Read truth.csv of frames at times (n,), or the poses of the body in a file of EuRoC.
+    """Read truth.csv for frames at times (n,), or the poses of the body in an EuRoC file.
 
     Raises UserError if it has other times or a value that is not a number.
     """
@@ -46,7 +46,7 @@ def read_truth(path: Path, time_s: Array, rotation_camera_from_body: Array) -> T
 
 
 def _of_euroc(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Truth:
-    """Truth between the poses of the inertial unit in a file of EuRoC, whose times are not those of the frames."""
+    """Interpolate the poses of the inertial unit in an EuRoC file at the times of the frames."""
     place, turn = (tuple(f"{kind}_{axis}" for axis in axes) for kind, axes in (("p_RS_R", "xyz"), ("q_RS", "xyzw")))
     table = read_euroc(path, POSES, {"timestamp": "integer", **dict.fromkeys((*place, *turn), "number")})
     own_s = nanoseconds_as_seconds(table)
@@ -61,7 +61,7 @@ def _of_euroc(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Tr
 
 
 def with_errors_of(estimates: pd.DataFrame, truth: Truth | None) -> pd.DataFrame:
-    """Estimates of the first frames with their errors: estimate less truth, O_L, metres, and the angle between both."""
+    """Add errors to estimates of the first frames: position minus truth (metres, O_L) and attitude angle."""
     if truth is None:
         return estimates
     n = len(estimates)

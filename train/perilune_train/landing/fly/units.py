@@ -1,8 +1,9 @@
-"""Compare inertial measurements with the Moon's gravity and the path from the prior; name units that fit better.
+"""Check the units of inertial measurements, and suggest units that fit better.
 
-Each reading of a log is integrated from the prior, without craters. A reading fits if its mean specific force is of the
-order of the Moon's gravity, if the path stays above the ground and below the height that thrust can reach, and if the
-camera keeps the ground in view. This is no proof: a lander in free fall measures no specific force at all.
+A reading is one interpretation of the numbers in a log. Each reading is integrated from the prior, without craters. It
+fits if its mean specific force is of the order of the Moon's gravity, the path stays above the ground and below the
+height that thrust can reach, and the camera keeps the ground in view. A poor fit does not prove that the units are
+wrong: a lander in free fall measures no specific force.
 """
 
 from collections.abc import Iterator
@@ -18,61 +19,61 @@ from perilune_train.landing.filter.propagate import Increments
 from perilune_train.landing.filter.state import State
 
 _MOST_STEPS = 400
-"""Measurements are joined to at most this many steps: a check needs no more."""
+"""Measurements are merged into at most this many steps, which are enough for a check."""
 _LEAST_FORCE, _MOST_FORCE = 0.3, 4.0
-"""Mean specific force upwards of a powered descent, in units of the Moon's gravity."""
+"""Range of the mean upward specific force of a powered descent, in units of the Moon's gravity."""
 _LARGEST_RATE_RADPS = 1.0
 _STEADY_RATE_RADPS = 0.03
-"""Root mean square of the angular rate of a steady descent, at most."""
+"""Largest root mean square of the angular rate, radians per second, in a steady descent."""
 _MOON_MPS2 = float(-gravity_mps2(0.0)[2])
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """The expected state at the first frame, and its errors."""
+    """The expected state at the first frame, its errors, and the geometry needed for the checks."""
 
     state: State
     """Expected state, at the time of the first frame."""
     position_sigma_m: float
-    """Standard deviation of its position."""
+    """Standard deviation of the expected position, metres."""
     velocity_sigma_mps: float
-    """Standard deviation of its velocity."""
+    """Standard deviation of the expected velocity, metres per second."""
     axis_in_body: Array
     """Direction of the camera's axis (3,), O_B."""
     end_s: float
-    """Time of the last frame."""
+    """Time of the last frame, seconds since the first frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """One way to read the numbers of a log."""
+    """One way to interpret the numbers in a log."""
 
     name: str
     """Name of the reading in messages."""
     force: float = 1.0
-    """Factor of the specific forces."""
+    """Factor applied to the specific forces."""
     added_mps2: float = 0.0
-    """Specific force upwards that the log lacks."""
+    """Upward specific force that is missing from the log."""
     rate: float = 1.0
-    """Factor of the angular rates."""
+    """Factor applied to the angular rates."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """The path that a reading of the measurements gives."""
+    """The path that results from a reading of the measurements."""
 
     force_mps2: float
-    """Mean specific force upwards."""
+    """Mean upward specific force."""
     lowest_m: float
-    """Least height."""
+    """Lowest height."""
     climbs: bool
-    """Whether it ends higher than the prior allows without a climb."""
+    """Whether the path ends higher than the prior allows for a descent."""
     leaves_s: float
-    """Time after the first frame at which the camera's axis leaves the ground, or infinity."""
+    """Time after the first frame at which the camera's axis no longer points at the ground, or infinity."""
     rate_radps: float
     """Root mean square of the angular rate."""
     slack_m: float
-    """Height below the ground that the prior's errors explain at the lowest point."""
+    """Depth below the ground that the prior's errors can explain at the lowest point."""
 
     @property
     def has_force(self) -> bool:
@@ -106,9 +107,9 @@ _RATES = (_Reading(""), _Reading("angular rates in degrees per second (times 0.0
 
 
 def doubts(measured: Increments, prior: Prior, *, is_lost: bool) -> list[str]:
-    """Return one text for each doubt about the units of a log.
+    """Describe each doubt about the units of a log in one text.
 
-    With `is_lost` the flight has lost its position, so less evidence is enough.
+    If `is_lost`, the flight has lost its position, and less evidence is enough for a doubt.
     """
     steps = _joined(measured.measured(), prior.state.time_s, prior.end_s)
     if steps is None:
@@ -136,7 +137,7 @@ def doubts(measured: Increments, prior: Prior, *, is_lost: bool) -> list[str]:
 
 
 def _better(steps: Increments, prior: Prior, *, is_unsteady: bool) -> Iterator[str]:
-    """Names of the readings that fit with the fewest changes, those with a force near to the Moon's gravity first."""
+    """Names of the readings that fit with the fewest changes, force closest to the Moon's gravity first."""
     fitting = []
     for force, rate in product(_FORCES, _RATES):
         if not force.name and not rate.name:
@@ -146,14 +147,14 @@ def _better(steps: Increments, prior: Prior, *, is_unsteady: bool) -> Iterator[s
             changes = bool(force.name) + bool(rate.name)
             off = abs(float(np.log(path.force_mps2 / _MOON_MPS2)))
             name = " with ".join(name for name in (force.name, rate.name) if name)
-            # With gravity added any small force fits.
+            # Sort readings with added gravity last: they fit any small force.
             fitting.append((changes, force.added_mps2 > 0, off, name))
     least = min((each[0] for each in fitting), default=0)
     yield from (each[-1] for each in sorted(fitting) if each[0] == least)
 
 
 def _joined(measured: Increments, start_s: float, end_s: float) -> Increments | None:
-    """The measurements between two times, joined to at most _MOST_STEPS; None if there is none."""
+    """The measurements between two times, merged into at most _MOST_STEPS steps; None if there are no measurements."""
     first, behind = np.searchsorted(measured.time_s, [start_s, end_s], side="right")
     if first >= behind:
         return None
@@ -170,7 +171,7 @@ def _joined(measured: Increments, start_s: float, end_s: float) -> Increments | 
 
 
 def _path(steps: Increments, prior: Prior, reading: _Reading) -> _Path:
-    """Integrate a reading of the measurements from the prior."""
+    """Integrate the measurements from the prior, as a reading interprets them."""
     position, velocity = prior.state.position_m, prior.state.velocity_mps
     rotation = prior.state.rotation_site_from_body
     up = np.array([0.0, 0.0, reading.added_mps2])
@@ -195,6 +196,6 @@ def _path(steps: Increments, prior: Prior, reading: _Reading) -> _Path:
     highest_m = prior.state.position_m[2] + rises_m + most_m + 3 * prior.velocity_sigma_mps * elapsed_s
     rate = steps.angular_rate_radps * reading.rate
     rms = float(np.sqrt(np.average((rate**2).sum(axis=1), weights=steps.interval_s)))
-    # The ground is not the plane z = 0.
+    # Allow for terrain: the ground is not exactly the plane z = 0.
     slack += 0.05 * float(prior.state.position_m[2])
     return _Path(force_s / elapsed_s, lowest, bool(position[2] > highest_m), leaves_s, rms, slack)

@@ -1,4 +1,4 @@
-"""Write one descent of a dataset as files for `navigate fly`, with errors in the prior and the catalogue."""
+"""Write one descent of a dataset as files for `navigate fly`, with random errors in the prior and the catalogue."""
 
 from pathlib import Path
 
@@ -45,9 +45,9 @@ def unpack_descent(
 ) -> int:
     """Write the files of a trajectory (scene_id, trajectory_id) to the new folder `out`; returns the number of frames.
 
-    `offset` holds the standard deviations, per axis, of position (m), velocity (m/s) and attitude (degrees) with
-    which the prior is off; catalogue and prior are drawn with the seed. Raises UserError if the dataset has no such
-    trajectory, or no inertial measurements of it.
+    `offset` holds the standard deviations of the prior's errors per axis: position (m), velocity (m/s) and attitude
+    (degrees). `seed` determines the errors of the catalogue and the prior. Raises UserError if the dataset lacks the
+    trajectory or its inertial measurements.
     """
     columns = ["frame_id", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "png_path"]
     frames = dataset.table("frames", columns, *ids).sort_by("time_s")
@@ -112,7 +112,7 @@ def _prior(
     offset: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> dict[str, object]:
-    """Content of prior.yaml: the first frame's true state, changed at random."""
+    """Content of prior.yaml: the true state at the first frame with random errors."""
     off = np.repeat(np.array(offset) * [1, 1, np.radians(1)], 3) * rng.normal(size=9)
     true = Pose(np.array(frames["position_m"][0].as_py()), matrix_from_quaternion(frames["rotation_wxyz"][0].as_py()))
     pose = true.changed(np.concatenate([off[:3], rotation_camera_from_body @ off[6:]]))

@@ -1,4 +1,4 @@
-"""Files of a map: one catalogue per scene, and their stated errors."""
+"""Read and write the files of a map: one catalogue per scene, and the standard deviations of its errors."""
 
 import json
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ class SceneMap:
     score: Array
     """Scores of the craters (N,)."""
     errors: pd.DataFrame
-    """Errors by diameter."""
+    """Errors of the catalogue by diameter."""
     picture: NDArray[np.uint8]
-    """Part of the first image with the mapped craters."""
+    """Centre of the first image, with the mapped craters drawn."""
 
 
 def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
-    """Write <scene_id>.parquet for each scene, and map.json: stated errors, Sun, hash of the ground."""
+    """Write <scene_id>.parquet for each scene, and map.json with stated errors, Sun position and terrain hashes."""
     columns = ["scene_id", "sun_azimuth_deg", "sun_elevation_deg", "content_sha256"]
     by_scene = dataset.table("scenes", columns).to_pandas().set_index("scene_id").to_dict("index")
     scenes = {}
@@ -55,8 +55,8 @@ def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
 def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
     """Read the catalogues that `write_maps` wrote, by scene_id.
 
-    Scenes that only the map or only the dataset has are left out. Raises UserError if map.json or a catalogue is
-    damaged, if map and dataset have no scene in common, or if the ground of a scene differs between them.
+    Scenes that are missing from the map or from the dataset are left out. Raises UserError if map.json or a catalogue
+    is damaged, if map and dataset have no scene in common, or if the terrain of a scene differs between them.
     """
     path, expected = folder / SETTINGS, "the folder of a map, from `perilune-train navigate map`"
     try:
@@ -78,12 +78,12 @@ def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
             raise UserError(
                 path, f"{name}: content_sha256", hashes[name], f"{hash_of_scene[name]}, the ground of the dataset"
             )
-    # Only names of scenes of the dataset become names of files.
+    # Security: only scene names from the dataset are used as file names.
     return {name: read_catalogue(folder / f"{name}.parquet", CatalogueUse(*sigmas[name])) for name in shared}
 
 
 def _sigmas(record: dict[str, float]) -> tuple[float, float]:
-    """Stated standard deviations of position and diameter. Raises ValueError if they are not finite and at least 0."""
+    """Stated standard deviations of position and diameter. Raises ValueError unless they are finite and at least 0."""
     values = float(record["position_sigma_m"]), float(record["diameter_sigma_share"])
     if not all(0 <= value < 1e3 for value in values):
         raise ValueError(f"deviations {values}, expected 0 to 1000")

@@ -1,4 +1,4 @@
-"""Make crater catalogues of the scenes of a survey: detect, match both images, write files, errors and a page."""
+"""Make a crater catalogue of each scene of a survey: detect craters, match both images, and write the results."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -36,23 +36,23 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, ERRORS = "map.md", "errors.parquet"
 TILING = Tiling(scales=(1.0, 0.5, 0.25, 0.125))
-"""Reduced images show large craters: the network knows craters of 2 to 50 px."""
+"""Detect large craters in reduced images, because the network detects craters of 2 to 50 px only."""
 _DIAMETER_SIGMA_SHARE = 0.12
-"""Standard deviation of a mapped diameter, divided by it, on validation scenes of `shipped-nav` with craters of 3 to 20
-m."""
+"""Standard deviation of a mapped diameter as a share of the diameter, measured on validation scenes of `shipped-nav`
+for craters of 3 to 20 m."""
 _LEAST_SIGMA_M = 0.05
 _WINDOW_PX = 1000
 _BOTH, _ONE = (227, 211, 25), (60, 60, 230)
-"""Cyan and red, in OpenCV's order blue, green, red."""
+"""Cyan and red, in OpenCV's channel order (blue, green, red)."""
 PICTURE = "map.png"
 
 
 def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool = False) -> pd.DataFrame:
-    """Make the catalogue of every scene of a survey; returns their errors by diameter.
+    """Make a catalogue of every scene of a survey; returns the errors of the catalogues by diameter.
 
     Writes <scene_id>.parquet for each scene, map.json (stated errors, Sun), errors.parquet, map.md and a picture to the
-    new folder `out`, or nothing. Raises UserError if a scene does not have two frames, or if the detector was fitted to
-    the terrain, unless `allow_overlap`.
+    new folder `out`; writes nothing if it fails. Raises UserError if a scene does not have exactly two frames, or if
+    the detector was fitted to the terrain (unless `allow_overlap`).
     """
     dataset = open_single(address)
     frames = dataset.table("frames").to_pandas().sort_values("frame_id")
@@ -121,7 +121,7 @@ def _scene_map(
 
 
 def _picture(image: NDArray[np.uint8], view: View, both: Matched) -> NDArray[np.uint8]:
-    """The centre of an image with craters detected in both images (cyan) and in this image alone (red)."""
+    """The centre of an image, with craters detected in both images (cyan) and in this image only (red)."""
     first = max((image.shape[0] - _WINDOW_PX) // 2, 0)
     canvas = cv2.cvtColor(image[first : first + _WINDOW_PX, first : first + _WINDOW_PX], cv2.COLOR_GRAY2BGR)
     in_both = np.zeros(len(view.sightings), bool)
@@ -137,7 +137,7 @@ def _picture(image: NDArray[np.uint8], view: View, both: Matched) -> NDArray[np.
 
 
 def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
-    """The page as Markdown."""
+    """The results page as Markdown."""
     lines = ["# Crater map", "", f"Dataset {code_span(dataset.info.name)}, {len(maps)} scenes, two images of each.", ""]
     lines += [
         "Poses of the images are exact. A crater of the map is true if one of the terrain is near: distance in radii,",

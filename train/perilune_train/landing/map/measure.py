@@ -1,4 +1,4 @@
-"""Errors of a crater map, compared with the craters of the terrain."""
+"""Errors of a crater map relative to the craters of the terrain."""
 
 import itertools
 
@@ -10,17 +10,17 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.catalogue import Catalogue
 
 DIAMETERS_M = (3.0, 5.0, 7.0, 10.0, 20.0, 40.0, 100.0, np.inf)
-"""Limits of the bins of diameter, metres."""
+"""Limits of the diameter bins, metres."""
 _CANDIDATES = 12
 _MOST_APART = 0.8
-"""Largest distance between a mapped and a true crater, in radii, plus twice the difference of the logarithms of the
-radii."""
+"""Largest cost of a match between a mapped and a true crater. The cost is their distance in radii of the mapped crater
+plus twice the absolute difference of the logarithms of the radii."""
 
 
 def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFrame:
-    """One row per bin of the diameter: number, share of true craters, share of craters that are mapped, errors.
+    """Return one row per diameter bin: number of mapped craters, share of these that are real, recall and errors.
 
-    `covered_m` (2,) is the largest |x| and |y| of the ground that both images show; craters beyond it do not count as
+    `covered_m` (2,) is the largest |x| and |y| of ground that both images show. Craters outside it do not count as
     missed.
     """
     truth = KDTree(exact.centre_m[:, :2])
@@ -58,5 +58,5 @@ def _mean(values: Array) -> float:
 
 
 def _rms(values: Array) -> float:
-    """Root mean square of all values, so per axis."""
+    """Root mean square of all values, which for vectors is the RMS per axis."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan

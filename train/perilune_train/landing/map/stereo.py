@@ -1,4 +1,4 @@
-"""Craters in space, from detections in two images of known poses."""
+"""Locate craters in space from detections in two images with known poses."""
 
 from dataclasses import dataclass, field
 
@@ -13,26 +13,27 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _CLASSES_PX = (30.0, 12.0, 5.0, 0.0)
-"""Smallest radii of the classes, pixels, largest first. The heights of one class narrow the search for the next."""
+"""Smallest radius of each size class, pixels, largest first. The heights of one class narrow the search for the
+next."""
 _RELIEF_M = 30.0
-"""Standard deviation of heights, metres, before any crater is matched."""
+"""Standard deviation of heights, metres, assumed before any crater is matched."""
 _LEAST_RELIEF_M = 1.0
 _SIZE_SIGMA = 0.15
-"""Standard deviation of the logarithm of the ratio of two radii of one crater."""
+"""Standard deviation of the logarithm of the ratio between two measured radii of one crater."""
 _GATE = 3.0
-"""Largest difference of a match, in standard deviations, on each axis."""
+"""Largest difference between matched craters, in standard deviations, on each axis."""
 _NEIGHBOURS = 16
-"""Number of matched craters whose heights give the height of the ground between them."""
+"""Number of matched craters whose median height is taken as the height of the ground around them."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image of known pose, with its detections."""
+    """One image with known pose, and its detections."""
 
     camera: Camera
     """Intrinsics, without distortion."""
     pose: Pose
-    """Pose."""
+    """Pose of the camera."""
     sightings: Sightings
     """Detected craters (M)."""
 
@@ -43,11 +44,11 @@ class View:
         return np.asarray(towards / -towards[:, 2:])
 
     def place_m(self, height_m: Array) -> Array:
-        """Points (M, 2), O_L, at which the rays have given heights (M,)."""
+        """Points (M, 2), metres, O_L, where the rays reach given heights (M,), metres."""
         return np.asarray(self.pose.position_m[:2] + self.rays[:, :2] * (self.pose.position_m[2] - height_m)[:, None])
 
     def radius_m(self, height_m: Array) -> Array:
-        """Radii (M,), metres, of the craters as level circles at given heights (M,)."""
+        """Radii (M,), metres, of the craters, taken as level circles at given heights (M,), metres."""
         rotation_camera_from_site = self.pose.rotation_camera_from_site
         centres = camera_from_site(
             np.column_stack([self.place_m(height_m), height_m]), self.pose.position_m, rotation_camera_from_site
@@ -61,17 +62,18 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Heights of matched craters."""
+    """The ground surface, estimated from the heights of matched craters."""
 
     place_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    """Points (N, 2), O_L."""
+    """Horizontal positions of the craters (N, 2), metres, O_L."""
     height_m: Array = field(default_factory=lambda: np.zeros(0))
-    """Heights (N,)."""
+    """Heights of the craters (N,), metres."""
     sigma_m: float = _RELIEF_M
-    """Standard deviation of a crater's height from the height of `at`, metres."""
+    """Standard deviation of a crater's height relative to the height that `at` returns, metres."""
 
     def at(self, place_m: Array, without_nearest: bool = False) -> Array:
-        """Heights (M,) of points (M, 2): the median of the nearest craters; 0 while there are too few."""
+        """Heights (M,) of points (M, 2): median of the nearest craters, or of all if there are few; 0 without
+        craters."""
         if len(self.height_m) <= _NEIGHBOURS:
             return np.full(len(place_m), np.median(self.height_m) if len(self.height_m) else 0.0)
         _, near = KDTree(self.place_m).query(place_m, _NEIGHBOURS + without_nearest)
@@ -87,17 +89,17 @@ class Matched:
     second: NDArray[np.intp]
     """Indices (N,) among the sightings of the second view."""
     centre_m: Array
-    """Centres (N, 3), O_L."""
+    """Centres (N, 3), metres, O_L."""
     radius_m: Array
-    """Radii (N,)."""
+    """Radii (N,), metres."""
     apart_m: Array
-    """Horizontal distance (N, 2) between both rays at that height, metres, O_L."""
+    """Horizontal distance (N, 2) between the two rays at the height of the centre, metres, O_L."""
     score: Array
-    """The lower of both scores (N,)."""
+    """The lower score of the two detections (N,)."""
 
 
 def matched(first: View, second: View) -> Matched:
-    """Match the craters of two views and intersect their rays, from the largest craters to the smallest.
+    """Match the craters of two views, largest first, and intersect their rays.
 
     The height of a single small crater is far less accurate than the height of the ground around it, so a crater gets
     the median height of its neighbours.
@@ -105,7 +107,7 @@ def matched(first: View, second: View) -> Matched:
     ground, pairs = Ground(), np.zeros((0, 2), np.intp)
     for number, least_px in enumerate(_CLASSES_PX):
         most_px = _CLASSES_PX[number - 1] if number else np.inf
-        # A crater near the limit of a class may be beyond it in the other view.
+        # A crater near the limit of a class may be on the other side of it in the other view.
         parts = [
             np.flatnonzero(
                 (view.sightings.radius_px >= share * least_px) & (view.sightings.radius_px < most_px / share)
@@ -139,14 +141,14 @@ def matched(first: View, second: View) -> Matched:
 
 
 def _spread(values: Array, chosen: NDArray[np.intp], view: View) -> Array:
-    """The values of some sightings as an array for all sightings; 0 elsewhere."""
+    """Place the values of the chosen sightings in an array for all sightings; 0 elsewhere."""
     every = np.zeros(len(view.sightings))
     every[chosen] = values
     return every
 
 
 def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Ground) -> NDArray[np.intp]:
-    """Pairs (N, 2) of sightings that are nearest to each other in position on the ground and in size."""
+    """Pairs (N, 2) of sightings that are each other's nearest in ground position and size."""
     if not len(parts[0]) or not len(parts[1]):
         return np.zeros((0, 2), np.intp)
     baseline = second.pose.position_m - first.pose.position_m
@@ -176,7 +178,7 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
 
 
 def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
-    """The ground of matched craters, from the heights at which their rays come closest to each other."""
+    """The ground from matched craters, at the heights where the two rays of each crater are closest."""
     start = [view.pose.position_m for view in (first, second)]
     rays = [view.rays[chosen] for view, chosen in zip((first, second), pairs.T, strict=True)]
     # Both rays have z = -1, so their distance is a linear function of the height.

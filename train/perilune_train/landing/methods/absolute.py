@@ -1,4 +1,4 @@
-"""All methods that give a position over ground: fixes of single frames, and the filter."""
+"""Run all methods that estimate a position relative to the site: fixes of single frames, and the filter."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,18 +25,18 @@ _START_DEG, _STAR_TRACKER_DEG = 0.5, 0.02
 
 @dataclass(frozen=True, slots=True)
 class Catalogues:
-    """The catalogues of the scenes of a split, each by scene_id."""
+    """The catalogues of the scenes of a split, by scene_id."""
 
     exact: Mapping[str, Catalogue]
     """Without errors."""
     rough: Mapping[str, Catalogue]
-    """With the errors that a catalogue made from orbit has."""
+    """With the errors of a catalogue made from orbit."""
     mapped: Mapping[str, Catalogue]
-    """Made by the project's own detector from images of an orbiter; may be empty."""
+    """Made by the project's detector from orbiter images; may be empty."""
 
 
 def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, Catalogue]) -> Catalogues:
-    """The catalogues of some scenes. Raises UserError if the map lacks one of them."""
+    """The catalogues of the given scenes. Raises UserError if the map lacks one of them."""
     exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in scene_ids}
     rough = {
         scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(number))
@@ -49,9 +49,9 @@ def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, C
 
 
 def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: Catalogues) -> dict[str, pd.DataFrame]:
-    """Errors of each method, one row per frame; methods without any frame are left out.
+    """Errors of each method, one row per frame; methods that have no frames are left out.
 
-    The filter needs inertial measurements of grade `tactical`; without them there are fixes only.
+    The filter needs inertial measurements of grade `tactical`. Without them only fixes are computed.
     """
     sources = {"": catalogues.rough, ", exact catalogue": catalogues.exact, ", map": catalogues.mapped}
     sources = {name: source for name, source in sources.items() if source}
@@ -69,5 +69,5 @@ def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: C
 
 
 def absolute_summary(method: str, errors: pd.DataFrame) -> dict[str, float]:
-    """The figures of a method, from its rows of `absolute_errors`."""
+    """Metrics of a method, from its table in `absolute_errors`."""
     return fix_summary(errors) if method.startswith(("fix", "lost")) else flight_summary(errors)

@@ -1,4 +1,4 @@
-"""Score poses from craters and the filter on the locked benchmark, by region and with intervals over scenes."""
+"""Score fixes and the filter on the locked benchmark, by region and with intervals over scenes."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,12 +31,12 @@ POSITION = "position_rmse_m"
 def score_landing(
     detector: Path, data: Address, manifests: Address, out: Path, maps: Path | None = None, allow_overlap: bool = False
 ) -> Metrics:
-    """Score fixes, lost-in-space fixes and the filter with a detector; returns the figures.
+    """Score fixes, lost-in-space fixes and the filter with a detector; returns the metrics.
 
-    `maps` has one folder of `navigate map` for each part, named after it; a part without a folder gets no rows for the
-    map. Writes page, figures, the table of all frames and a picture to the new folder `out`, or nothing. Raises
-    UserError if the benchmark is missing or changed, or if the detector was fitted to its terrain, unless
-    `allow_overlap`.
+    `maps` contains one folder from `navigate map` for each part of the benchmark, named after the part. A part without
+    a folder gets no rows for the map. Writes a page, the metrics, a table of all frames and a picture to the new folder
+    `out`; writes nothing if it fails. Raises UserError if the benchmark is missing or changed, or if the detector was
+    fitted to its terrain (unless `allow_overlap`).
     """
     parts = open_parts("nav", data, manifests)
     best = RunFolder(detector).best
@@ -79,14 +79,14 @@ def score_landing(
 
 
 def _mapped(part: Part, maps: Path | None) -> Mapping:
-    """The catalogues that were mapped for a part; empty if there is no map of it."""
+    """The catalogues mapped for a part of the benchmark; empty if the part has no map."""
     if maps is None or not (maps / part.name).is_dir():
         return {}
     return read_maps(maps / part.name, part.dataset)
 
 
 def _spread(method: str, errors: pd.DataFrame) -> Spread:
-    """Spread of the RMSE of position over scenes; for fixes, over the right ones only."""
+    """Spread over scenes of the position RMSE; for fixes, the RMSE of correct fixes only."""
     used = errors[errors["error_px"] < WRONG_PX] if method.startswith(("fix", "lost")) else errors
     used = used.dropna(subset=["error_m"])
     rows, squares = np.arange(len(used)), np.square(used["error_m"].to_numpy())
@@ -100,7 +100,7 @@ def _spread(method: str, errors: pd.DataFrame) -> Spread:
 
 
 def _page(detector: Path, by_method: dict[str, pd.DataFrame], figures: Metrics) -> str:
-    """The page as Markdown."""
+    """The results page as Markdown."""
     lines = ["# Locked benchmark of landing", "", f"Craters by the detector {code_span(detector.resolve().name)}.", ""]
     for name in part_names("nav"):
         n_frames, n_locked = figures.get(f"frames/{name}"), figures.get(f"locked_frames/{name}")

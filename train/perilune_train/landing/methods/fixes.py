@@ -1,4 +1,4 @@
-"""Poses of single frames from craters: with an inaccurate prior, and lost in space."""
+"""Estimate poses of single frames from craters, with an inaccurate prior or lost in space."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -16,15 +16,15 @@ from perilune_train.landing.craters.search import Area
 from perilune_train.landing.methods.seen import SeenDescent
 
 PRIOR_M, PRIOR_DEG = 100.0, 1.0
-"""Standard deviations of the prior on each axis, metres and degrees."""
+"""Standard deviations of the prior's errors per axis, metres and degrees."""
 WRONG_PX = 5.0
-"""Fixes with a larger error, in pixels on the ground, are wrong."""
+"""A fix with a larger error, in pixels on the ground, counts as wrong."""
 LOST_ABOVE_M, LOST_ALTITUDE_SHARE = 800.0, 0.1
-"""Lost in space: smallest altitude, metres, and largest relative error of the known altitude."""
+"""Limits for lost in space: smallest altitude, metres, and largest relative error of the known altitude."""
 
 
 def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames; priors have errors of 100 m and 1 degree (standard deviations) per axis."""
+    """Errors of the fixes of all frames, from priors with random errors of 100 m and 1 degree per axis (1 sigma)."""
     rng, sigma = np.random.default_rng(seed), np.repeat([PRIOR_M, np.radians(PRIOR_DEG)], 3)
     rows = []
     for descent in _followed("fixes", descents):
@@ -37,9 +37,10 @@ def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Cat
 
 
 def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames above 800 m, if only a level camera and the altitude within 10 % are known.
+    """Errors of the lost-in-space fixes of all frames above 800 m.
 
-    Position over the whole catalogue and heading are unknown.
+    The camera is known to be level and the altitude is known to 10 %. The heading is unknown, and so is the position
+    within the catalogue.
     """
     rng, rows = np.random.default_rng(seed), []
     for descent in _followed("lost in space", descents):
@@ -95,13 +96,13 @@ def _row(descent: SeenDescent, true: Pose, located: Located | None, seconds: flo
 
 
 def step_to(pose: Pose, true: Pose) -> Array:
-    """The step (6,) from a pose to the true one: shift in O_L, metres, turn from the left, radians, O_C."""
+    """The step (6,) to the true pose: translation (metres, O_L), then rotation from the left (radians, O_C)."""
     turn = rotation_vectors(true.rotation_camera_from_site @ pose.rotation_camera_from_site.T)
     return np.concatenate([true.position_m - pose.position_m, turn])
 
 
 def fix_summary(fixes: pd.DataFrame) -> dict[str, float]:
-    """Figures of a method: errors of the right fixes, and shares of frames without a fix and with a wrong fix."""
+    """Metrics of a method: errors of correct fixes, and shares of frames without a fix and with a wrong fix."""
     right = fixes[fixes["error_px"] < WRONG_PX]
     return {
         "n_frames": float(len(fixes)),

@@ -1,4 +1,4 @@
-"""The filter over descents: errors at every frame with their stated standard deviations."""
+"""Run the filter over descents; compute its errors at every frame and the standard deviations that it states."""
 
 import time
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
 from perilune_train.landing.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
-"""Standard deviations of position, metres, and velocity, metres per second, at the start, on each axis."""
+"""Standard deviations at the start, per axis, of position (metres) and velocity (metres per second)."""
 BAND = (1.24, 14.45)
-"""Interval that holds the sum of six squared standard normal numbers in 95 % of cases."""
+"""Interval that contains the sum of six squared standard normal numbers with probability 95 %."""
 
 
 def flights(
@@ -35,7 +35,7 @@ def flights(
 ) -> pd.DataFrame:
     """Errors of the filter, or of the smoother, at every frame of all descents.
 
-    The errors of the starts are random; the number of the descent is their seed.
+    The errors at the start are random; the index of the descent is the random seed.
     """
     tables = []
     rotation_camera_from_body, sigmas = mounting_of(dataset), default_sigmas(grade, attitude_deg)
@@ -64,20 +64,20 @@ def mounting_of(dataset: Dataset) -> Array:
 
 
 def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
-    """Standard deviations of the start: `START_M`, `START_MPS`, an attitude, and the biases of a grade."""
+    """Standard deviations at the start: `START_M`, `START_MPS`, the given attitude, and the biases of the grade."""
     return start_sigmas(START_M, START_MPS, attitude_deg, GRADES[grade])
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What the filter assumes at the first frame, and its true error."""
+    """Assumed errors of the filter at the first frame, and the true error."""
 
     grade: InertialGrade
     """Grade of the inertial unit."""
     sigmas: Array
     """Standard deviations (15,) with which the filter starts, see `start_sigmas`."""
     error: Array
-    """Difference (9,) from the true state: position, m, velocity, m/s, both O_L, and attitude, rad, O_B."""
+    """Error (9,) at the start: position (m, O_L), velocity (m/s, O_L) and attitude (rad, O_B)."""
 
 
 def flight(
@@ -88,7 +88,7 @@ def flight(
     start: Start,
     smooth: bool = False,
 ) -> pd.DataFrame:
-    """Errors of the filter at every frame of a descent, or with `smooth` of the smoother, which uses all frames."""
+    """Errors of the filter at every frame of a descent; with `smooth`, of the smoother, which uses all frames."""
     lander = lander_of(descent, rotation_camera_from_body, catalogue, start, smooth)
     estimates = list(fly(lander, instruments, descent.time_s, descent.sightings))
     rows = [row_of(descent, estimate, rotation_camera_from_body) for estimate in estimates]
@@ -117,13 +117,13 @@ def lander_of(
 
 
 def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFrame:
-    """The table of a flight from the rows of its frames."""
+    """The table of a flight, from one row per frame."""
     ids = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
     return pd.DataFrame(rows).assign(**ids, time_s=descent.time_s)
 
 
 def row_of(descent: SeenDescent, estimate: Estimate, rotation_camera_from_body: Array) -> dict[str, object]:
-    """Errors of the filter at a frame."""
+    """Errors of the filter at one frame, as a row of the table."""
     position, rotation_site_from_body = _true(descent, estimate.frame, rotation_camera_from_body)
     covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
     return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation_site_from_body), covariance)
@@ -133,13 +133,13 @@ _POSE = np.r_[POSITION, ATTITUDE]
 
 
 def _true(descent: SeenDescent, frame: int, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """True position and rotation_site_from_body at a frame."""
+    """True position (3,) and rotation_site_from_body (3, 3) at a frame."""
     true = descent.true[frame]
     return true.position_m, true.rotation_camera_from_site.T @ rotation_camera_from_body
 
 
 def _row(altitude_m: float, status: object, error: Array, covariance: Array) -> dict[str, object]:
-    """One row, from the step (6,) to the true pose and its covariance (6, 6)."""
+    """A row of the table, from the step (6,) to the true pose and the covariance (6, 6) of this step."""
     return {
         "altitude_m": altitude_m,
         "status": status,
@@ -156,7 +156,7 @@ def _axes(name: str, values: Array) -> dict[str, float]:
 
 
 def flight_summary(flown: pd.DataFrame) -> dict[str, float]:
-    """Figures of the filter over all frames of all descents."""
+    """Metrics of the filter over all frames of all descents."""
     ends = flown.groupby(["scene_id", "trajectory_id"])["error_m"].last()
     inside = flown["squared"].between(*BAND)
     return {

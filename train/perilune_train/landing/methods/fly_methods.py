@@ -38,13 +38,13 @@ PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png"
 def fly_methods(
     evaluated: EvaluatedSplit, navigator: Path, detector: Path, out: Path, maps: Path | None = None
 ) -> pd.DataFrame:
-    """Fly all methods over a split, with two networks; returns one row per method.
+    """Fly all methods over a split with a navigator and a detector; returns one row per method.
 
-    `navigator` and `detector` are folders of runs, `maps` is the folder of a map from `navigate map`. Writes
+    `navigator` and `detector` are folders of runs; `maps` is the folder of a map from `navigate map`. Writes
     methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
-    pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`, or nothing. Raises
-    UserError if a network was fitted to the terrain of the split and that is not accepted, or if the dataset lacks
-    frames.
+    pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`; writes nothing if
+    it fails. Raises UserError if a network was fitted to the terrain of the split and this is not accepted, or if the
+    dataset lacks frames.
     """
     address, split = evaluated.dataset, evaluated.split
     # Record the commit at the start: the checkout may change during the run.
@@ -112,7 +112,7 @@ def _relative(
 
 
 def _draw_matches(folder: Path, trajectory: Trajectory, descent: SeenDescent, catalogue: Catalogue) -> None:
-    """Draw the first and the last frame of a descent with what is matched."""
+    """Draw the first and the last frame of a descent, with the matched craters."""
     for name, frame in ((PICTURES[2], 0), (PICTURES[3], len(descent.true) - 1)):
         near = PosePrior(descent.true[frame], np.diag(np.square([5.0] * 3 + [0.002] * 3)))
         located = locate(descent.sightings[frame], catalogue, descent.camera, near)

@@ -1,4 +1,4 @@
-"""The page of all methods: what each method knows, its errors, and pictures."""
+"""Write the page of all methods: what each method knows, its errors, and pictures."""
 
 import math
 from collections.abc import Sequence
@@ -65,7 +65,7 @@ def page_of(
     detection_s: float,
     pictures: Sequence[str],
 ) -> str:
-    """The page as Markdown."""
+    """The results page as Markdown."""
     scenes = {descent.ids[0] for descent in descents}
     lines = [
         "# Navigation methods",
@@ -103,7 +103,7 @@ def _table(rows: pd.DataFrame, columns: dict[str, str]) -> list[str]:
 
 
 def cell(key: str, value: float) -> str:
-    """A figure as text, by the name of its column."""
+    """Format a figure as its column requires."""
     if not math.isfinite(value):
         return "-"
     if key == "n_frames":

@@ -1,4 +1,4 @@
-"""Pictures of all methods: errors by altitude, errors of the filter within their bands, craters matched on a frame."""
+"""Draw errors by altitude, filter errors with their bands, and craters matched in a frame."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def draw_by_altitude(path: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 
 def draw_flights(path: Path, flown: pd.DataFrame) -> None:
-    """Draw the errors of the filter along each descent, at most eight of them, within three standard deviations."""
+    """Draw the errors of the filter along at most eight descents, with bands of three standard deviations."""
     groups = list(flown.groupby(["scene_id", "trajectory_id"]))[:_MOST_DESCENTS]
     figure = Figure(figsize=(14, 2.2 * len(groups) + 0.6), layout="constrained")
     axes = figure.subplots(len(groups), 3, squeeze=False, sharex=True)
@@ -68,7 +68,7 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
 def draw_matches(
     path: Path, image: NDArray[np.uint8], descent: SeenDescent, frame: int, catalogue: Catalogue, located: Located
 ) -> None:
-    """Draw a frame: matched (cyan) and unmatched (red) detections, and the catalogue's craters at the pose (yellow)."""
+    """Draw a frame: matched (cyan) and unmatched (red) detections, and the projected catalogue (yellow)."""
     figure = Figure(figsize=(9, 9.4), layout="constrained")
     axis = figure.subplots()
     enlarged = cv2.resize(image, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)

@@ -1,4 +1,4 @@
-"""Descents with the craters that a detector detects in every frame."""
+"""Descents with the craters that a detector finds in every frame."""
 
 import time
 from dataclasses import dataclass
@@ -31,19 +31,19 @@ class SeenDescent:
     camera: Camera
     """Intrinsics, without distortion."""
     time_s: Array
-    """Times of the frames (n,), seconds since the first."""
+    """Times of the frames (n,), seconds since the first frame."""
     true: list[Pose]
     """True poses of the camera (n)."""
     velocity_mps: Array
     """True velocity at the first frame (3,), O_L."""
     level_rotation_camera_from_site: Array
-    """Attitude (3, 3) of the camera on a level lander of heading 0."""
+    """Attitude (3, 3) of the camera when the lander is level with heading 0."""
     sightings: list[Sightings]
     """Detected craters of each frame (n)."""
 
 
 def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
-    """Descents with the craters that the detector of a run detects, and its seconds per frame."""
+    """Descents with the craters that the detector of a run finds, and the detection time, seconds per frame."""
     detector, threshold = open_detector(RunFolder(run).best, config_of_run(run)), chosen_threshold(run)
     descents, seconds = [], 0.0
     n_frames = sum(len(trajectory.images) for trajectory in trajectories)

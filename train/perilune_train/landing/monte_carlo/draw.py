@@ -1,4 +1,4 @@
-"""One draw of a descent: errors of the start and of the inertial unit, and the fault of the scenario."""
+"""Draw random errors for a descent: errors at the start, inertial errors, and the fault of the scenario."""
 
 from dataclasses import dataclass, replace
 
@@ -15,14 +15,14 @@ from perilune_train.landing.monte_carlo.scenario import OUTAGE_S, WRONG_PRIOR_M,
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One draw of a descent."""
+    """One random draw of a descent."""
 
     descent: SeenDescent
-    """The descent, with the detections of the scenario."""
+    """The descent, with detections changed as the scenario requires."""
     instruments: Instruments
-    """Measurements with the drawn inertial errors."""
+    """Measurements with the random inertial errors."""
     start_error: Array
-    """Error of the start (9,), as in `Start.error`."""
+    """Error at the start (9,), as in `Start.error`."""
 
 
 def drawn(
@@ -33,10 +33,11 @@ def drawn(
     scenario: Scenario,
     rng: np.random.Generator,
 ) -> Draw:
-    """Draw a descent.
+    """Draw the random errors of one descent.
 
-    `reference` has inertial measurements whose errors are small compared with those of `grade`; they count as the true
-    motion. Ranges are as recorded. `sigmas` are the stated errors of the start, position, velocity and attitude first.
+    `reference` contains inertial measurements whose errors are small compared with the errors of `grade`, so they are
+    taken as the true motion. Ranges stay as recorded. `sigmas` are the standard deviations at the start; its first nine
+    elements are for position, velocity and attitude.
     """
     start_error = sigmas[:9] * rng.normal(size=9)
     instruments = _measured(reference, grade, rng)
@@ -71,7 +72,7 @@ def _none() -> Sightings:
 
 
 def _with_false(sightings: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
-    """Add a false sighting for each sighting, of the same sizes and scores, anywhere in the image."""
+    """Add a false sighting for each sighting, with equal size and score, at a random position in the image."""
     shuffled = rng.permutation(len(sightings))
     centre = np.concatenate([sightings.centre_px, rng.uniform(0, size_px, (len(sightings), 2))])
     radius = np.concatenate([sightings.radius_px, sightings.radius_px[shuffled]])

@@ -1,4 +1,4 @@
-"""Fly the filter over draws of every descent of a split, in parallel, and write table, page and pictures."""
+"""Fly the filter over random draws of every descent of a split, in parallel; write a table, a page and pictures."""
 
 import os
 import time
@@ -43,11 +43,11 @@ from perilune_train.training.runs import RunFolder, load_weights
 PAGE, TABLE = "monte_carlo.md", "draws.parquet"
 PICTURES = ("errors.png", "consistency.png")
 REFERENCE: InertialGrade = "navigation"
-"""Grade of the inertial measurements that count as the true motion: its errors are smaller than those of `GRADE` by
-factors of 6 (noise of the specific force) to 1000."""
+"""Grade of the inertial measurements that are taken as the true motion. Its errors are smaller than the errors of
+`GRADE` by factors of 6 (noise of the specific force) to 1000."""
 GRADE: InertialGrade = "tactical"
 _TOGETHER = 20
-"""Number of draws of a descent that are flown together."""
+"""Number of draws of a descent that are flown in one batch."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -56,7 +56,7 @@ class Site:
     """One descent and the inputs of its draws."""
 
     descent: SeenDescent
-    """The descent with recorded detections."""
+    """The descent with the detections in its frames."""
     reference: Instruments
     """Inertial measurements of the grade `REFERENCE`, and ranges."""
     catalogue: Catalogue
@@ -65,16 +65,16 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What all draws share."""
+    """Inputs that all draws share."""
 
     sites: list[Site]
     """All descents."""
     rotation_camera_from_body: Array
     """Mounting of the camera (3, 3)."""
     sigmas: Array
-    """Stated errors of the start."""
+    """Standard deviations at the start, as in `Start.sigmas`."""
     scenario: Scenario
-    """What goes wrong."""
+    """The fault that is simulated."""
     seed: int
     """Random seed of all draws."""
 
@@ -84,10 +84,10 @@ def fly_draws(
 ) -> pd.DataFrame:
     """Fly the filter over random draws of every descent of a split; returns a row per draw and frame.
 
-    The detector of the run `detector` runs once over every frame. Writes monte_carlo.md, draws.parquet and pictures to
-    the new folder `out`, or nothing. The result does not depend on the number of workers, by default one per core.
-    Raises UserError if the detector was fitted to the terrain of the split and that is not accepted, or if the dataset
-    lacks frames or inertial measurements.
+    `detector` is the folder of a run; its detector processes every frame once. Writes monte_carlo.md, draws.parquet and
+    pictures to the new folder `out`; writes nothing if it fails. The result does not depend on the number of workers,
+    which is one per core by default. Raises UserError if the detector was fitted to the terrain of the split and this
+    is not accepted, or if the dataset lacks frames or inertial measurements.
     """
     dataset, split = open_single(evaluated.dataset), evaluated.split
     best = RunFolder(detector).best
@@ -113,7 +113,7 @@ def fly_draws(
 
 
 def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> list[Site]:
-    """The descents of a split, after the detector of a run has seen their frames."""
+    """The descents of a split, with the craters that the detector of a run finds in their frames."""
     trajectories = load_split(dataset, split)
     references = {trajectory.ids: _reference(dataset, trajectory.ids, address) for trajectory in trajectories}
     descents, _ = seen_descents(dataset, trajectories, detector)
@@ -124,7 +124,7 @@ def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> 
 
 
 def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Instruments:
-    """Measurements that count as the true motion."""
+    """Measurements that are taken as the true motion."""
     instruments = Instruments.of_trajectory(dataset, ids, REFERENCE)
     if not len(instruments.inertial):
         expected = f"measurements of the grade {REFERENCE} (see the setting dataset.nav.instruments.inertial_grades)"
@@ -135,8 +135,8 @@ def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Inst
 def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFrame]:
     """Fly draws of one descent together.
 
-    Each draw depends on the seed, the number of the descent and the number of the draw; other draws change it by
-    rounding only.
+    Each draw depends on the seed, the number of the descent and the number of the draw. The other draws in the batch
+    change it by rounding errors only.
     """
     site, sigmas = job.sites[number], job.sigmas
     landers, drawn_descents = [], []
@@ -181,11 +181,11 @@ def all_draws(job: Job, draws: int, workers: int) -> list[pd.DataFrame]:
 
 
 def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator[list[pd.DataFrame]]:
-    """Tables in any order."""
+    """Yield the tables of the batches, in any order."""
     if workers == 1:
         yield from (flown_draws(job, *batch) for batch in batches)
         return
-    # spawn: the threads of torch do not survive a fork.
+    # Use spawn, because torch's threads do not survive a fork.
     with _one_thread(), ProcessPoolExecutor(workers, get_context("spawn"), _begin, (job,)) as pool:
         remaining = iter(batches)
         running = {pool.submit(_of_job, *batch) for batch in islice(remaining, 2 * workers)}
@@ -200,8 +200,7 @@ def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Give processes that start inside one thread for linear algebra: threads of several workers slow each other
-    down."""
+    """Start processes with one thread for linear algebra, since threads of several workers slow each other down."""
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:

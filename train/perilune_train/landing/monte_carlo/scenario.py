@@ -1,4 +1,4 @@
-"""What is drawn, and what goes wrong, in the flights of a Monte Carlo run."""
+"""Random draws and fault scenarios of a Monte Carlo run."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +12,7 @@ SCENARIOS: dict[Scenario, str] = {
     "wrong-prior": f"the start is {WRONG_PRIOR_M:g} m off over ground, and states 60 m on each axis",
     "false-detections": "a false detection is added for each detection",
 }
-"""What each scenario is."""
+"""Description of each scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Draws:
     """Random draws of every descent of a Monte Carlo run."""
 
     scenario: Scenario = "nominal"
-    """What goes wrong."""
+    """Name of the fault scenario."""
     count: int = 200
     """Number of draws of each descent."""
     attitude_deg: float = 0.5
