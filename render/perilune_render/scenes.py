@@ -67,10 +67,10 @@ class RenderedFrame:
     image: np.ndarray
     """Grey values, DN (h, w): uint8, or uint16 above 8 bits."""
     depth_m: np.ndarray
-    """Depth along the line of sight of the camera, metres (h, w) float32, infinite for the sky. With a distorting lens
-    it is in the pixels of the pinhole that covers the view."""
+    """Depth along the line of sight of the camera, metres (h, w) float32, infinite for the sky. With lens distortion,
+    it has the pixels of the pinhole camera that covers the view."""
     labels: pd.DataFrame
-    """One row per crater, with the columns of the table `labels`, and with `depth_m` and `diameter_m` of the crater."""
+    """One row per crater, with the columns of the table `labels` and the crater's `depth_m` and `diameter_m`."""
     pose: Pose
     """Pose of the camera."""
 
@@ -91,9 +91,9 @@ class RenderedFrame:
 class Scene:
     """Lunar ground with craters, a Sun and a camera; renders labelled frames from any pose above it.
 
-    Frames are those of `perilune-render serve` for the same settings and poses. The ground is made for the descents of
-    the configuration, up to 1500 m; a pose from which the camera sees farther raises UserError. To see the horizon, set
-    `dataset.scene.horizon=true`. Use a scene in one thread.
+    `perilune-render serve` gives equal frames for equal settings and poses. The ground is made for the descents of the
+    configuration, up to 1500 m; a pose from which the camera sees beyond this ground raises UserError. To see the
+    horizon, set `dataset.scene.horizon=true`. Use a scene in one thread only.
 
         scene = Scene("mare", seed=7, sun_elevation_deg=20)
         scene.render(look_down(altitude_m=800)).plot().save("frame.png")
@@ -112,9 +112,9 @@ class Scene:
         """Generate the ground, which takes seconds, or read it from the cache.
 
         `source` is the name of a terrain (mare, highland, polar) or of a preset, a YAML file of settings, an elevation
-        model, or a dataset or manifest, of which this is the first scene. `settings` are as those of `--set`, for
-        example "dataset.camera.width_px=512". The engine `cycles` needs Blender. Raises UserError if one of these
-        cannot be used.
+        model, or a dataset or manifest, whose first scene is used. `settings` have the form of `--set`, for example
+        "dataset.camera.width_px=512". The engine `cycles` needs Blender. Raises UserError if an argument cannot be
+        used.
         """
         given: dict[str, Any] = {
             "scene.sun_elevation_deg": sun_elevation_deg,
@@ -161,8 +161,8 @@ class Scene:
     def render(self, poses: Pose | Sequence[Pose]) -> RenderedFrame | list[RenderedFrame]:
         """Render and label the frame of a pose, or the list of frames of several poses.
 
-        Frame i of a list has the noise of frame i of a sequence; a single frame has the noise of the first one. Raises
-        UserError for a pose below the ground, or from which the camera sees beyond it.
+        Frame i of a list has the noise of frame i of a sequence; a single frame has the noise of the first frame.
+        Raises UserError for a pose below the ground, or if the camera sees beyond the ground.
         """
         frames = [self._render(pose, index) for index, pose in enumerate(listed(poses))]
         return frames[0] if isinstance(poses, Pose) else frames
@@ -180,7 +180,7 @@ class Scene:
         return RenderedFrame(frame.image, frame.radiance.depth_m, rows, pose)
 
     def close(self) -> None:
-        """Release the engine; the end of a program does so too."""
+        """Release the engine; this also happens at the end of the program."""
         self._simulated.close()
 
     def __enter__(self) -> "Scene":
@@ -200,7 +200,7 @@ class Scene:
 
 
 def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
-    """The settings of a terrain, a preset, a file of settings or an elevation model. Raises UserError on another."""
+    """The settings of a terrain, a preset, a file of settings or an elevation model. Raises UserError otherwise."""
     name, path = str(source), Path(source)
     preset, file, settings_of_name, dem = _BASE, None, TERRAINS.get(name, ()), None
     if name in PRESETS:
@@ -230,7 +230,7 @@ def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
 def _simulation_of(
     dataset: Dataset, sun_azimuth_deg: float | None, sun_elevation_deg: float | None, engine: EngineName
 ) -> SimulatedScene:
-    """The first scene of a dataset, with its ground and settings; the Sun is its own unless another is given."""
+    """The first scene of a dataset, with its ground and settings, and its Sun unless another Sun is given."""
     info, where = dataset.info, dataset.store.at("dataset.json")
     if len(info.recipes) != 1:
         expected = "one recipe; select its scenes with `perilune-manifest subset`"

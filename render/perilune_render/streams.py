@@ -1,4 +1,4 @@
-"""Random streams derived by name from one seed, so that any scene, trajectory or frame can be regenerated alone."""
+"""Random streams derived by name from one seed, so that each scene, trajectory or frame can be regenerated alone."""
 
 import hashlib
 
@@ -17,5 +17,5 @@ def stream(seed: int, *names: object) -> np.random.Generator:
 
 
 def camera_seed(seed: int, camera: str | None) -> int:
-    """Random seed of a camera's frames or sensor: independent for each of several cameras, `seed` for a single one."""
+    """Random seed of a camera's frames or sensor: independent for each camera, `seed` for a single camera."""
     return seed if camera is None else derived_seed(seed, "camera", camera)

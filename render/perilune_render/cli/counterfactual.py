@@ -43,12 +43,12 @@ def counterfactual(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render frames of a dataset again without some craters, or under another Sun, with everything else equal.
+    """Render frames of a dataset again without some craters or with another azimuth of the Sun; all else is equal.
 
-    Frames and craters keep their ids. The table of the removed craters is OUT.removed.parquet. Run the same command
-    again to resume.
+    Frames and craters keep their ids. The removed craters are listed in OUT.removed.parquet. Run the same command again
+    to resume.
     """
-    # Checked before the manifest is read, which takes seconds.
+    # Check before reading the manifest, which takes seconds.
     resolve_over(CounterfactualConfig, "counterfactual", "--sun-azimuth-offset-deg", _sun(sun_azimuth_offset_deg))
     options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     given, store, table = ps.open_dataset(manifest), open_store(out), _table_beside(out)
@@ -96,7 +96,7 @@ def _sun(offset_deg: float) -> dict[str, float]:
 
 
 def _table_beside(out: str) -> tuple[Store, str]:
-    """Return store and name of the table of removed craters, beside the dataset: its folder holds only known files."""
+    """Store and name of the table of removed craters, beside the dataset's folder, which holds only known files."""
     if "://" in out:
         above, _, name = out.rstrip("/").rpartition("/")
     else:

@@ -45,22 +45,22 @@ _UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
 
 @dataclass(frozen=True, slots=True)
 class JobOptions:
-    """Options of a command that renders: with which processes, and which part of the work."""
+    """Options of a command that renders: which processes to use, and which part of the work to do."""
 
     executor: Literal["local", "ray"]
     """Processes on this machine, or actors of Ray."""
     address: str | None
     """Address of a running Ray cluster; None starts Ray on this machine."""
     workers: int | None
-    """Number of worker processes; 0 renders in this process; None for as many as the cores and the memory allow."""
+    """Number of worker processes; 0 renders in this process; None uses as many as cores and memory allow."""
     threads: int | None
     """Number of threads of each process; None divides the cores among the workers."""
     shard: tuple[int, int] | None
     """Number, from 1, and count of shards; None renders all trajectories."""
     finish: bool
-    """Whether only to finish a dataset whose shards are rendered."""
+    """Whether to only finish a dataset whose shards are rendered."""
     dry_run: bool
-    """Whether only to estimate."""
+    """Whether to only estimate time and size."""
 
     @classmethod
     def of(
@@ -73,7 +73,7 @@ class JobOptions:
         finish: bool,
         dry_run: bool,
     ) -> "JobOptions":
-        """Check the options of a command. Raises UserError on a malformed shard or options that exclude each other."""
+        """Check the options of a command. Raises UserError on a malformed shard or on conflicting options."""
         given = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
         if len(given) > 1:
             raise UserError("dataset", "options", " and ".join(given), "one of them")
@@ -150,7 +150,7 @@ def dataset(
         warn_of_size(resolved)
     store, failed = open_store(out if out is not None else f"data/{preset}"), False
     with first_worker(options, resolved) as early:
-        # Importing pyarrow and Numba takes seconds; check the settings first.
+        # Import late: pyarrow and Numba take seconds, and the settings are checked first.
         from perilune_render.jobs.job import Job
         from perilune_render.jobs.run import RenderingFailed
 
@@ -174,7 +174,7 @@ def dataset(
 
 
 def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.AbstractContextManager[Worker | None]":
-    """Start a worker while this process plans the job; yield None if no worker of this machine will render it."""
+    """Start a worker while this process plans the job; yield None if no worker on this machine will render the job."""
     if options.executor != "local" or options.workers == 0 or options.finish:
         return contextlib.nullcontext()
     from perilune_render.jobs.worker import early_worker
@@ -183,14 +183,14 @@ def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.Abst
 
 
 def _made(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
-    """Estimate, render or finish; return the dataset if finished. Raises RenderingFailed if trajectories failed."""
+    """Estimate, render or finish; return a finished dataset. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
     if options.workers is None and options.executor == "local":
         from perilune_render.jobs.local import default_workers
 
         options = replace(options, workers=default_workers(job, options.threads))
-    if options.executor == "local" or options.threads is not None:  # machines of Ray may have other numbers of cores
+    if options.executor == "local" or options.threads is not None:  # Ray's machines may have different core counts
         job = job.with_threads(options.threads, options.workers or 1)
     if options.finish:
         return finish_job(job, out)
@@ -217,7 +217,7 @@ def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker
 
 
 def _kill_processes() -> None:
-    """Kill all child processes; those of Ray would run for another minute."""
+    """Kill all child processes; Ray's processes would otherwise run for another minute."""
     import psutil
 
     for process in psutil.Process().children(recursive=True):

@@ -53,7 +53,7 @@ def config(
         bool, typer.Option("--show/--plain", help="Print meaning, unit and default of each setting, or only values.")
     ] = True,
 ) -> None:
-    """Print every setting as a configuration file to start from."""
+    """Print all settings as a configuration file to start from."""
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(settings or ()))
     answer_page(annotated_yaml("dataset", resolved) if show else to_yaml("dataset", resolved))
 
@@ -76,7 +76,7 @@ def develop(
     ] = None,
     setting: Setting = None,
 ) -> None:
-    """Make a dataset from the EXRs of another one, with another sensor or camera, without Blender."""
+    """Make a dataset from the EXRs of another dataset, with a different sensor or camera, without Blender."""
     from perilune_render.dataset.develop import develop_dataset
 
     with progress_bar() as progress:
@@ -145,7 +145,7 @@ def regenerate(
         Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
     ] = None,
 ) -> None:
-    """Render frames from a manifest alone and compare them with its hashes. Exit code 2 if one differs."""
+    """Render frames from a manifest alone and compare them with its hashes. Exit code 2 if a frame differs."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = ps.open_dataset(manifest)

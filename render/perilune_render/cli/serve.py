@@ -18,7 +18,7 @@ _PORT = 10363
 _NATIVE_PORT = 10364
 _LOOPBACK = "127.0.0.1"
 _OWN = (_LOOPBACK, "::1", "localhost")
-"""Loopback addresses: only this machine reaches them."""
+"""Loopback addresses, which only this machine can reach."""
 _Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
 
 
@@ -55,7 +55,7 @@ def serve(
         typer.Option(min=1, max=2**31, help="Scenes that clients of `perilune_shared.client` may ask for by number."),
     ] = 1,
 ) -> None:
-    """Render images at any pose over one scene, for clients of PANGU's protocol and of `perilune_shared.client`."""
+    """Serve images from any pose over a scene to clients of PANGU's protocol and of `perilune_shared.client`."""
     config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True)
     if config.cameras:
         expected = "none: the server has one dataset.camera"
@@ -112,7 +112,7 @@ def serve(
 
 
 def _start(simulated: "SimulatedScene") -> tuple[int, int, float, "Array", int]:
-    """Width and height, pixels, field of view, radians, Sun and random seed of a new client of PANGU's protocol."""
+    """Width and height, pixels, field of view, radians, Sun and random seed for a new client of PANGU's protocol."""
     import numpy as np
 
     from perilune_render.poses.plan import trajectory_seed

@@ -44,25 +44,25 @@ class CameraConfig(Section):
     focal_length_px: Pixels | None = None
     """Focal length, pixels; null computes it from horizontal_fov_deg."""
     focal_length_y_px: Pixels | None = None
-    """Focal length divided by the pixel height, where pixels are not square; null takes the focal length of x."""
+    """Focal length divided by the pixel height, for pixels that are not square; null takes the focal length along x."""
     principal_x_px: _Point | None = None
-    """Principal point, from the left edge, pixels; null is the image centre."""
+    """Principal point, from the left edge, pixels; null takes the image centre."""
     principal_y_px: _Point | None = None
-    """Principal point, from the top edge, pixels; null is the image centre."""
+    """Principal point, from the top edge, pixels; null takes the image centre."""
     distortion: DistortionConfig = DistortionConfig()
     """Lens distortion."""
 
 
 class MountingConfig(Section):
-    """Where a camera is on the body, and how it is turned; by default it is the lander's camera, dataset.camera."""
+    """Position and attitude of a camera on the body; the default is the pose of the lander's camera, dataset.camera."""
 
     position_in_body_m: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
-    """Centre of projection in O_B, metres."""
+    """Centre of projection in O_B (the axes of the body), metres."""
     turned_deg: tuple[_Angle, _Angle, _Angle] = (0.0, 0.0, 0.0)
-    """Turns of the camera about X_B, then Y_B, then Z_B, from its default attitude: view along -Z_B, image x along X_B,
-    degrees. [15, 0, 0] turns the view towards Y_B."""
+    """Rotations of the camera about X_B, then Y_B, then Z_B, from its default attitude, degrees. The default looks
+    along -Z_B with image x along X_B; [15, 0, 0] turns the view towards Y_B."""
     rotation_camera_from_body_wxyz: tuple[_Cosine, _Cosine, _Cosine, _Cosine] | None = None
-    """Unit quaternion in place of turned_deg; (0, 1, 0, 0) is the default attitude."""
+    """Unit quaternion that replaces turned_deg; (0, 1, 0, 0) is the default attitude."""
 
     @model_validator(mode="after")
     def _one_rotation(self) -> "MountingConfig":
@@ -78,4 +78,4 @@ class MountedCameraConfig(CameraConfig):
     """One of several cameras on the body."""
 
     mounting: MountingConfig = MountingConfig()
-    """Place and attitude on the body."""
+    """Position and attitude on the body."""

@@ -1,4 +1,4 @@
-"""Settings of outputs beside the frames: hazard maps of the scenes, images of a flash lidar."""
+"""Settings of additional outputs: hazard maps of the scenes and images of a flash lidar."""
 
 from typing import Annotated
 
@@ -8,13 +8,13 @@ from perilune_render.config.values import Deviation, Length, Share
 from perilune_shared.config.resolve import Section
 
 _LEAST_PX, _MOST_PX = 3, 100
-"""Smallest and largest footprint, pixels: a plane needs 3, and time grows with the square."""
+"""Smallest and largest footprint, pixels: fitting a plane needs 3, and run time grows with the square."""
 _MOST_SIDE_PX = 2048
 _ROUNDING = 1e-9
 
 
 class HazardConfig(Section):
-    """A map of each scene for a lander of one size: slope, roughness, boulders, shadow, and safe places."""
+    """A hazard map of each scene for a lander of given size: slope, roughness, boulders, shadow, and safe places."""
 
     footprint_m: Length = 10.0
     """Diameter of the lander's footprint, metres."""
@@ -27,9 +27,9 @@ class HazardConfig(Section):
     max_roughness_m: Deviation = 0.5
     """Largest roughness of a safe place, metres."""
     max_boulder_m: Deviation = 0.5
-    """Largest height of a boulder at a safe place, metres."""
+    """Largest boulder height at a safe place, metres."""
     max_shadow_share: Share = 1.0
-    """Largest share of shadow at a safe place; 1 for no limit."""
+    """Largest share of a safe place that may lie in shadow; 1 for no limit."""
     frame_channels: bool = False
     """Whether the EXRs also have the channels slope, roughness, boulder and safe, sampled from the map."""
 
@@ -46,29 +46,29 @@ class HazardConfig(Section):
         return int(self.extent_m / self.pixel_m * (1 + _ROUNDING))
 
     def margin_px(self) -> int:
-        """Ground beyond the map that the footprints at its border cover, pixels."""
+        """Width of the border around the map that footprints at its edge cover, pixels."""
         return int(self.footprint_m / self.pixel_m / 2 * (1 + _ROUNDING))
 
 
 class FlashLidarConfig(Section):
-    """A flash lidar along the camera's axis. It measures the ranges of all its pixels at the time of each frame."""
+    """A flash lidar along the camera's axis, which measures all its pixels at once, at the time of each frame."""
 
     width_px: Annotated[int, Field(ge=1, le=1024)] = 128
     """Image width, pixels."""
     height_px: Annotated[int, Field(ge=1, le=1024)] = 128
     """Image height, pixels."""
     horizontal_fov_deg: Annotated[float, Field(ge=0.1, le=120)] = 20.0
-    """Field of view over the image width, degrees; the principal point is the image centre."""
+    """Horizontal field of view, degrees; the principal point is the image centre."""
     range_sigma_m: Deviation = 0.05
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0
-    """Additional standard deviation of a range, share of the range."""
+    """Standard deviation of a range that is proportional to the range, as a share of it; adds to range_sigma_m."""
     quantisation_m: Deviation = 0.01
     """Step of the ranges, metres; 0 for none."""
     max_range_m: Length = 2000.0
-    """Largest range that is measured, metres."""
+    """Largest range that the lidar measures, metres."""
     threshold_range_m: Length = 1500.0
-    """Distance at which ground of mean albedo, seen along its normal, returns the smallest detectable energy,
+    """Distance at which ground of mean albedo, seen along its normal, returns just enough energy to be detected,
     metres."""
     energy_sigma_share: Annotated[float, Field(ge=0, le=1)] = 0.1
     """Standard deviation of the returned energy, share of the energy."""

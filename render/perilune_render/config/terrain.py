@@ -18,9 +18,9 @@ class CratersConfig(Section):
     surface_age_gyr: Annotated[float, Field(gt=0, le=4.4)] = 3.5
     """Age of the surface, which sets the number of large craters, Gyr."""
     equilibrium: Literal["trask", "minton", "viper", "chang_e_4"] = "chang_e_4"
-    """Equilibrium law: density at which small craters are erased as fast as they form."""
+    """Equilibrium law: the density above which small craters are erased as fast as they form."""
     equilibrium_share: Annotated[Span, Within(0, 100)] = Span(low=0.9, high=1.7)
-    """Density of small craters, as a multiple of the equilibrium law, drawn for each scene."""
+    """Density of small craters, as a multiple of the equilibrium density, drawn for each scene."""
     min_diameter_spacings: Annotated[float, Field(ge=1.5, le=1000)] = 2.2
     """Diameter of the smallest crater, local vertex spacings."""
     max_diameter_m: Annotated[float, Field(gt=0, le=100_000)] = 800.0
@@ -30,11 +30,12 @@ class CratersConfig(Section):
     depth: Literal["stopar", "pike"] = "stopar"
     """Depth law of fresh craters."""
     irregularity: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """Irregularity of outline and rim height; 0 is a circle, at 1 the outline deviates by about 1 % of the radius."""
+    """Irregularity of outline and rim height; 0 gives a circle, and at 1 the outline deviates by about 1 % of the
+    radius."""
     flat_floor_share: Share = 0.15
-    """Share of craters that form with a flat floor, as in thin regolith over rock."""
+    """Share of craters that form with a flat floor, as craters in thin regolith over rock do."""
     secondary_share: Share = 0.08
-    """Share of craters under 30 m that belong to clusters of secondaries."""
+    """Share of craters below 30 m that belong to clusters of secondaries."""
     n_rayed: Annotated[int, Field(ge=0, le=100)] = 4
     """Number of craters with bright rays; the largest fresh craters have them."""
 
@@ -76,9 +77,9 @@ METRES_PER_UNIT = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937, "
 """Units of heights."""
 HeightUnit = Literal["m", "km", "ft", "us-ft", "cm", "mm"]
 SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
-"""Settings of the site in an elevation model, of which one pair or none is set."""
+"""Settings that place the site in an elevation model; one pair or none may be set."""
 FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "vrt_files", "allow_unseen")
-"""Settings for what the file of an elevation model does not state."""
+"""Settings that supply what the file of an elevation model does not state."""
 
 
 RimSource = Literal["catalogue", "measured"]
@@ -92,7 +93,7 @@ class CatalogueColumnsConfig(Section):
     latitude_deg: str | None = None
     """Column of the latitude, degrees."""
     diameter_m: str | None = None
-    """Column of the diameter, metres; exactly one of the four sizes is stated."""
+    """Column of the diameter, metres; set exactly one of the four size columns."""
     diameter_km: str | None = None
     """Column of the diameter, kilometres."""
     radius_m: str | None = None
@@ -109,18 +110,18 @@ class CatalogueColumnsConfig(Section):
 
     @property
     def stated(self) -> dict[str, str]:
-        """The columns that are stated, by what they contain."""
+        """The columns that the configuration states: setting name to column name."""
         values = {name: getattr(self, name) for name in CatalogueColumnsConfig.model_fields}
         return {name: value for name, value in values.items() if value is not None}
 
 
 class ElevationConfig(Section):
-    """Use of an elevation model."""
+    """How an elevation model is used."""
 
     outside: Outside = "procedural"
     """Ground outside the model: procedural with the model's statistics, an error (refuse), or the model mirrored."""
     site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    """Latitude of the landing site, degrees; null, with the other site settings, for the middle of the model."""
+    """Latitude of the landing site, degrees; null, like the other site settings, takes the middle of the model."""
     site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
     """Longitude of the landing site, east positive, degrees."""
     site_column_px: _Place | None = None
@@ -130,9 +131,9 @@ class ElevationConfig(Section):
     height_unit: HeightUnit | None = None
     """Unit of the model's heights; null takes the unit stated in its file, or metres."""
     band: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """Band of the heights, from 1; null takes the only band, or the one that is described as heights."""
+    """Band of the heights, from 1; null takes the only band, or the band that the file describes as heights."""
     nodata: Annotated[float, Field(ge=-1e39, le=1e39)] | None = None
-    """Value of pixels without a height, before scale and offset, in addition to the value that the file declares."""
+    """Value of pixels without a height, before scale and offset, in addition to the nodata value in the file."""
     crs: (
         Annotated[str, Field(max_length=5000, pattern=r"^(?i:(EPSG|ESRI|IAU|IAU_\d{4}):\d+$|\+proj=|[A-Z_]+\[)")] | None
     ) = None
@@ -140,11 +141,12 @@ class ElevationConfig(Section):
     vrt_files: Annotated[list[str], Field(min_length=1, max_length=10_000)] | None = None
     """Files that a model in VRT (GDAL's text that joins rasters) may refer to, as paths from its folder."""
     allow_unseen: bool = False
-    """Whether to accept a model without a height in the ground in view."""
+    """Whether to accept a model that has no heights within the ground in view."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
     """Columns of the catalogue."""
     rims: RimSource = "measured"
-    """Place and size of a catalogue's craters: measured in the model where a rim is found, or as in the catalogue."""
+    """Position and size of a catalogue's craters: measured in the model where a rim is found, or taken from the
+    catalogue."""
 
     @model_validator(mode="after")
     def _one_pair(self) -> "ElevationConfig":
@@ -177,11 +179,11 @@ class TerrainConfig(Section):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing, as a multiple of the smallest ground size of a pixel at each place."""
+    """Vertex spacing, as a multiple of the smallest ground size of a pixel at that point."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
     """Largest number of ground vertices of one mesh (about 450 bytes of memory each). If the ground needs more, each
-    trajectory is rendered with several meshes, each for a band of altitudes; such ground may have ten times as many
-    vertices (70 bytes each while it is generated)."""
+    trajectory is rendered with several meshes, each for a band of altitudes. Such ground may have ten times as many
+    vertices in total (70 bytes each while it is generated)."""
     craters: CratersConfig = CratersConfig()
     """Craters."""
     boulders: BouldersConfig = BouldersConfig()
@@ -189,8 +191,8 @@ class TerrainConfig(Section):
     relief: ReliefConfig = ReliefConfig()
     """Relief."""
     dem: str | None = None
-    """GeoTIFF elevation model to start from, or null."""
+    """GeoTIFF elevation model that the terrain starts from, or null."""
     elevation: ElevationConfig = ElevationConfig()
-    """Use of the elevation model."""
+    """How the elevation model is used."""
     catalogue: str | None = None
     """CSV or Parquet catalogue of the model's craters, which become labels, or null."""

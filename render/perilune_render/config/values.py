@@ -11,7 +11,7 @@ from perilune_shared.config.resolve import Section
 Altitude = Annotated[float, Field(gt=0, le=500_000)]
 """Height above the ground, metres."""
 Length = Annotated[float, Field(gt=0, le=1e6)]
-"""Length of ground, metres."""
+"""Length on the ground, metres."""
 Deviation = Annotated[float, Field(ge=0, le=10_000)]
 """Standard deviation of a length, metres."""
 Seconds = Annotated[float, Field(gt=0, le=100_000)]
@@ -23,13 +23,13 @@ Electrons = Annotated[float, Field(ge=0, le=1e9)]
 Pixels = Annotated[float, Field(gt=0, le=1e6)]
 """Length in an image, pixels."""
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
-"""Number of scenes, trajectories or frames."""
+"""Count of scenes, trajectories or frames."""
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
 @dataclass(frozen=True)
 class Within:
-    """Bounds of both ends of a Span."""
+    """Bounds on both ends of a Span."""
 
     least: float
     """Smallest value of `low`."""
@@ -37,7 +37,7 @@ class Within:
     """Largest value of `high`."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """The schema of a Span, then this check."""
+        """Return the schema of a Span, followed by the check of its bounds."""
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def _check(self, span: "Span") -> "Span":
@@ -47,7 +47,7 @@ class Within:
 
 
 class Span(Section):
-    """Range of a uniform distribution; in a configuration a single number is a range of that one value."""
+    """Range of a uniform distribution; in a configuration a single number gives both ends."""
 
     low: float
     """Smallest value."""

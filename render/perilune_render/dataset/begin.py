@@ -48,7 +48,7 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
 
 
 def camera_records(mounted: MountedCamera) -> tuple[CameraRecord, CameraRecord]:
-    """What dataset.json records of a camera: the camera of the frames, the camera of the EXRs, and the mounting."""
+    """The records of a camera in dataset.json: for the frames and for the EXRs, with the mounting."""
     x, y, z = mounted.position_in_body_m.tolist()
     mounting = mounted.rotation_camera_from_body, (x, y, z)
     return CameraRecord.of(mounted.camera, *mounting), CameraRecord.of(mounted.exr_camera, *mounting)
@@ -56,9 +56,9 @@ def camera_records(mounted: MountedCamera) -> tuple[CameraRecord, CameraRecord]:
 
 @contextlib.contextmanager
 def writing(store: Store) -> Iterator[None]:
-    """Keep other runs from writing a dataset: the lock of a folder, a claim in an object store.
+    """Prevent other runs from writing a dataset, by a lock in a folder or a claim in an object store.
 
-    A finished dataset needs none: it may be on a read-only disk. Raises UserError if another run is writing.
+    A finished dataset is not locked, since it may be on a read-only disk. Raises UserError if another run is writing.
     """
     if is_complete(store):
         yield
@@ -82,7 +82,7 @@ def is_begun(store: Store) -> bool:
     else:
         begun = store.exists(INFO_NAME)
         others = [] if begun else [item.path for item in store.list() if not _is_own(item.path.partition("/")[0])]
-    # Checked last, since another process may be beginning the same dataset; it writes dataset.json first.
+    # Check this last: another process may be starting the same dataset, and it writes dataset.json first.
     begun = store.exists(INFO_NAME)
     if others and not begun:
         expected = "an empty or new folder or address, or a dataset to resume"
@@ -101,7 +101,7 @@ def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
     Raises UserError if the address holds anything else.
     """
     if not is_begun(store):
-        # Another process may begin the same dataset at the same time.
+        # Another process may start the same dataset at the same time.
         with contextlib.suppress(FileExistsError):
             store.write(INFO_NAME, info_bytes(info, store.at(INFO_NAME)))
     existing = open_dataset(store).info
@@ -122,13 +122,13 @@ def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
 
 
 def open_finished(store: Store) -> Dataset:
-    """Open a complete dataset; remove files of a killed run below work/."""
+    """Open a complete dataset; remove the files that a killed run left below work/."""
     remove_work(store)
     return open_dataset(store)
 
 
 def check_code(recipe: Recipe, *, with_dem: bool) -> None:
-    """Raise UserError if this process has other code or libraries than a recipe."""
+    """Raise UserError if code or libraries of this process differ from a recipe."""
     found = all_versions(
         with_dem=with_dem,
         engine=recipe.config.get("render", {}).get("engine", "cycles"),
@@ -141,17 +141,17 @@ def check_code(recipe: Recipe, *, with_dem: bool) -> None:
 
 
 def _compared(recipe: Recipe, name: str) -> object:
-    """One field of a recipe as it is compared on resuming."""
+    """One field of a recipe, in the form that is compared on resuming."""
     return _without_releases(recipe.versions) if name == "versions" else getattr(recipe, name)
 
 
 def _without_releases(versions: dict[str, str]) -> dict[str, str]:
-    """Versions without perilune's release numbers: hashes identify its code."""
+    """Versions without perilune's release numbers: hashes identify the code."""
     return {name: version for name, version in versions.items() if not name.startswith("perilune")}
 
 
 def first_difference(recorded: object, requested: object, path: str = "") -> str:
-    """The first setting, in order of names, in which two trees of plain data differ, with both values."""
+    """The first setting, by name, that differs between two trees of plain data, with both values."""
     if isinstance(recorded, dict) and isinstance(requested, dict):
         for key in sorted({*recorded, *requested}):
             if recorded.get(key) != requested.get(key):

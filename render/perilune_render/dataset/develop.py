@@ -1,7 +1,7 @@
-"""Develop a dataset's frames again from their EXRs, with another sensor or another camera at the same place.
+"""Develop a dataset's frames again from their EXRs, with another sensor, or another camera at the same position.
 
-Nothing is rendered, so Blender is not needed. An interrupted run is resumed as in rendering: a trajectory is finished
-once its commit is written, which comes last.
+Nothing is rendered, so Blender is not needed. An interrupted run resumes as in rendering: a trajectory is finished once
+its commit is written, as the last step.
 """
 
 from dataclasses import asdict, dataclass
@@ -42,20 +42,20 @@ from perilune_shared.storage.store import Address, Store, open_store
 
 @dataclass(frozen=True, slots=True)
 class Renderings:
-    """The engine of a developed trajectory: it reads the EXRs of the source in place of rendering."""
+    """The engine of a developed trajectory: it reads the EXRs of the source instead of rendering."""
 
     camera: Camera
     """Camera of the EXRs."""
     sun: Array
     """Unit vector towards the Sun, O_L (3,)."""
     store: Store
-    """Dataset of the EXRs."""
+    """Dataset that holds the EXRs."""
     paths: dict[int, str]
-    """EXR of each frame, by the random seed with which it was rendered."""
+    """Path of each frame's EXR, by the random seed of its rendering."""
 
     @classmethod
     def of(cls, source: Dataset, frames: pa.Table, seed: int, camera: Camera) -> "Renderings":
-        """The EXRs of one trajectory: its rows of the table frames and its random seed."""
+        """The EXRs of one trajectory, from its rows of the table `frames` and its random seed."""
         rows = frames.to_pylist()
         paths = {recorded_shot(row, seed).render_seed: row["exr_path"] for row in rows}
         return cls(camera, np.array(rows[0]["sun_direction"]), source.store, paths)
@@ -66,14 +66,14 @@ class Renderings:
             return read_radiance(path, (self.camera.width_px, self.camera.height_px))
 
     def render_rows(self, poses: RowPoses, seed: int, approach_deg: int = 0) -> Radiance:
-        """Read the rendering of a random seed; its rows already have their own poses."""
+        """Read the rendering of a random seed; the EXR already has a pose for each row."""
         return self.render(*poses.pose_at(0.0), seed, approach_deg)
 
 
 def develop_dataset(
     source: Dataset, out: Address, progress: Progress, config_file: Path | None = None, settings: tuple[str, ...] = ()
 ) -> Dataset:
-    """Make a dataset at `out` from the EXRs of `source`, with changes to its settings.
+    """Make a dataset at `out` from the EXRs of `source`, with changed settings.
 
     `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only, or the intrinsics in
     `dataset.cameras`. Scenes, craters, boulders and trajectories are copied. With the same camera the labels are copied
@@ -129,7 +129,7 @@ def _develop(
     out: Store,
     progress: Progress,
 ) -> Dataset:
-    """Begin or resume the dataset at `out`; `rig` has the cameras of its PNGs."""
+    """Begin or resume the dataset at `out`; `rig` holds the cameras of its PNGs."""
     info = begin_or_resume(out, info)
     if info.complete:
         return open_finished(out)
@@ -153,7 +153,7 @@ def _develop(
 
 
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
-    """The source's settings with the user's changes, which may concern the sensor and the camera only."""
+    """The source's settings with the user's changes, which may affect only the sensor and the camera."""
     where = str(source.store.at("dataset.json"))
     given = settings_of(source.info.recipe())
     before = resolve_over(DatasetConfig, "dataset", where, given)
@@ -180,7 +180,7 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
 
 
 def _rig(source: Dataset, config: DatasetConfig) -> Rig:
-    """The cameras of the new frames. Raises UserError if the EXRs do not cover the view of one of them."""
+    """The cameras of the new frames. Raises UserError if the EXRs do not cover a camera's view."""
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
     rig = rig_of(config)
@@ -235,7 +235,7 @@ def _develop_trajectory(source: Dataset, out: Store, frame_source: FrameSource, 
 
 
 def _copy_scene(source: Dataset, out: Store, scene_id: str, recipe: Recipe) -> None:
-    """Copy the rows of a scene; the scene's row gets the new recipe, and names no files."""
+    """Copy the rows of a scene; the row in `scenes` gets the new recipe and no files."""
     rows = {name: source.table(name, scene_id=scene_id) for name in OF_SCENE}
     rows["scenes"] = with_column(rows["scenes"], "recipe", [recipe.key] * len(rows["scenes"]))
     for name in (f"{kind}_{column}" for kind in SCENE_FILE_KINDS for column in ("path", "sha256", "bytes")):

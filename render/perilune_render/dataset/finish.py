@@ -1,7 +1,7 @@
 """Finish a dataset: merge the rows of its trajectories, write overview, index and dataset.json, remove work/.
 
-Killed at any moment, the same command finishes it with the same bytes: dataset.json with `complete` comes after all
-that it names, and work/ is removed last.
+If it is killed at any moment, the same command completes the dataset with the same bytes: dataset.json with `complete`
+is written after all files that it names, and work/ is removed last.
 """
 
 from collections import deque
@@ -27,7 +27,7 @@ from perilune_shared.storage.store import Store
 
 _OVERVIEW = "overview.png"
 _SHEET_FRAMES, _FRAMES_PER_CAMERA, _COLUMNS = 12, 3, 6
-"""Of the overview: frames, frames of each camera if there are several, and pictures in a row."""
+"""In the overview: number of frames, number of frames of each of several cameras, and pictures in a row."""
 _AHEAD = 32
 """Number of reads in flight, since each request to an object store takes tens of milliseconds."""
 _Name = TypeVar("_Name")
@@ -60,12 +60,12 @@ def finish(store: Store, info: DatasetInfo, scenes: Iterable[tuple[str, list[str
 
 
 def remove_work(store: Store) -> None:
-    """Remove what is left below work/ in a complete dataset."""
+    """Remove what remains below work/ in a complete dataset."""
     store.delete_below(work.FOLDER)
 
 
 def _read_ahead(read: Callable[[_Name], _Rows], given: Iterable[_Name]) -> Iterator[tuple[_Name, _Rows]]:
-    """Yield what `read` returns for each of `given`, in order; a few calls run at the same time."""
+    """Yield each of `given` with the result of `read`, in order; several calls run at the same time."""
     waiting: deque[tuple[_Name, Future[_Rows]]] = deque()
     with ThreadPoolExecutor(_AHEAD) as readers:
         for each in given:
@@ -78,9 +78,9 @@ def _read_ahead(read: Callable[[_Name], _Rows], given: Iterable[_Name]) -> Itera
 
 
 def overview_png(dataset: Dataset) -> bytes:
-    """One picture of frames from the whole dataset, each also with its labels, visible ones in green.
+    """One picture of frames from the whole dataset, each also with its labels; visible craters are green.
 
-    Several cameras have a row each.
+    With several cameras, each has a row.
     """
     frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path", "camera"]).to_pandas()
     if dataset.info.cameras is None:

@@ -28,7 +28,7 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import sha256_of
 
 _SAME_M = 1e-6
-"""Largest difference of a recorded position from the same draw, metres: rounding on another processor."""
+"""Largest difference of a recorded position from its redrawn value, metres, due to rounding on another processor."""
 _TURN = "angular_velocity_radps"
 _OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "camera")
 
@@ -36,11 +36,11 @@ _OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "r
 def plan_from_manifest(
     manifest: Dataset, dem: Path | None = None, catalogue: Path | None = None
 ) -> tuple[Plan, DatasetConfig, DatasetInfo]:
-    """The plan of a manifest's scenes, trajectories and frames, its settings, and the initial dataset.json.
+    """The plan of a manifest's scenes, trajectories and frames, the settings, and the initial dataset.json.
 
     Names, seeds, poses and splits come from the manifest; `dem` and `catalogue` are the user's copies of the files that
     its recipe names. Raises UserError if the manifest has several recipes (merged from different datasets), if its
-    frames were developed again, or if the elevation model differs.
+    frames were developed from EXRs, or if the elevation model differs.
     """
     info, where = manifest.info, manifest.store.at("dataset.json")
     if len(info.recipes) != 1:
@@ -74,7 +74,7 @@ def plan_from_manifest(
 
 
 def _rig_of_frames(manifest: Dataset, rig: Rig) -> Rig:
-    """The cameras of a rig for which a manifest has frames. Raises UserError if it records others."""
+    """The cameras of a rig for which a manifest has frames. Raises UserError if it records other cameras."""
     info, where = manifest.info, manifest.store.at("dataset.json")
     names = set(manifest.table("frames", ["camera"])["camera"].unique().to_pylist())
     if not names <= rig.keys():
@@ -89,7 +89,7 @@ def _rig_of_frames(manifest: Dataset, rig: Rig) -> Rig:
 
 def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
     dem = Path(config.terrain.dem) if config.terrain.dem is not None else None
-    if dem is None or not dem.is_file():  # reported when it is opened
+    if dem is None or not dem.is_file():  # a missing file is reported when it is opened
         return
     found = f"sha256:{sha256_of(dem)}"
     for expected in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
@@ -99,16 +99,16 @@ def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Recorded(Sequence[TrajectoryPlan]):
-    """The trajectories of a manifest, ordered by scene and name."""
+    """The trajectories of a manifest, ordered by scene and id."""
 
     rows: list[dict[str, Any]]
     """Rows of the table `trajectories`."""
     first: np.ndarray
-    """Index of the first frame of each trajectory, and the number of frames (n_trajectories + 1,)."""
+    """Index of the first frame of each trajectory, then the total number of frames (n_trajectories + 1,)."""
     columns: dict[str, np.ndarray]
     """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
     settings: FlightConfig | None
-    """Settings of the flights, to know the motion between the frames; None if that is not needed."""
+    """Settings of the flights, which give the motion between frames; None if it is not needed."""
     rig: Rig
     """Cameras; needed only with `settings`."""
 
@@ -170,7 +170,8 @@ def _flight(
 ) -> Flight:
     """The flight of a row of the table `trajectories` and the columns of its frames.
 
-    Its motion follows from the recorded seed, unless a position differs: then it was not drawn, or with other settings.
+    The motion follows from the recorded seed, unless a position differs; then the motion was not drawn, or was drawn
+    with other settings.
     """
     position, velocity, acceleration = (
         tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
@@ -184,7 +185,7 @@ def _flight(
 
 
 def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamera | None) -> bool:
-    """Whether a motion of the body passes through the recorded positions of all frames of a camera on it."""
+    """Whether a motion of the body passes through the recorded positions of all frames of a camera on the body."""
     position = columns["position_m"]
     if camera is not None and camera.position_in_body_m.any():
         position = camera.body_position(position, columns["rotation_wxyz"])
@@ -192,7 +193,7 @@ def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamer
 
 
 def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
-    """Numbers of frames with equal hashes, frames with a hash in the manifest, and scenes with other ground."""
+    """Numbers of frames with equal hashes, frames with a hash in the manifest, and scenes with different ground."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))
         for d in (manifest, made)

@@ -1,4 +1,4 @@
-"""Write the manifest of a planned dataset, without frames, to render it later: scenes, trajectories and poses."""
+"""Write the manifest of a planned dataset for later rendering: scenes, trajectories and poses, without frames."""
 
 import pyarrow as pa
 
@@ -21,13 +21,13 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 
 _EMPTY = {name: TABLES[name].empty_table() for name in ("craters", "boulders", "labels")}
-"""Tables that follow from scenes and poses, and that a plan leaves out."""
+"""Tables that a plan leaves out, since they follow from scenes and poses."""
 
 
 def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Address, progress: Progress) -> None:
-    """Write the manifest of the dataset `detect` or `nav`, as planned, into the new folder `out`.
+    """Write the manifest of the planned dataset `detect` or `nav` into the new folder `out`.
 
-    Every scene is generated once, for the hash of its content; nothing is rendered. Raises UserError on invalid
+    Every scene is generated once to compute its content hash; nothing is rendered. Raises UserError on invalid
     settings, or if `out` is not empty.
     """
     plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
@@ -58,11 +58,11 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
 
 
 def write_left_out_frames(manifest: Dataset, out: Address, progress: Progress) -> None:
-    """Write a manifest whose table `frames` was left out, with this table, into the new folder `out`.
+    """Write a manifest whose table `frames` was left out into the new folder `out`, with this table restored.
 
-    Scenes, trajectories and metadata are those of the manifest; poses, splits and times are drawn again by its recipe,
-    without any ground. Raises UserError if the manifest has several recipes, has its frames, or its trajectories are
-    not those of its recipe.
+    Scenes, trajectories and metadata are copied from the manifest; poses, splits and times are drawn again by its
+    recipe, without generating ground. Raises UserError if the manifest has several recipes or already has its frames,
+    or if its trajectories differ from the recipe's trajectories.
     """
     info, where = manifest.info, manifest.store.at("dataset.json")
     if len(info.recipes) != 1:
@@ -90,7 +90,7 @@ def frames_left_out(manifest: Dataset) -> bool:
 
 
 def _frames_of(config: DatasetConfig, plan: Plan, scene: ScenePlan) -> pa.Table:
-    """Rows of the table `frames` of one scene, without what is known only once a frame is rendered."""
+    """Rows of the table `frames` of one scene, without columns that are known only after rendering."""
     wanted = {"png": True, "exr": config.render.exr, "lidar": config.flash_lidar is not None}
     kinds = [kind for kind in IMAGE_KINDS if wanted[kind]]
     frames = []

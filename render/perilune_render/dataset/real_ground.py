@@ -17,9 +17,9 @@ _OUTLINE = (230, 190, 60)
 def real_ground_share(
     scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth_m: np.ndarray
 ) -> float:
-    """Share of a frame's ground pixels that show measured ground of the elevation model; 0 without ground pixels.
+    """Share of a frame's ground pixels that show known ground of the elevation model; 0 without ground pixels.
 
-    depth_m (h, w) is along the camera's axis, infinite where nothing is hit.
+    depth_m (h, w) is along the camera's axis, infinite where no ground is hit.
     """
     hit = np.isfinite(depth_m)
     if not hit.any() or not scene.real.any():
@@ -49,7 +49,7 @@ def draw_outline(
     position_m: Array,
     rotation_camera_from_site: Array,
 ) -> None:
-    """Draw the model's outline (N, 2) on a colour picture of a frame, enlarged by any integer, in place."""
+    """Draw the model's outline (N, 2) on a colour picture of a frame, enlarged by any integer factor, in place."""
     scale = picture.shape[1] / camera.width_px
     height = value_at(scene.height_m.astype(np.float64), scene.grid, outline[:, 0], outline[:, 1])
     pixels = camera.project(camera_from_site(np.column_stack([outline, height]), position_m, rotation_camera_from_site))

@@ -1,7 +1,7 @@
 """Regenerate frames from a manifest alone: seeds, poses and the recorded recipe.
 
-On every processor with AVX2 and FMA a frame is identical byte for byte. On others, rounding may change where a ray hits
-the ground and so change single pixels: frames are then compared within a tolerance.
+On every processor with AVX2 and FMA, a frame is identical byte for byte. On other processors, rounding may change where
+a ray hits the ground and thus single pixels, so frames are compared within a tolerance.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,11 +46,11 @@ from perilune_shared.storage.png import png_header
 from perilune_shared.storage.store import Address, Store, open_store
 
 GREY_TOLERANCE = 2
-"""Largest difference of a pixel within tolerance, grey levels of 255."""
+"""Largest difference of a pixel within tolerance, grey levels on a scale of 255."""
 RELATIVE_TOLERANCE = 1e-3
-"""Largest difference of an EXR value within tolerance, relative, and absolute for values near 0."""
+"""Largest difference of an EXR value within tolerance: relative, or absolute for values near 0."""
 OUTLIERS = 0.001
-"""Share of pixels that may differ by more, where a ray hits another facet."""
+"""Share of pixels that may differ by more, because a ray hits another facet."""
 State = Literal["identical", "within tolerance", "different", "new"]
 _ORDER: tuple[State, ...] = ("identical", "new", "within tolerance", "different")
 
@@ -62,19 +62,19 @@ class Outcome:
     frame_id: str
     """Id in the manifest."""
     png: State
-    """The PNG compared with the manifest's hash, then with the dataset's file; new if the manifest has no hash."""
+    """Result of comparing the PNG with the manifest's hash, then with the dataset's file; new without a hash."""
     exr: State | None
-    """The same comparison for the EXR; None if the frame has none."""
+    """Result for the EXR; None if the frame has no EXR."""
     lidar: State | None
-    """The same comparison for the flash lidar; None if the frame has none."""
+    """Result for the flash lidar image; None if the frame has no such image."""
     same_ground: bool
-    """Whether the content hash of craters and boulders equals the hash in the scene's row."""
+    """Whether the content hash of craters and boulders equals the hash recorded for the scene."""
     png_path: str
     """Address of the new PNG."""
 
     @property
     def state(self) -> State:
-        """The worst of the states of its files."""
+        """The worst state among the frame's files."""
         return max((state for state in (self.png, self.exr, self.lidar) if state is not None), key=_ORDER.index)
 
 
@@ -124,15 +124,15 @@ class _Sources:
     """The user's copies of the files that a recipe names."""
 
     dem: Path | None
-    """Elevation model; None if the recipe names none."""
+    """Elevation model; None if the recipe names no model."""
     catalogue: Path | None
-    """Crater catalogue; None if the recipe names none."""
+    """Crater catalogue; None if the recipe names no catalogue."""
 
 
 def _of_scene(
     dataset: Dataset, scene: dict, rows: list[dict], out: Store, sources: _Sources, advance: Callable[[], object]
 ) -> list[Outcome]:
-    """Regenerate the frames `rows` of a scene into `out`; `advance` is called after each."""
+    """Regenerate the frames `rows` of a scene into `out`; `advance` is called after each frame."""
     where = dataset.store.at("dataset.json")
     recipe = dataset.info.recipes.get(scene["recipe"])
     if recipe is None:
@@ -180,7 +180,7 @@ def _of_scene(
 
 
 def _trajectories(dataset: Dataset, scene_id: str, rows: list[dict]) -> dict[str, dict]:
-    """Rows of the trajectories of a scene by their ids. Raises UserError if a frame of `rows` has none."""
+    """Rows of the trajectories of a scene by their ids. Raises UserError if a frame of `rows` has no trajectory."""
     columns = ["trajectory_id", "seed", "nominal_position_m"]
     recorded = dataset.table("trajectories", columns, scene_id=scene_id).to_pylist()
     trajectories = {row["trajectory_id"]: row for row in recorded}
@@ -192,7 +192,7 @@ def _trajectories(dataset: Dataset, scene_id: str, rows: list[dict]) -> dict[str
 
 
 def _check_cameras(dataset: Dataset, rows: list[dict], rig: Rig) -> None:
-    """Raise UserError if the recorded camera of a frame is not its recipe's."""
+    """Raise UserError if the recorded camera of a frame differs from the recipe's camera."""
     where = dataset.store.at("dataset.json")
     for row in rows:
         if row["camera"] not in rig:
@@ -203,7 +203,7 @@ def _check_cameras(dataset: Dataset, rows: list[dict], rig: Rig) -> None:
 
 
 def _wanted(config: DatasetConfig, rows: list[dict]) -> DatasetConfig:
-    """The settings, without the outputs that no frame of `rows` has."""
+    """The settings without outputs that no frame of `rows` has."""
     has_exrs, has_lidar = (any(row[f"{kind}_path"] is not None for row in rows) for kind in ("exr", "lidar"))
     channels = config.hazard is not None and config.hazard.frame_channels and has_exrs
     hazard, lidar = config.hazard if channels else None, config.flash_lidar if has_lidar else None
@@ -211,7 +211,7 @@ def _wanted(config: DatasetConfig, rows: list[dict]) -> DatasetConfig:
 
 
 def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> DatasetConfig:
-    """The settings of ground and EXRs; for a developed dataset, its settings with the camera of its source."""
+    """The settings of ground and EXRs; for a developed dataset, these include the camera of its source."""
     origin = recipe.developed_from
     if origin is None:
         return config
@@ -225,7 +225,7 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> Data
 
 
 def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Store, new: dict[str, Any]) -> State:
-    """Compare a new file with the recorded hash and, if they differ, with the old file's pixels if it is present."""
+    """Compare a new file with the recorded hash and, if it differs, with the pixels of the old file, if present."""
     if row[f"{kind}_sha256"] is None:
         return "new"
     if new[f"{kind}_sha256"] == row[f"{kind}_sha256"]:
@@ -251,7 +251,7 @@ def _state(outlier_share: float) -> State:
 def png_outlier_share(first: bytes, second: bytes) -> float:
     """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 if their shapes differ."""
     try:
-        # A small file may decompress to any size: compare the headers first.
+        # A small file may decompress to any size, so compare the headers first.
         if png_header(first) != png_header(second):
             return 1.0
     except ValueError:

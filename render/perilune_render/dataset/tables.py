@@ -84,7 +84,7 @@ def scene_tables(
 ) -> dict[str, pa.Table]:
     """Parts of the tables `scenes`, `craters` and `boulders` for one scene.
 
-    `recipe` is the key of its recipe, `files` holds the columns of its files, such as hazard_*.
+    `recipe` is the key of the scene's recipe; `files` holds the columns of the scene's files, such as hazard_*.
     """
     ground = ground_tables(plan.scene_id, scene)
     return {
@@ -129,7 +129,7 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory; `files` has each frame's columns of files and measurements."""
+    """Part of the table `frames` for one trajectory; `files` holds each frame's file and measurement columns."""
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
@@ -156,7 +156,7 @@ def measurement_tables(
 ) -> dict[str, pa.Table]:
     """Parts of the tables `inertial` and `ranges` for one trajectory, without empty parts.
 
-    Without a known motion between the frames there are no measurements; with `at_frames` there is a range for each
+    If the motion between frames is unknown, there are no measurements, except that `at_frames` gives a range for each
     frame.
     """
     motion = trajectory.flight.motion
@@ -185,7 +185,7 @@ def measurement_tables(
 
 
 def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:
-    """The part `table` of the table `frames` with another camera and other files (see `frame_table`)."""
+    """The part `table` of the table `frames` with a different camera and different files (see `frame_table`)."""
     columns = {name: table[name] for name in table.column_names}
     columns |= {name: [getattr(camera, name)] * len(table) for name in _CAMERA}
     renewed = (*_FILES, *(name for name in _OF_LABELS if name in files[0]))

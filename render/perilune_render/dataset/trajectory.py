@@ -23,7 +23,7 @@ from perilune_shared.storage.store import Store
 
 @dataclass(frozen=True, slots=True)
 class SceneSetting:
-    """What all trajectories of a scene share."""
+    """Data shared by all trajectories of a scene."""
 
     scene: Scene
     """Ground, craters and boulders."""
@@ -32,19 +32,19 @@ class SceneSetting:
     instruments: InstrumentsConfig
     """Instruments on the lander."""
     outputs: SceneOutputs = field(default_factory=SceneOutputs)
-    """Outputs beside the frames."""
+    """Additional outputs beside the frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """Rows of a frame whose files are written."""
+    """Table rows of a frame whose files are written."""
 
     row: dict[str, str | int | float | None]
-    """Columns of its files and measurements in the table `frames`."""
+    """Columns of files and measurements in the table `frames`."""
     labels: pa.Table
-    """Its rows of the table `labels`."""
+    """Rows of the table `labels`."""
     is_dark: bool
-    """Whether almost none of its pixels are sunlit."""
+    """Whether almost no pixel of the frame is sunlit."""
 
 
 def render_trajectory(
@@ -95,7 +95,7 @@ def _frames(out: Store, source: FrameSource, trajectory: TrajectoryPlan, of_scen
 
 
 def _labelled(frame_id: str, files: dict[str, str | int], source: FrameSource, frame: Frame, scene: Scene) -> _Written:
-    """Label a frame whose files are written; `files` are their columns."""
+    """Label a frame whose files are written; `files` holds their columns."""
     share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
     labels = source.labels(frame)
     row = {**files, "real_ground_share": share, "n_craters_above_max_radius": labels.n_above}

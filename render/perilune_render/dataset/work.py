@@ -4,8 +4,8 @@
     work/<table>/<scene>.<trajectory>.parquet  frames, labels, inertial, ranges: the rows of a trajectory
     work/index/<scene>.<trajectory>.parquet    commit of a trajectory: its files and rows, with sizes and hashes
 
-The commit is written last: a trajectory is finished once it exists. Until then all is written again, since an attempt
-that was killed may have left any part of it. `finish` merges these files into the tables of the dataset.
+The commit is written last: a trajectory is finished once its commit exists. Before that, everything is written again,
+since a killed attempt may have left any part of it. `finish` merges these files into the tables of the dataset.
 """
 
 import hashlib
@@ -50,13 +50,13 @@ def commit(store: Store, labels: list[pa.Table], frames: pa.Table, measurements:
 
 
 def write_scene(store: Store, scene_id: str, tables: Mapping[str, pa.Table]) -> None:
-    """Write the rows of a scene unless they are written; the table `scenes` comes last.
+    """Write the rows of a scene unless they exist; the table `scenes` is written last.
 
     Raises UserError if the dataset has other craters or boulders in this scene.
     """
     path = _path("scenes", scene_id)
     if store.exists(path):
-        # Compared by content hash, since craters computed on another processor may differ in the last digits.
+        # Compare by content hash, since craters computed on another processor may differ in the last digits.
         recorded, found = (
             rows["content_sha256"].to_pylist() for rows in (Part(store, path, "scenes").read(), tables["scenes"])
         )
@@ -64,7 +64,7 @@ def write_scene(store: Store, scene_id: str, tables: Mapping[str, pa.Table]) -> 
             expected = "the elevation model and catalogue that the dataset was started with"
             raise UserError(store.at(path), "craters", "other craters or boulders", expected)
         return
-    # The scenes row says that a scene is whole, so the other tables must be on the disk before it.
+    # A row in `scenes` says that a scene is complete, so the other tables must be on disk first.
     store.sync([_write(store, table, scene_id, tables[table]).path for table in OF_SCENE[1:]])
     store.sync([_write(store, OF_SCENE[0], scene_id, tables[OF_SCENE[0]]).path])
 
@@ -102,7 +102,7 @@ def _path(table: str, name: str) -> str:
 
 
 def _write(store: Store, table: str, name: str, rows: pa.Table) -> WrittenFile:
-    """Write rows of a table; does not wait until they are on the disk."""
+    """Write rows of a table; does not wait until they are on disk."""
     content = _parquet(stored(table, rows))
     store.replace(_path(table, name), content, durable=False)
     return WrittenFile.of(_path(table, name), content)

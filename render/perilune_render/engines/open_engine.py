@@ -1,4 +1,4 @@
-"""Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays over the height field)."""
+"""Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays cast at the height field)."""
 
 import contextlib
 from contextlib import AbstractContextManager
@@ -22,7 +22,7 @@ def open_engine(
 ) -> AbstractContextManager[Engine]:
     """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L; use it as a context manager.
 
-    The engine `heightfield` builds the surface of the scene unless it is given.
+    The engine `heightfield` builds the surface of the scene unless `surface` is given.
     Raises UserError if the engine cannot be loaded or does not render what the configuration asks for.
     """
     if config.render.engine == "heightfield":
@@ -34,7 +34,7 @@ def open_engine(
         # Importing Blender takes a second, and only this engine needs it.
         from perilune_render.engines.blender.renderer import Renderer
     except ImportError as error:
-        # The module is there, so one of the system's libraries is missing.
+        # The module is installed, so a system library is missing.
         expected = "the X11 libraries that Blender needs; `scripts/system-libraries` lists them"
         raise UserError("configuration", "dataset.render.engine", f"cycles ({error})", expected) from None
 
@@ -42,7 +42,7 @@ def open_engine(
 
 
 def load_engine(name: str) -> None:
-    """Import the libraries of an engine before a scene exists. `open_engine` reports a missing library."""
+    """Import the libraries of an engine before a scene exists. `open_engine` later reports a missing library."""
     with contextlib.suppress(ImportError):
         if name == "heightfield":
             import perilune_render.engines.heightfield.engine

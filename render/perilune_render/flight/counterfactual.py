@@ -1,7 +1,7 @@
 """Plan of a counterfactual: some frames of a dataset, and the craters that are removed from its ground.
 
-The removed craters are far apart, so that all of them can be removed in one rendering: the effect of each is that of
-removing it alone.
+The removed craters are so far apart that all can be removed in one rendering: each removal has the effect it would have
+alone.
 """
 
 from dataclasses import replace
@@ -42,7 +42,7 @@ _N_SIZES, _N_DEPTHS = 3, 2
 
 
 def part_of(plan: Plan, split: str, n_frames: int, sun_azimuth_offset_deg: float = 0.0) -> Plan:
-    """At most `n_frames` frames of each trajectory, evenly spaced over the frames of one split, under a turned Sun.
+    """At most `n_frames` frames of each trajectory, evenly spaced over one split, with the Sun's azimuth offset.
 
     Frames keep their ids, poses and random seeds. Trajectories and scenes without frames in the split are omitted.
     Raises UserError if no frame is in the split.
@@ -88,12 +88,12 @@ def _flight(trajectory: TrajectoryPlan, indices: np.ndarray) -> Flight:
 
 
 def craters_to_remove(manifest: Dataset, plan: Plan, per_scene: int, seed: int) -> pd.DataFrame:
-    """The craters to remove from each scene of a plan, with REMOVED_COLUMNS; fewer than `per_scene` if no more fit.
+    """The craters to remove from each scene of a plan, with REMOVED_COLUMNS; fewer than `per_scene` if not all fit.
 
-    Each crater is visible, by the selection of labels of that name, in at least one planned frame of the manifest. Of
-    each class of diameter (three per scene) and of depth over diameter (two) about equally many are drawn at random, by
-    `seed`. The reaches of two craters do not overlap. Craters of an elevation model are never removed. Raises UserError
-    if the manifest has no labels.
+    Each crater has a label in the selection `visible` in at least one planned frame of the manifest. The random draw by
+    `seed` takes about equal numbers from each class of diameter (three per scene) and of depth over diameter (two). The
+    reaches of two craters do not overlap. Craters of an elevation model are never removed. Raises UserError if the
+    manifest has no labels.
     """
     removed = [pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in REMOVED_COLUMNS.items()})]
     if per_scene > 0:
@@ -123,14 +123,15 @@ def _candidates(manifest: Dataset, plan: Plan) -> pd.DataFrame:
     rows = rows[rows["origin"] != "elevation model"].sort_values(keys)
     radius_m = rows["diameter_m"] / 2
     wear = diffusivity_m2_per_myr(rows["diameter_m"].to_numpy()) * rows["age_myr"] / radius_m**2
-    # Only the largest fresh craters of a scene have rays; which ones is known when the ground is generated.
+    # Only the largest fresh craters of a scene have rays; which craters these are is known only once the ground is
+    # generated.
     may_have_rays = (wear < RAYED_WEAR) & (rows["origin"] == "primary")
     reach_m = np.where(may_have_rays, RAYS_REACH, REACH_RADII) * radius_m
     return rows.assign(depth_ratio=rows["depth_m"] / rows["diameter_m"], reach_m=reach_m)
 
 
 def choose_apart(candidates: pd.DataFrame, n: int, rng: np.random.Generator) -> list[int]:
-    """Positions of at most `n` candidates whose reaches do not overlap, drawn in turn from each class.
+    """Positions of at most `n` candidates whose reaches do not overlap, drawn from each class in turn.
 
     Needs the columns x_m, y_m, reach_m, diameter_m and depth_ratio.
     """
@@ -151,7 +152,7 @@ def choose_apart(candidates: pd.DataFrame, n: int, rng: np.random.Generator) -> 
 
 
 def _classes(diameter_m: np.ndarray, depth_ratio: np.ndarray) -> np.ndarray:
-    """Class (N,) of each crater: equally many of each class of diameter, and in it of each class of depth ratio."""
+    """Class (N,) of each crater: equal numbers in each class of diameter and, within it, of depth ratio."""
     classes = _N_DEPTHS * _ranked(diameter_m, _N_SIZES)
     for size in np.unique(classes):
         in_class = classes == size

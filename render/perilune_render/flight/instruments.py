@@ -1,8 +1,8 @@
 """Simulated instruments: an inertial unit, and a laser altimeter that looks along the camera's axis.
 
-An inertial measurement is the mean over its interval of the angular rate and of the specific force (acceleration
-without gravity), in the body's axes: the increments of a strapdown unit, divided by the interval. Each axis adds a bias
-and white noise to the true value. The bias is drawn once for each trajectory and then walks. Scale factors,
+An inertial measurement holds the angular rate and the specific force (acceleration without gravity) in the body's axes,
+averaged over an interval: the increments of a strapdown unit divided by the interval. Each axis adds a bias and white
+noise to the true value. The bias is drawn once for each trajectory and then follows a random walk. Scale factors,
 misalignment and quantisation are not simulated.
 """
 
@@ -23,9 +23,9 @@ from perilune_shared.geometry.inertial_errors import drawn_errors
 from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 
 _MOST_STEPS = 50
-"""Largest number of steps by which a range is found."""
+"""Largest number of iterations to find a range."""
 _TOLERANCE_M = 1e-3
-"""Change of a range in one step below which it has converged, metres."""
+"""Change in one iteration below which a range has converged, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +43,10 @@ class Increments:
 
 
 def true_increments(motion: Motion, rate_hz: float) -> Increments:
-    """Increments without errors, `rate_hz` of them per second; the last interval may be shorter.
+    """Increments without errors at a rate of `rate_hz` per second; the last interval may be shorter.
 
-    Turned by the angular rate for the interval, the attitude at its start is exactly that at its end. The specific
-    force is integrated by Simpson's rule.
+    Rotating the attitude at the start of an interval by the angular rate times the interval gives exactly the attitude
+    at its end. The specific force is integrated by Simpson's rule.
     """
     duration_s = motion.nominal.duration_s
     time = np.arange(int(np.ceil(duration_s * rate_hz - 1e-9)) + 1) / rate_hz
@@ -63,7 +63,7 @@ def true_increments(motion: Motion, rate_hz: float) -> Increments:
 
 
 def measured(true: Increments, grade: InertialGrade, seed: int) -> Increments:
-    """The increments as a unit of this grade measures them on the trajectory of a random seed."""
+    """The increments as measured by an inertial unit of this grade, with the random seed of a trajectory."""
     gyro, accelerometer = drawn_errors(GRADES[grade], true.interval_s, stream(seed, "inertial", grade))
     rate, force = true.angular_rate_radps + gyro, true.specific_force_mps2 + accelerometer
     return Increments(true.time_s, true.interval_s, rate, force)
@@ -80,7 +80,7 @@ class Ranges:
 
 
 def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, duration_s: float, seed: int) -> Ranges:
-    """Simulate the ranges of a trajectory with this random seed. The beam passes through boulders."""
+    """Simulate the ranges along a trajectory with this random seed. The beam ignores boulders."""
     time = np.arange(int(np.floor(duration_s * config.range_rate_hz + 1e-9)) + 1) / config.range_rate_hz
     beam = -motion.rotation_site_from_body_at(time)[:, :, 2]
     true_m = range_to_ground_m(scene, motion.path_at(time)[0], beam)
@@ -91,10 +91,10 @@ def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, dura
 def measure_ranges_of_frames(
     flight: Flight, frame_index: Sequence[int], scene: Scene, config: InstrumentsConfig, seed: int
 ) -> Ranges:
-    """Simulate one range at each frame of a flight, given its random seed; the beam is the axis of the camera."""
+    """Simulate one range at each frame of a flight, with its random seed; the beam is along the axis of the camera."""
     true_m = range_to_ground_m(scene, flight.position_m, flight.rotation_camera_from_site[:, 2])
     sigma_m = config.range_sigma_m + config.range_sigma_share * true_m
-    # Each frame has its own stream, so that parts of one trajectory in several scenes have different noise.
+    # Each frame has a random stream of its own, so that parts of one trajectory in several scenes have different noise.
     noise = np.array([stream(seed, "range", index).normal() for index in frame_index])
     return Ranges(flight.time_s, true_m + sigma_m * noise)
 
@@ -102,8 +102,8 @@ def measure_ranges_of_frames(
 def range_to_ground_m(scene: Scene, position_m: Array, direction: Array) -> Array:
     """Distances (N,) from positions (N, 3) along unit vectors (N, 3), O_L, to the ground, metres.
 
-    Iterates: the height of the ground where the ray was last gives the next distance. It converges where the ground is
-    less steep than the ray; elsewhere, and beyond the terrain, the distance is NaN.
+    Each iteration computes the distance from the height of the ground below the last point of the ray. It converges
+    where the ground is less steep than the ray; elsewhere, and beyond the terrain, the distance is NaN.
     """
     x, y, z = position_m.T
     dx, dy, dz = direction.T

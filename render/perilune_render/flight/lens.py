@@ -7,14 +7,14 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 
 _LARGEST_COVER = 9
-"""Largest ratio of rendered pixels to the camera's pixels."""
+"""Largest number of rendered pixels, as a multiple of the camera's pixels."""
 
 
 def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
     """The camera of a configuration's section. Raises UserError if its distortion is too strong.
 
-    Too strong means that it folds back within the image, or that the pinhole that covers the view has more than
-    _LARGEST_COVER times the camera's pixels.
+    It is too strong if the distorted image folds back on itself, or if the pinhole camera that covers the view has more
+    than _LARGEST_COVER times the camera's pixels.
     """
     width, height, lens = config.width_px, config.height_px, config.distortion
     focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)

@@ -13,10 +13,10 @@ from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 _N_WAVES = 256
-"""Random waves of each smooth process."""
+"""Number of random waves in each smooth process."""
 _MOST_DRAWS = 1000
 _STEP = 2 * np.pi / 20
-"""Step at which the acceleration of a draw is checked, radians of its fastest wave."""
+"""Time step of the check of a draw's acceleration, radians of its fastest wave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +24,8 @@ class SmoothProcess:
     """A draw of K independent stationary processes of unit variance with the kernel exp(-dt^2 / (2 tau^2)).
 
     It is a sum of random waves (random Fourier features, Rahimi & Recht 2007), 256 for each process. Unlike samples
-    from a Cholesky factor it is smooth at any frame rate, and its derivatives are exact. With the finite number of
-    waves the variance of one draw is within about 5 % of the kernel's.
+    from a Cholesky factor, the sum is smooth at any frame rate, and its derivatives are exact. Since the number of
+    waves is finite, the variance of one draw deviates from the kernel's by up to about 5 %.
     """
 
     omega_radps: Array
@@ -41,11 +41,11 @@ class SmoothProcess:
         return cls(omega, rng.normal(size=(2, len(tau), _N_WAVES)) / np.sqrt(_N_WAVES))
 
     def part(self, axes: slice) -> "SmoothProcess":
-        """Some of the processes."""
+        """A selection of the processes."""
         return SmoothProcess(self.omega_radps[axes], self.amplitude[:, axes])
 
     def at(self, time_s: Array) -> tuple[Array, Array, Array]:
-        """Values (N, K), first derivatives, per second, and second derivatives, per second squared, at times (N,)."""
+        """Values (N, K), first derivatives (per second) and second derivatives (per second squared) at times (N,)."""
         angle = np.asarray(time_s)[:, None, None] * self.omega_radps
         cos, sin = np.cos(angle), np.sin(angle)
         waves = self.amplitude[0] * cos + self.amplitude[1] * sin
@@ -86,29 +86,29 @@ class Motion:
         )
 
     def largest_perturbation_mps2(self) -> float:
-        """Largest acceleration by the perturbation from first to last frame, metres per second squared.
+        """Largest acceleration of the perturbation between the first and the last frame, metres per second squared.
 
-        Taken at 20 or more steps in the period of every wave.
+        Evaluated at 20 or more steps in the period of each wave.
         """
         step_s = _STEP / np.abs(self.position_process.omega_radps).max()
         _, _, second = self.position_process.at(np.arange(0, self.nominal.duration_s, step_s))
         return float(self.position_sigma_m * np.linalg.norm(second, axis=1).max())
 
     def rotation_site_from_body_at(self, time_s: Array) -> Array:
-        """Rotations (N, 3, 3) at times (N,)."""
+        """Rotations from O_B to O_L (N, 3, 3) at times (N,)."""
         tilt = self.attitude_sigma_rad * self.attitude_process.at(time_s)[0]
         return np.stack([matrix_from_rotation_vector(v) for v in tilt])
 
     def rotation_camera_from_site_at(self, time_s: Array) -> Array:
-        """Rotations (N, 3, 3) at times (N,)."""
+        """Rotations from O_L to O_C (N, 3, 3) at times (N,)."""
         return np.stack([ROTATION_CAMERA_FROM_BODY @ r.T for r in self.rotation_site_from_body_at(time_s)])
 
 
 def draw_motion(config: FlightConfig, seed: int) -> Motion:
     """Draw the motion of a random seed.
 
-    With `max_perturbation_mps2`, motions are drawn until the acceleration of the perturbation is nowhere above it.
-    Raises UserError if none of a thousand draws is.
+    With `max_perturbation_mps2`, motions are drawn until the acceleration of the perturbation never exceeds this limit.
+    Raises UserError if all of a thousand draws exceed it.
     """
     rng = stream(seed, "flight")
     azimuth = rng.uniform(config.azimuth_deg.low, config.azimuth_deg.high)

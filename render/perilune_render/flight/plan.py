@@ -1,8 +1,8 @@
 """The plan: every scene, trajectory and frame of a dataset, fixed before rendering.
 
 The plan depends on the configuration alone. A scene is planned as a seed, which determines its craters and boulders
-(`perilune_render.terrain.scene.grow_scene`). The trajectories of a scene are derived from its seed when they are asked
-for, and a flight is drawn when it is first used, so that the plan of many millions of frames is made in seconds.
+(`perilune_render.terrain.scene.grow_scene`). The trajectories of a scene are derived from its seed on demand, and a
+flight is drawn at its first use, so that a plan of many millions of frames is made in seconds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,7 +47,7 @@ class TrajectoryPlan:
     """One trajectory."""
 
     scene_id: str
-    """Scene it belongs to."""
+    """Id of its scene."""
     trajectory_id: str
     """Unique in its scene."""
     seed: int
@@ -57,17 +57,18 @@ class TrajectoryPlan:
     splits: tuple[str, ...]
     """Split of each frame."""
     draw_flight: Callable[[], Flight]
-    """Returns the flight."""
+    """Draws and returns the flight."""
     is_drawn: bool = True
-    """Whether the flight follows from the seed; otherwise it is recorded in a manifest."""
+    """Whether the flight follows from the seed; otherwise it is read from a manifest."""
     camera: str | None = None
-    """Name of its camera, one of several on the body; None if the body has one without a name."""
+    """Name of the camera if the body has several; None for a single camera without a name."""
     origin: Callable[[int], str] | None = None
-    """Returns the place in a user's file of the pose at an index of `frame_index`, for messages; None for none."""
+    """Function from an index of `frame_index` to the pose's location in a user's file, for messages; None without a
+    file."""
 
     @cached_property
     def flight(self) -> Flight:
-        """True motion of the camera, drawn when it is first used."""
+        """True motion of the camera, drawn at its first use."""
         return self.draw_flight()
 
     def frame_id(self, index: int) -> str:
@@ -85,15 +86,15 @@ class Plan:
     """A dataset before rendering."""
 
     rig: Rig
-    """Cameras by name. Each trajectory is of one of them: a descent seen by two is two trajectories."""
+    """Cameras by name. Each trajectory belongs to one camera: a descent seen by two cameras makes two trajectories."""
     view: ViewEnvelope
-    """The views that the mesh of every scene is made for."""
+    """The views for which the mesh of every scene is made."""
     scenes: tuple[ScenePlan, ...]
     """All scenes."""
     trajectories: Sequence[TrajectoryPlan]
-    """All trajectories, in the order of their scenes. A drawn plan makes a trajectory anew at each access."""
+    """All trajectories, in the order of their scenes. A drawn plan builds a trajectory at each access."""
     ranges: Mapping[str, range]
-    """Indices in `trajectories` of the trajectories of each scene, by its id."""
+    """For each scene id, the indices of its trajectories in `trajectories`."""
 
     @property
     def first(self) -> MountedCamera:
@@ -111,7 +112,7 @@ class Plan:
         return self.first.exr_camera
 
     def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
-        """The trajectories of one scene; none if the plan has no such scene."""
+        """The trajectories of one scene; empty if the plan has no such scene."""
         return [self.trajectories[index] for index in self.ranges.get(scene_id, ())]
 
 
@@ -137,7 +138,7 @@ class _Drawn(Sequence[TrajectoryPlan]):
         """The trajectory at an index, or the trajectories of a slice as a tuple."""
         if isinstance(index, slice):
             return tuple(self[k] for k in range(*index.indices(len(self))))
-        # All descents of one camera come first: an engine is opened once for each camera of a scene.
+        # The descents are grouped by camera, so that each camera of a scene opens only one engine.
         nth, t = divmod(range(len(self))[index], self.settings.trajectories_per_scene)
         s, c = divmod(nth, len(self.rig))
         scene, n_frames = self.scenes[s], self.settings.n_frames
@@ -149,7 +150,7 @@ class _Drawn(Sequence[TrajectoryPlan]):
 
 
 def seen_by(body: TrajectoryPlan, name: str | None, rig: Rig) -> TrajectoryPlan:
-    """The trajectory of a camera on a body; the same one for a camera without a name."""
+    """The trajectory of a camera on a body; unchanged for a camera without a name."""
     if name is None:
         return body
     trajectory_id = trajectory_of_camera(name, body.trajectory_id)
@@ -172,8 +173,8 @@ def drawn_scene(config: DatasetConfig, sun: SunConfig, ground: str, number: int)
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
     """The plan of the dataset `detect` or `nav`. Raises UserError if a distortion is too strong.
 
-    Seeds are derived from the configuration's seed, its name and the kind. Presets therefore share no terrain. The
-    two kinds of one preset share it only with `shared_terrain`.
+    Seeds are derived from the configuration's seed, its name and the kind. Presets therefore share no terrain, and the
+    two kinds of one preset share terrain only with `shared_terrain`.
     """
     settings = config.kind(kind)
     rig = rig_of(config)

@@ -1,6 +1,6 @@
-"""Check the poses of a plan against the ground: the camera is above it, and frames show nothing but ground.
+"""Check the poses of a plan against the ground: the camera must be above it, and frames must show only ground.
 
-Views of a ground up to the horizon may show the sky, but must show ground too.
+If the ground extends to the horizon, frames may show the sky, but must also show ground.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ from perilune_shared.geometry.curvature import hits_sphere, horizon_m
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
-"""Smallest height of the camera above the ground or the boulder below it, metres."""
+"""Smallest height of the camera above the ground or above a boulder, metres."""
 LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
-"""Largest velocity, metres per second (five times the escape velocity), and angular velocity, radians per second."""
+"""Largest velocity, metres per second (five times escape velocity), and angular velocity, radians per second."""
 _CHECKED_FRAMES = 20_000
 """Approximate number of frames that `check_plan` checks, which takes a few seconds."""
 _POINTS_PER_SIDE = 8
@@ -33,7 +33,7 @@ class Poses:
     """Poses of the camera in N frames of one scene."""
 
     frame_id: Sequence[str]
-    """Ids of the frames (N,), for messages; with the line or row in the user's file, if there is one."""
+    """Ids of the frames (N,), for messages; with the line or row in the user's file, if any."""
     position_m: Array
     """Position of the camera, O_L, metres (N, 3)."""
     rotation_wxyz: Array
@@ -56,11 +56,11 @@ def _named(trajectory: TrajectoryPlan, index: int) -> str:
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
-    """Make the checks that need no terrain heights: the Sun is up, poses are over the mesh, ground is in view.
+    """Check without terrain heights that the Sun is up, that poses are over the mesh, and that ground is in view.
 
-    Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks the poses of each other
-    scene when its ground is known. Raises UserError with `where` (the configuration or the manifest) and the first
-    scene or frame that fails.
+    Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks the other scenes once their
+    ground is known. Raises UserError with `where` (the configuration or the manifest) and the first scene or frame that
+    fails.
     """
     for scene in plan.scenes:
         if not 0 < scene.sun_elevation_deg <= 90:
@@ -76,7 +76,7 @@ def check_plan(plan: Plan, grid: Grid, where: object) -> None:
 
 
 def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene: Scene, where: object) -> None:
-    """Check the poses of all frames of planned trajectories of one scene, as `check_poses`."""
+    """Check the poses of all frames of planned trajectories over one scene with `check_poses`."""
     for name, mounted in plan.rig.items():
         of_camera = [trajectory for trajectory in trajectories if trajectory.camera == name]
         if of_camera:
@@ -84,11 +84,11 @@ def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene
 
 
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
-    """Check poses against the ground of a scene: `check_places`, and what the frames show.
+    """Check poses against the ground of a scene: valid positions (`check_places`), and ground in the frames.
 
     The ray through every tested point of the image border must hit the mesh, unless the scene's views may show the sky.
-    A ray that starts above the ground hits the mesh if and only if it is below the mesh's edge where it leaves the
-    mesh's square. Raises UserError with `where` and the first frame that fails.
+    A ray from above the ground hits the mesh if and only if it is lower than the mesh's edge where it leaves the
+    square. Raises UserError with `where` and the first frame that fails.
     """
     horizon = scene.view is not None and scene.view.horizon
     rays = _check_mesh(poses, camera, scene.grid, where, horizon=horizon)
@@ -109,8 +109,8 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
 def check_places(poses: Poses, scene: Scene, where: object) -> None:
     """Check that cameras are over the mesh of a scene, and LEAST_CLEARANCE_M above its ground and its boulders.
 
-    With horizon they must not be so high that it is beyond the mesh's edge. Raises UserError with `where` and the first
-    frame that fails.
+    In scenes with horizon, cameras must be low enough for the horizon to lie within the mesh. Raises UserError with
+    `where` and the first frame that fails.
     """
     _check_over(poses, scene.grid, where, horizon=scene.view is not None and scene.view.horizon)
     x, y, z = poses.position_m.T
@@ -123,7 +123,7 @@ def check_places(poses: Poses, scene: Scene, where: object) -> None:
 
 
 def _check_clearance(poses: Poses, surface_m: Array, what: str, where: object) -> None:
-    """Check that cameras are LEAST_CLEARANCE_M above surfaces at these heights (N,)."""
+    """Check that cameras are LEAST_CLEARANCE_M above surfaces with heights `surface_m` (N,), metres."""
     z = poses.position_m[:, 2]
     _refuse(
         z < surface_m + LEAST_CLEARANCE_M,
@@ -135,7 +135,7 @@ def _check_clearance(poses: Poses, surface_m: Array, what: str, where: object) -
 
 
 def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, horizon: bool) -> Array:
-    """Check that poses are over the mesh and show ground alone, or with `horizon` some ground.
+    """Check that poses are over the mesh and show only ground, or with `horizon` at least some ground.
 
     Returns rays (N, S, 3), O_L, through S image border points.
     """
@@ -157,7 +157,7 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, hori
 
 
 def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> None:
-    """Check that poses are finite and over the mesh, which with `horizon` must reach the horizon of each."""
+    """Check that poses are finite and over the mesh, and with `horizon` that the mesh extends to their horizon."""
     position, rotation = poses.position_m, poses.rotation_wxyz
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= _UNIT_TOLERANCE
     _refuse(
@@ -188,7 +188,7 @@ def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> No
 
 
 def _check_not_only_sky(poses: Poses, camera: Camera, matrices: Array, where: object) -> None:
-    """Check that some ground is in view of each pose: not only sky."""
+    """Check that each pose shows some ground, not only sky."""
     in_view = ground_in_view(poses.position_m, matrices, camera)
     _refuse(~in_view, poses, where, lambda n: "a view of the sky alone", lambda n: "some ground in view")
 
@@ -202,7 +202,7 @@ def ground_in_view(position_m: Array, matrices: Array, camera: Camera) -> np.nda
 
 
 def _edge_points(camera: Camera) -> Array:
-    """Image coordinates (S, 2) of points on the image border, with its corners, pixels."""
+    """Image coordinates (S, 2) of points on the image border, including the corners, pixels."""
     share = np.arange(_POINTS_PER_SIDE) / _POINTS_PER_SIDE
     sides = [(share, 0 * share), (1 + 0 * share, share), (1 - share, 1 + 0 * share), (0 * share, 1 - share)]
     return np.concatenate([np.stack(side, axis=-1) for side in sides]) * [camera.width_px, camera.height_px]
@@ -221,7 +221,7 @@ def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Arra
 
 
 def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, expected) -> None:
-    """Raise UserError for the first true value of `faulty` (N,); `found` and `expected` make texts from its index."""
+    """Raise UserError for the first true value of `faulty` (N,); `found` and `expected` return texts for its index."""
     if faulty.any():
         n = int(np.argmax(faulty))
         raise UserError(where, f"frame {poses.frame_id[n]}", found(n), expected(n))

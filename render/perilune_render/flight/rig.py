@@ -1,7 +1,7 @@
 """The rig: the cameras on the body, and the poses of each along a trajectory of the body.
 
-The body's pose is given as the pose of a camera with the default mounting: at the body's origin, looking along -Z_B.
-This is the camera of a lander with a single one.
+The body's pose is given as the pose of a camera with the default mounting: at the body's origin, looking along -Z_B. A
+lander with a single camera has this camera.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from perilune_shared.geometry.frames import (
 )
 
 _LOWEST_RAY = 0.01
-"""Smallest z, along -Z_B, of a ray of length 1 through the image's corner: less shows the horizon."""
+"""Smallest component along -Z_B of a unit ray through a corner of the image; below it, the image shows the horizon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,15 +54,15 @@ class MountedCamera:
     def flight_of(self, body: Flight) -> Flight:
         """The flight of this camera on a body.
 
-        Its velocity is that of the body, and that of its rotation about the body's origin. `motion` stays that of the
-        body.
+        The velocity is the body's velocity plus the velocity from its rotation about the body's origin. `motion`
+        remains the motion of the body.
         """
         position, rotation = self.poses(body.position_m, body.rotation_wxyz)
         seen = replace(body, position_m=position, rotation_wxyz=rotation)
         turn = body.angular_velocity_radps
         if turn is None:
             return seen
-        # Given in the axes of the default mounting.
+        # The angular velocity is given in the axes of the default mounting.
         in_site = np.einsum("nji,nj->ni", matrix_from_quaternion(body.rotation_wxyz), turn)
         velocity = body.velocity_mps + np.cross(in_site, position - body.position_m)
         turn = turn @ (self.rotation_camera_from_body @ ROTATION_CAMERA_FROM_BODY.T).T
@@ -71,7 +71,7 @@ class MountedCamera:
     def levelled(self) -> Camera:
         """A pinhole at the body's origin, with the default attitude, that sees all ground that this camera sees.
 
-        Its focal length is so large that no pixel of this camera shows less ground than one of its own. Raises
+        Its focal length is so large that its pixels cover no more ground than the smallest pixel of this camera. Raises
         UserError if the camera could see the horizon of a level body.
         """
         if np.array_equal(self.rotation_camera_from_body, ROTATION_CAMERA_FROM_BODY):
@@ -83,19 +83,19 @@ class MountedCamera:
         if (-rays[:, 2] < _LOWEST_RAY * np.linalg.norm(rays, axis=1)).any():
             raise UserError("configuration", "dataset.cameras", "a view with the horizon", "a view of the ground alone")
         half = float(np.abs(rays[:, :2] / rays[:, 2:]).max())
-        # Between the image and a level one, lengths grow by at most the square of the ratio of the depths.
+        # From this image to the level image, lengths grow by at most the square of the ratio of depths.
         focal = max(self.exr_camera.fx_px, self.exr_camera.fy_px) * max(1.0, float(-rays[:, 2].min())) ** 2
         side = int(np.ceil(2 * half * focal))
         return Camera(side, side, focal, focal, side / 2, side / 2)
 
     def flight_settings(self, flight: FlightConfig) -> FlightConfig:
-        """Flight settings whose spread of the position also has the distance of the camera from the body's origin."""
+        """Flight settings whose position spread includes the distance of the camera from the body's origin."""
         lever_m = float(np.linalg.norm(self.position_in_body_m))
         return flight.model_copy(update={"position_sigma_m": flight.position_sigma_m + lever_m / 3})
 
 
 Rig = Mapping[str | None, MountedCamera]
-"""Cameras by name, in the order of the names; a single one without a name has the key None."""
+"""Cameras by name, in the order of the names; a single camera without a name has the key None."""
 
 
 def rig_of(config: DatasetConfig) -> dict[str | None, MountedCamera]:

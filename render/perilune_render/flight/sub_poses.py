@@ -1,4 +1,4 @@
-"""Poses of the camera during one frame: while its rows are read out, and while it is exposed.
+"""Poses of the camera during one frame: during the readout of its rows and during the exposure.
 
 The camera keeps its velocity in O_L and its angular velocity in O_C. Times are seconds from the middle of the exposure
 of the middle row, to which the pose of a frame refers.
@@ -18,9 +18,9 @@ _SKY_M = 1e9
 
 
 def moved(pose: Pose, velocity_mps: Array, angular_velocity_radps: Array, time_s: float) -> Pose:
-    """A pose some time later: velocity (3,) in O_L, angular velocity (3,) of the camera in O_C."""
+    """A pose moved by time_s: velocity (3,) in O_L, angular velocity (3,) of the camera in O_C."""
     position, rotation = pose
-    # The camera turns by w t in its own axes, so what it sees turns by -w t.
+    # The camera rotates by w t in its axes, so the scene in camera axes rotates by -w t.
     return position + time_s * velocity_mps, matrix_from_rotation_vector(-time_s * angular_velocity_radps) @ rotation
 
 
@@ -33,7 +33,7 @@ class RowPoses:
     time_s: Array
     """Time of the middle of each row's exposure (N,)."""
     pose_at: Callable[[float], Pose]
-    """Returns the pose at a time, seconds."""
+    """Function from a time, seconds, to the pose."""
 
     def bands(self, n_bands: int) -> list[tuple[np.ndarray, Pose]]:
         """Pixels (h, w) bool of each of `n_bands` bands of neighbouring rows, with the pose in the middle of each."""
@@ -56,12 +56,12 @@ class RowPoses:
 
 
 def row_times_s(n_rows: int, row_time_s: float) -> Array:
-    """Time of the middle of each row's exposure (n_rows,), seconds; the mean of all is 0."""
+    """Time of the middle of each row's exposure (n_rows,), seconds; their mean is 0."""
     return (np.arange(n_rows) + 0.5 - n_rows / 2) * row_time_s
 
 
 def sensor_rows(camera: Camera, exr_camera: Camera) -> np.ndarray:
-    """Row of `camera` that sees each pixel of `exr_camera` (h, w) int64; the nearest one outside its image."""
+    """Row of `camera` that sees each pixel of `exr_camera` (h, w) int64; outside its image, the nearest row."""
     row = camera.project(exr_camera.rays(exr_camera.pixel_centres()))[..., 1]
     # Far outside the image the distortion may fold back; those pixels are not used.
     return np.clip(np.floor(np.nan_to_num(row)), 0, camera.height_px - 1).astype(np.int64)

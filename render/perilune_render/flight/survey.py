@@ -1,4 +1,4 @@
-"""Plan of a survey: a stereo pair of images of every scene of another plan, from orbit and under another Sun."""
+"""Plan of a survey: a stereo pair of images from orbit of every scene of another plan, with another Sun."""
 
 from dataclasses import replace
 from functools import partial
@@ -17,16 +17,18 @@ from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 _SHARE_OF_GROUND = 0.95
-"""The images reach this share of the way from the site to the edge of the ground; beyond it relief may end."""
+"""Distance from the site that the images cover, as a share of the distance to the edge of the ground, where relief may
+end."""
 _TILE_PX = 32
 _LARGEST_SIDE_PX = 8192
 _BETWEEN_S = 100.0
-"""Time between the two images. The motion during an exposure is then far below a pixel, as if it were compensated."""
+"""Time between the two images, long enough that the motion during an exposure is far below a pixel, as if
+compensated."""
 _CAMERA_FROM_SITE_LEVEL = np.diag([1.0, -1.0, -1.0])
 
 
 def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
-    """The survey of the scenes of a plan, by `config.survey`: one trajectory of two frames over each.
+    """The survey of the scenes of a plan, by `config.survey`: one trajectory with two frames for each scene.
 
     The ground equals the ground of the descents byte for byte. The camera is at y = 0, first at negative x (east) and
     then at positive x (west), and looks towards the site. Raises UserError if the ground is made of several meshes, or
@@ -72,7 +74,7 @@ def _lit(scene: ScenePlan, survey: SurveyConfig) -> ScenePlan:
 
 
 def _pair(descents: Plan, scene_id: str, survey: SurveyConfig) -> TrajectoryPlan:
-    """The two images of a scene; they are in the split of its first descent."""
+    """The two images of a scene; they take the split of its first descent."""
     first = descents.of_scene(scene_id)[0]
     splits = (first.splits[0],) * 2
     return TrajectoryPlan(scene_id, "survey", first.seed, range(2), splits, partial(_flight, survey), is_drawn=False)
@@ -90,6 +92,6 @@ def _flight(survey: SurveyConfig) -> Flight:
 
 
 def _turned(angle_rad: float) -> Array:
-    """Rotation (3, 3) about the camera's y, which moves the axis from straight down towards -x for positive angles."""
+    """Rotation (3, 3) about the camera's y; a positive angle moves the optical axis from straight down towards -x."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])

@@ -37,7 +37,7 @@ def channel_bytes(channels: Mapping[str, np.ndarray]) -> bytes:
 
 @contextlib.contextmanager
 def local_exr(store: Store, path: str) -> Iterator[Path]:
-    """Yield the path of an EXR of a dataset: OpenEXR reads files only, so an object is copied for the block."""
+    """Yield the path of an EXR of a dataset: OpenEXR reads only files, so an object is first copied to disk."""
     if store.folder is not None:
         yield files.inside(store.folder, path)
         return
@@ -50,7 +50,7 @@ def local_exr(store: Store, path: str) -> Iterator[Path]:
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
     """Channels (h, w) by name. Raises UserError if the file is missing, damaged or not of `size_px` (width, height).
 
-    A small file may decompress to any size: the header is checked before the pixels are read.
+    A small file may decompress to any size, so the header is checked before the pixels are read.
     """
     if not path.is_file():
         raise UserError(path, "exr", "no such file", "an EXR frame")

@@ -2,10 +2,11 @@
 
 Theory: a law gives the reflectance factor as a function of mu0 = cos incidence, mu = cos emission and the cosine of the
 phase angle. The reflectance factor is the radiance divided by the radiance of a perfectly diffusing plate under the
-same light. Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the plate lit from the zenith.
-The phase angle equals i + e in the principal plane only.
+same light. Multiplied by mu0, it is the radiance factor I/F: the radiance divided by the radiance of the plate lit from
+the zenith. The phase angle equals i + e in the principal plane only.
 
-`perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law; a test compares the bits.
+`perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law; a test checks that the results are equal
+to the bit.
 
 Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
 that `perilune_render.engines.blender.nodes` can call them with symbols and build shader nodes from the same code.
@@ -22,7 +23,7 @@ import numpy as np
 Law = Callable[[Any, Any, Any], Any]
 
 LEAST_SINE_SQUARED = 1e-7
-"""Prevents division by 0 at i = 0 and e = 0, also in float32; the roughness terms already vanish at larger angles."""
+"""Floor against division by 0 at i = 0 and e = 0, also in float32; roughness terms vanish at larger angles already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +45,14 @@ class HapkeParameters:
 
 
 HIGHLAND = HapkeParameters(0.385, 0.2375, 0.325, 1.686, 0.0672)
-"""Median of latitudes within 30 degrees, 643 nm (Sato et al. 2014)."""
+"""Parameters for highland: median of latitudes within 30 degrees, 643 nm (Sato et al. 2014)."""
 MARE = HapkeParameters(0.222, 0.254, 0.160, 1.993, 0.0597)
-"""Mare Tranquillitatis, 643 nm (Sato et al. 2014)."""
+"""Parameters for mare: Mare Tranquillitatis, 643 nm (Sato et al. 2014)."""
 MEAN = HapkeParameters(0.2242, 0.24575, 0.2425, 1.8395, 0.06345)
-"""The mean Moon: b, c, B_S0 and h_S midway between mare and highland, w fitted by us.
+"""Parameters for the mean Moon: b, c, B_S0 and h_S are midway between mare and highland; we fitted w.
 
-With this w the mean ratio of the law to a published fit to NAC images is 1, over incidences of 5 to 80 degrees in nadir
-view.
+With this w, the ratio of the law to a published fit to NAC images has a mean of 1 for incidences of 5 to 80 degrees in
+nadir view.
 The published fit is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to 1.19 up to 70 degrees and
 falls to 0.63 at 80 degrees, where the law is darker than the fit.
 """
@@ -61,8 +62,8 @@ def hapke(parameters: HapkeParameters, mu0: Any, mu: Any, cos_phase: Any) -> Any
     """Hapke's reflectance factor with shadow hiding, multiple scattering and macroscopic roughness.
 
     I/F = w/4 mu0e/(mu0e+mue) [p(g) (1 + B_S0 / (1 + tan(g/2)/h_S)) + H(mu0e) H(mue) - 1] S,
-    H(x) = (1+2x)/(1+2x sqrt(1-w)); mu0e, mue and S are those of `roughness`. The reflectance factor is I/F over mu0 and
-    is symmetric in incidence and emission.
+    H(x) = (1+2x)/(1+2x sqrt(1-w)); `roughness` computes mu0e, mue and S. The reflectance factor is I/F divided by mu0
+    and is symmetric in incidence and emission.
     """
     p = parameters
     larger, smaller, shadowing = roughness(p.theta_bar_deg, mu0, mu, cos_phase)
@@ -84,30 +85,30 @@ def hapke(parameters: HapkeParameters, mu0: Any, mu: Any, cos_phase: Any) -> Any
 def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[Any, Any, Any]:
     """Hapke's correction for a surface of mean slope theta_bar (Hapke 1984, doi 10.1016/0019-1035(84)90054-X).
 
-    Returns the effective cosine of the larger of incidence and emission, that of the smaller, and S / (mu0 mue). Hapke
-    gives two cases, i <= e and e <= i, which differ only by exchanging the two angles. Ordered by size they are one
-    case, and S / (mu0 mue) is the same in both. The formulas are those of Hapke's book of 2012, chapter 12. In this
-    form S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
+    Returns the effective cosines of the larger and the smaller of incidence and emission, and S / (mu0 mue). Hapke
+    gives two cases, i <= e and e <= i, which differ only by exchanging the two angles. If the angles are ordered by
+    size, only one case remains, with the same S / (mu0 mue). The formulas follow chapter 12 of Hapke's book of 2012. In
+    this form, S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
     """
     slope, chi = slope_of(theta_bar_deg), chi_of(theta_bar_deg)
-    # Cosine of the larger angle, and of the smaller.
+    # Cosines of the larger and the smaller angle.
     cos_l, cos_s = np.minimum(mu0, mu), np.maximum(mu0, mu)
     sin_l, e1_l, e2_l = _slopes(slope, cos_l)
     sin_s, e1_s, e2_s = _slopes(slope, cos_s)
     open_l, open_s = 2 - e1_l, 2 - e1_s
     cos_psi = np.minimum(np.maximum((cos_phase - mu0 * mu) / (sin_l * sin_s), -1), 1)
     psi = np.arccos(cos_psi)
-    # Hapke's f; psi/2 is slightly reduced, since the tangent of 90 degrees overflows.
+    # Hapke's f, with psi/2 slightly reduced, since the tangent of 90 degrees overflows.
     seen_as_one = np.exp(np.tan(psi * 0.499999) * -2)
-    # At i = e = 90 degrees and psi = 180 degrees this denominator is 0, and so are the numerators.
+    # At i = e = 90 degrees and psi = 180 degrees this denominator and the numerators are 0.
     per_both = slope / np.maximum(psi * e1_s * (-1 / np.pi) + open_l, 1e-4)
     common = (cos_psi * -0.5 + 0.5) * e2_s
     larger = sin_l * (e2_l - common) * per_both + cos_l
     smaller = sin_s * (cos_psi * e2_l + common) * per_both + cos_s
-    # Hapke's eta of each angle: its effective cosine without the other angle.
+    # Hapke's eta of each angle: its effective cosine, independent of the other angle.
     alone_l = sin_l * e2_l / open_l * slope + cos_l
     alone_s = sin_s * e2_s / open_s * slope + cos_s
-    # The four effective cosines above lack the factor chi: in the shadowing one factor 1 / chi remains.
+    # The four effective cosines above lack the factor chi, so one factor 1 / chi remains in the shadowing.
     shadowing = (1 / chi) / (alone_l * (seen_as_one * (cos_s - alone_s) + alone_s))
     return larger * chi, smaller * chi, shadowing
 
@@ -135,16 +136,16 @@ def lommel_seeliger(mu0: Any, mu: Any, cos_phase: Any) -> Any:
 
 
 LUNAR_LAMBERT_SCALE = 0.0503
-"""Fitted by us as `MEAN`; the ratio to the published fit is 0.63 at 5 degrees, rises to 1.28, and is 0.89 at 80."""
+"""Fitted by us, as `MEAN`; the ratio to the published fit is 0.63 at 5 degrees, rises to 1.28, and is 0.89 at 80."""
 
 
 def lunar_lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
     """McEwen's lunar-Lambert law, I/F = scale [2 L mu0/(mu0+mu) + (1-L) mu0].
 
-    L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees (McEwen 1991, doi 10.1016/0019-1035(91)90053-V). Valid up
-    to g = 104 degrees, where the polynomial falls below 0; beyond, L is 0. The law describes how brightness varies over
-    a surface at one phase angle. Deviation: McEwen's factor that falls with the phase angle, fitted to each image, is
-    constant here.
+    L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees (McEwen 1991, doi 10.1016/0019-1035(91)90053-V). The
+    polynomial is valid up to g = 104 degrees, where it falls below 0; beyond, L is 0. The law describes how brightness
+    varies over a surface at one phase angle. Deviation: McEwen fits a factor that falls with the phase angle to each
+    image; here this factor is constant.
     """
     g = np.arccos(np.minimum(np.maximum(cos_phase, -1), 1)) * (180 / np.pi)
     share = np.maximum(1 + g * (-0.019 + g * (2.42e-4 + g * -1.46e-6)), 0)
@@ -157,7 +158,7 @@ def lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
 
 
 HAPKE = {"hapke_highland": HIGHLAND, "hapke_mare": MARE, "hapke_mean": MEAN}
-"""Parameters of the laws by Hapke's model."""
+"""Parameters of the laws that follow Hapke's model."""
 LAWS: dict[str, Law] = {
     **{name: partial(hapke, parameters) for name, parameters in HAPKE.items()},
     "lommel_seeliger": lommel_seeliger,
@@ -167,7 +168,7 @@ LAWS: dict[str, Law] = {
 
 
 def reflectance_factor(law: str, mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """I/F over mu0 of a named law for mu0, mu > 0: the colour that gives a diffuse shader the radiance I/F."""
+    """I/F divided by mu0 of a named law for mu0, mu > 0: the colour for which a diffuse shader has the radiance I/F."""
     return LAWS[law](mu0, mu, cos_phase)
 
 

@@ -12,11 +12,11 @@ class Radiance:
     radiance_factor: np.ndarray
     """Radiance factor I/F (h, w) float32."""
     depth_m: np.ndarray
-    """Depth along the camera's axis of the ray through the pixel's centre, metres; infinite if it hits nothing (h, w)
-    float32."""
+    """Depth, along the camera's axis, of the hit of the ray through the pixel's centre, metres; infinite without a hit
+    (h, w) float32."""
     normal: np.ndarray
-    """Unit shading normal in O_L, 0 where nothing is hit (h, w, 3) float32. With dataset.render.exr it is that of the
-    ray through the pixel's centre, else the mean direction over the pixel's samples."""
+    """Unit shading normal in O_L, 0 without a hit (h, w, 3) float32. With dataset.render.exr it is the normal at the
+    hit of the ray through the pixel's centre, otherwise the mean direction over the pixel's samples."""
     sunlit: np.ndarray
     """Whether the pixel is sunlit (h, w) bool."""
     blurred: np.ndarray | None = None

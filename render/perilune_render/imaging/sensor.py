@@ -7,8 +7,8 @@ gain, grey values (DN) per electron. mu_y and sigma_y^2 are the temporal mean an
     mu_y = K (eta mu_p + mu_d) + black level,    mu_d = dark current x t
     sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark),    sigma_d^2 = read noise^2 + mu_d
 
-Between pixels, eta varies by the PRNU, and mu_d by the DSNU and the hot pixels. This pattern is the same in every frame
-of a dataset.
+Between pixels, eta varies by the PRNU, and mu_d by the DSNU and the hot pixels. All frames of a dataset share this
+pattern.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 _STRETCH = 1.5
-"""Approximate bound on how much distortion stretches motion at the image edge."""
+"""Approximate bound on how much distortion stretches motion at the image edges."""
 _LEAST_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
 _FAINT_E = 100.0
@@ -37,7 +37,7 @@ HOT_PIXEL_S = 0.002
 
 @dataclass(frozen=True, slots=True)
 class FixedPattern:
-    """The fixed pattern noise of one sensor, the same in all its frames."""
+    """The fixed pattern noise of one sensor, shared by all its frames."""
 
     response: np.ndarray
     """Relative response of each pixel, mean 1 (h, w) float32."""
@@ -48,7 +48,7 @@ class FixedPattern:
 
     @classmethod
     def draw(cls, config: SensorConfig, camera: Camera, seed: int) -> "FixedPattern":
-        """Draw the sensor of a dataset from the dataset's seed."""
+        """Draw the sensor of a dataset from the random seed of the dataset."""
         rng = stream(seed, "sensor")
         shape = camera.height_px, camera.width_px
         response = 1 + config.gain_nonuniformity * rng.standard_normal(shape, np.float32)
@@ -60,7 +60,7 @@ class FixedPattern:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """The light on the sensor in one frame, without noise and fixed pattern."""
+    """The light on the sensor in one frame, before noise and fixed pattern."""
 
     light: np.ndarray
     """Radiance factor I/F of each pixel after point spread and motion blur (h, w) float32."""
@@ -79,7 +79,8 @@ def expose(
     """The light on the sensor of `camera`: resampling, point spread, exposure time, motion blur, in this order.
 
     `radiance` is the rendering by `exr_camera` at the middle of the exposure. `velocity_camera_mps` (3,) is the
-    velocity of the camera in its own axes O_C, `angular_velocity_radps` (3,) its angular velocity there, None for none.
+    velocity of the camera in its own axes O_C, `angular_velocity_radps` (3,) its angular velocity in the same axes,
+    None without rotation.
     """
     light = _on_sensor(radiance.radiance_factor, config, camera, exr_camera)
     exposure_s = exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
@@ -95,7 +96,7 @@ def expose(
 
 
 def time_of_exposure_s(radiance: Radiance, config: SensorConfig, camera: Camera, exr_camera: Camera) -> float:
-    """Exposure time of `expose`, seconds."""
+    """Exposure time that `expose` uses, seconds."""
     light = _on_sensor(radiance.radiance_factor, config, camera, exr_camera)
     return exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
 
@@ -115,7 +116,7 @@ def psf_kernel(sigma_px: float) -> np.ndarray:
 
     The weight at k pixels is exp(-t) I_k(t) with t = sigma_px^2 (Lindeberg 1990, doi 10.1109/34.49051). Its variance is
     t for every t, while a Gaussian sampled at the pixel centres loses variance below about 0.7 px (sigma 0.45 becomes
-    0.38). The renderer averages over the pixel's area; sigma_px does not include that.
+    0.38). sigma_px does not include the average over the pixel's area, which the renderer takes.
     """
     half = int(np.ceil(6 * sigma_px + 4))
     weights = ive(np.abs(np.arange(-half, half + 1)), sigma_px**2)
@@ -161,7 +162,7 @@ def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.n
 
 
 def _on_ground(light: np.ndarray, depth_m: np.ndarray, camera: Camera, exr_camera: Camera) -> np.ndarray:
-    """The pixels of an image (h, w) that show ground, which has a finite depth; all pixels if none does."""
+    """The pixels of an image (h, w) that show ground (finite depth); all pixels if none shows ground."""
     hit = np.isfinite(depth_m)
     if hit.all() or not hit.any():
         return light
@@ -172,8 +173,8 @@ def _on_ground(light: np.ndarray, depth_m: np.ndarray, camera: Camera, exr_camer
 def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
     """Exposure time, seconds, for the radiance factor of pixels (...).
 
-    Automatic exposure brings `exposure_percentile` to the grey value `exposure_level`, but to no more than that share
-    of the full well, and is limited to `longest_exposure_s`.
+    Automatic exposure brings the percentile `exposure_percentile` to the grey value `exposure_level`, but to no more
+    than that share of the full well, and is limited to `longest_exposure_s`.
     """
     if config.exposure == "fixed":
         return config.exposure_time_s
@@ -188,8 +189,9 @@ def motion_px(
 ) -> np.ndarray:
     """Motion in the image, pixels (h, w, 2) float32, of the ground at a depth (h, w) along the axis, metres.
 
-    The camera moves by `move_camera_m` (3,) in its own axes O_C and turns by the rotation vector `turn_rad` (3,) there.
-    To first order in turn and in the ratio of motion to depth; where nothing is hit only the rotation counts.
+    The camera moves by `move_camera_m` (3,) in its own axes O_C and rotates by the rotation vector `turn_rad` (3,) in
+    these axes. The result is of first order in the rotation and in the ratio of motion to depth; where nothing is hit,
+    only the rotation counts.
     """
     rays = _rays(camera)
     step = np.asarray(move_camera_m, np.float32)
@@ -205,7 +207,7 @@ def motion_px(
 
 
 def _turned(rays: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
-    """Motion (h, w, 2) of rays (h, w, 2), both divided by z, if the camera turns by `turn_rad` (3,): -turn x ray."""
+    """Motion (h, w, 2) of rays (h, w, 2), both divided by z, if the camera rotates by `turn_rad` (3,): -turn x ray."""
     x, y = rays[..., 0], rays[..., 1]
     a, b, c = turn_rad
     along = a * y - b * x
@@ -232,7 +234,7 @@ def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
     if longest < _LEAST_MOTION_PX:
         return light
-    # Gauss-Legendre nodes: two are enough to give the blur of a short motion its true width.
+    # Gauss-Legendre nodes: two are enough for the correct width of a short blur.
     times, weights = np.polynomial.legendre.leggauss(int(min(2 * longest, 126)) + 2)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
     mean = np.zeros_like(light)

@@ -1,4 +1,4 @@
-"""Estimate time and bytes of a job from a few frames, rendered into a temporary folder."""
+"""Estimate run time and size of a job from a few frames, rendered into a temporary folder."""
 
 import tempfile
 import time
@@ -23,19 +23,19 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.storage.store import Address, open_store
 
 _N_FRAMES = 10
-"""Number of frames rendered of each trajectory of the sample."""
+"""Number of frames rendered for each trajectory of the sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Work that is left, and its estimated time and size."""
+    """The remaining work, with its estimated time and size."""
 
     n_frames: int
     """Number of frames that are still to be rendered."""
     seconds: float
-    """Time to render them, with start and finish."""
+    """Time to render these frames, including start and finish, seconds."""
     n_bytes: float
-    """Bytes of their files and rows."""
+    """Size of the files and rows of these frames, bytes."""
 
 
 class _Times(Report):
@@ -62,9 +62,9 @@ class _Times(Report):
 def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecutor, n_workers: int) -> Estimate:
     """Estimate the rest of a job at an address, with an executor of `n_workers` processes.
 
-    Renders ten frames for each process at the same time, from its own scene if there are as many. Writes nothing to
-    the address. Raises UserError as `check` and if a pose does not fit the ground, RenderingFailed if frames
-    cannot be rendered.
+    Renders ten frames for each process at the same time, each process from a different scene if there are enough.
+    Writes nothing to the address. Raises UserError like `check`, and if a pose does not fit the ground, RenderingFailed
+    if frames cannot be rendered.
     """
     out = open_store(address)
     check(job)
@@ -97,7 +97,7 @@ def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecu
 
 
 def _sample(job: Job, left: list[int], n_trajectories: int) -> Job:
-    """A job of `n_trajectories` unfinished trajectories with few frames, of different scenes if possible."""
+    """A job of `n_trajectories` unfinished trajectories with few frames, from different scenes if possible."""
     first_of: dict[str, int] = {}
     for number in left:
         first_of.setdefault(job.plan.trajectories[number].scene_id, number)
@@ -132,18 +132,18 @@ def _same(flight: Flight) -> Flight:
 
 @dataclass(frozen=True, slots=True)
 class _Bytes:
-    """Mean bytes of a sample."""
+    """Mean sizes in a sample, bytes."""
 
     frame: float
-    """Of a frame's files and rows."""
+    """Size of a frame's files and rows."""
     scene: float
-    """Of a scene's rows."""
+    """Size of a scene's rows."""
     fixed: float
-    """Of the tables of frames and labels and of the index, whatever the number of their rows."""
+    """Size of the frame and label tables and the index that does not depend on their number of rows."""
 
     @classmethod
     def of(cls, made: Dataset) -> "_Bytes":
-        """The mean bytes of a finished sample."""
+        """The mean sizes in a finished sample."""
         images = sum(item.size_bytes for item in made.store.list("frames"))
         index = pa.concat_tables(pq.read_table(pa.BufferReader(made.store.read(part.path))) for part in made.info.index)
         rows = fixed = 0.0

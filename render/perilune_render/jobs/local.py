@@ -1,7 +1,7 @@
 """Render a job in worker processes on this machine.
 
-A small loop over processes instead of a pool from a library: a killed worker breaks a pool of `concurrent.futures` or
-loky with all its tasks, and none of them hands a task to the worker that already holds its scene.
+This is a small loop over processes instead of a library's pool: a killed worker breaks a pool of `concurrent.futures`
+or loky with all its tasks, and neither pool hands a task to the worker that already holds the scene.
 """
 
 import tempfile
@@ -24,17 +24,18 @@ from perilune_shared.threads import usable_cores
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
 LOST_STARTS = 3
-"""Number of workers in a row that may end before they are ready."""
+"""Number of consecutive workers that may end before they are ready."""
 _BASE_BYTES, _VERTEX_BYTES = 0.75 * 2**30, 500
-"""Peak memory of a worker: 1.1 GiB for 1.2 million vertices and 3.1 GiB for 5.7 million were measured."""
+"""Peak memory of a worker, in total and per vertex; measured: 1.1 GiB for 1.2 million vertices, 3.1 GiB for 5.7
+million."""
 _GROUND_BYTES, _GROWING_BYTES = 16, 70
-"""Memory for each vertex of ground that is rendered in levels, and for each vertex while ground is generated."""
+"""Memory per vertex for ground that is rendered in levels, and per vertex while ground is generated, bytes."""
 
 
 class LocalWorkers:
     """The executor that renders in `n_workers` processes. Its workers end with the block, or with this process.
 
-    `early` is a worker that was started before, and is used unless it has ended.
+    `early` is a worker that is already running; it is used unless it has ended.
     """
 
     def __init__(self, job: Job, out: Store, n_workers: int, early: Worker | None = None):
@@ -74,7 +75,7 @@ class LocalWorkers:
                     return
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
+        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
         while True:
             n_busy = sum(worker.trajectory is not None for worker in self._workers.values())
             if not n_busy and not work.n_waiting:
@@ -112,12 +113,12 @@ class LocalWorkers:
                 self._end(worker)
 
     def _heard(self) -> list[Worker]:
-        """Workers that have sent a message or ended; waits for the first."""
+        """Workers that have sent a message or ended; waits for at least one."""
         ready = wait(self._workers)
         return [worker for connection, worker in self._workers.items() if connection in ready]
 
     def _receive(self, worker: Worker) -> tuple[Any, ...] | None:
-        """The next message of a worker; None if it has ended, which also removes it. Raises its final error."""
+        """The next message of a worker; None if the worker has ended, which removes it. Raises its final error."""
         try:
             message = worker.connection.recv()
             if message == ("started",):
@@ -147,7 +148,7 @@ class LocalWorkers:
 
 
 def for_other_processes(out: Store) -> Store:
-    """A store that processes with other working directories can open too. Raises UserError if they cannot."""
+    """A store that processes with other working directories can open too. Raises UserError if they cannot open it."""
     if out.address.startswith("memory://"):
         raise UserError(out, "--out", "memory of this process", "--workers 0, or an address that workers can open")
     return out if out.folder is None else open_store(out.folder.absolute())
@@ -156,8 +157,9 @@ def for_other_processes(out: Store) -> Store:
 def default_workers(job: Job, n_threads: int | None) -> int:
     """The number of workers that render a job here by default: one for each core, or for each `n_threads` cores.
 
-    It is limited by the trajectories and by free memory. On two cores, two processes of one thread rendered 1.28 times
-    as many frames a second as one process of two (docs/notebook/2026-11-22-cores.md). More cores were not measured.
+    The number of trajectories and free memory limit it. On two cores, two processes with one thread each rendered 1.28
+    times as many frames per second as one process with two threads (docs/notebook/2026-11-22-cores.md). More cores were
+    not measured.
     """
     n_cores = usable_cores() // (n_threads or job.config.render.threads or 1)
     n_ground = graded_grid(job.config.terrain, job.plan.view).n_vertices
@@ -168,6 +170,6 @@ def default_workers(job: Job, n_threads: int | None) -> int:
 
 
 def _free_bytes() -> float:
-    """Memory that new processes may use, bytes: free on the machine or, if less, in the container or batch job."""
+    """Memory that new processes may use, bytes: free on the machine, within limits of the container or batch job."""
     free, left = float(psutil.virtual_memory().available), memory_left_bytes()
     return free if left is None else min(free, left)

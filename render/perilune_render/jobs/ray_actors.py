@@ -1,7 +1,7 @@
 """Render a job with Ray, on this machine or on a cluster: one actor per process, each with its own renderer.
 
-Ray places the actors on machines, and places new ones when a process or a machine is lost. Work is handed out
-as to local workers (`WorkList`), so that an actor stays with its scene.
+Ray places the actors on machines, and starts new ones when a process or a machine is lost. Work is handed out as for
+local workers (`WorkList`), so that an actor keeps its scene.
 """
 
 import logging
@@ -29,7 +29,7 @@ class _Renderer:
     """The actor: a scene renderer in a process of Ray."""
 
     def start(self, job: Job, out: Store) -> None:
-        """Receive the job. Raises UserError if this process has other code than the job."""
+        """Receive the job. Raises UserError if the code of this process differs from the job's."""
         self._renderer = SceneRenderer(job, out)
 
     def grow(self, scene_id: str) -> list[str]:
@@ -43,25 +43,25 @@ class _Renderer:
 
 @dataclass(slots=True, eq=False)
 class _Actor:
-    """An actor, as the driver sees it."""
+    """The driver's record of an actor."""
 
     handle: Any
     """Ray's handle of the actor."""
     ready: bool = False
-    """Whether it runs."""
+    """Whether the actor is running."""
     trajectory: int | None = None
-    """The trajectory that it renders."""
+    """Index of the trajectory that the actor is rendering."""
     scene_id: str | None = None
-    """The scene that it keeps."""
+    """Id of the scene that the actor keeps."""
     n_done: int = 0
-    """Number of trajectories that it has rendered."""
+    """Number of trajectories that the actor has rendered."""
 
 
 class RayActors:
-    """The executor that renders with Ray, in `n_workers` actors, by default as many as the cluster has cores for.
+    """The executor that renders with Ray in `n_workers` actors, by default as many as the cluster's cores allow.
 
-    Each has the configured number of threads, or one if that is 0; Ray reserves a core for each thread. `address` is
-    the address of a running cluster; None starts Ray on this machine for the duration of the block. A local folder
+    Each actor has the configured number of threads, or one if this is 0; Ray reserves a core for each thread. `address`
+    is the address of a running cluster; None starts Ray on this machine for the duration of the block. A local folder
     `out` must be at the same path on all machines.
     """
 
@@ -77,7 +77,7 @@ class RayActors:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         local = {"num_cpus": self._n_workers * self._n_threads} if self._n_workers and self._address is None else {}
         try:
-            with interrupts_held():  # Python ignores an interrupt in a callback of a fork, and Ray forks
+            with interrupts_held():  # Ray forks, and Python ignores interrupts in fork callbacks
                 ray.init(
                     self._address or "local",
                     include_dashboard=None if self._address else False,
@@ -101,7 +101,7 @@ class RayActors:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with interrupts_held():  # half of a shutdown would leave processes
+        with interrupts_held():  # an interrupted shutdown would leave processes behind
             ray.shutdown()
 
     def check_scene(self, scene_id: str) -> None:
@@ -123,7 +123,7 @@ class RayActors:
                 return
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
+        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
         while True:
             busy = [actor for actor in self._actors if actor.trajectory is not None]
             if not busy and not work.n_waiting:
@@ -174,14 +174,14 @@ class RayActors:
                 ray.kill(actor.handle)
 
     def _lose_start(self, actor: _Actor, error: RayActorError) -> None:
-        """Remove an actor that was lost before it rendered. Raises UserError if too many were lost in succession."""
+        """Remove an actor lost before it rendered anything. Raises UserError if too many were lost in succession."""
         self._actors.remove(actor)
         self._lost_starts += 1
         if self._lost_starts > LOST_STARTS * (self._n_workers or 1):
             raise UserError("perilune-render", "Ray", error, "processes that start: see Ray's logs") from None
 
     def _start(self, n_actors: int) -> None:
-        """Start actors until there are `n_actors`; each gets work once it runs."""
+        """Start actors until there are `n_actors`; each gets work once it is running."""
         remote = ray.remote(
             num_cpus=self._n_threads,
             max_restarts=0,

@@ -4,8 +4,8 @@
     work/running/<process>.json    one process: what it renders, and how many frames it has rendered
     work/failed/<trajectory>.json  the error of a trajectory that failed repeatedly
 
-No record affects what is rendered, except that a dataset is resumed with its own plan alone. The records are removed
-with the rest of work/ when the dataset is finished.
+No record affects what is rendered, except that a dataset resumes only with its own plan. The records are removed with
+the rest of work/ when the dataset is finished.
 """
 
 import contextlib
@@ -28,12 +28,12 @@ _FAILURE = frozenset({"trajectory", "error"})
 
 
 def write_plan(store: Store, plan: dict[str, Any]) -> None:
-    """Record the numbers of `trajectories` and `frames` of a job, and the hash of its `plan`."""
+    """Record a job's numbers of `trajectories` and `frames` and the hash of its `plan`."""
     store.replace(f"{FOLDER}/plan.json", json.dumps(plan).encode())
 
 
 def read_plan(store: Store) -> dict[str, Any] | None:
-    """The record of a job (`write_plan`); None without one."""
+    """The record of a job (`write_plan`); None without a record."""
     return _read(store, f"{FOLDER}/plan.json") if store.exists(f"{FOLDER}/plan.json") else None
 
 
@@ -59,7 +59,7 @@ class RunningRecord:
 
     def remove(self) -> None:
         """Remove the record, if it was written."""
-        # A store that does not answer is reported by what was written there before.
+        # An unreachable store has already been reported by an earlier write.
         with contextlib.suppress(OSError, UserError):
             if self._updated:
                 self._store.delete(f"{FOLDER}/{self._name}.json")
@@ -76,7 +76,7 @@ def write_failure(store: Store, trajectory: str, error: str) -> None:
 
 
 def remove_failures(store: Store, trajectories: Iterable[str]) -> None:
-    """Remove the failures of trajectories that are tried again."""
+    """Remove the failure records of trajectories that are tried again."""
     recorded = {content["trajectory"]: path for path, content in _listed(store, "failed", _FAILURE)}
     for trajectory in trajectories:
         if trajectory in recorded:
@@ -100,7 +100,7 @@ def failures(store: Store) -> dict[str, str]:
 
 
 def _write(store: Store, name: str, content: dict[str, Any]) -> None:
-    # A record that cannot be written is no reason to stop: the dataset's own files will say why.
+    # Continue if a record cannot be written: writing the dataset's files will report the cause.
     with contextlib.suppress(OSError, UserError):
         store.replace(f"{FOLDER}/{name}.json", json.dumps(content).encode())
 

@@ -10,7 +10,7 @@ from perilune_shared.errors import one_line, shortened
 
 
 class Report:
-    """Reports on the rendering of some trajectories of a job, given by their indices in the plan."""
+    """Reports on the rendering of trajectories of a job, which are identified by their indices in the plan."""
 
     def __init__(self, job: Job, indices: Sequence[int], progress: Progress):
         self._job, self._progress = job, progress
@@ -25,7 +25,7 @@ class Report:
         self._frames: Counter[int] = Counter()
 
     def started(self, index: int) -> None:
-        """Note that a process begins a trajectory."""
+        """Record that a process begins a trajectory."""
 
     def frame(self, index: int) -> None:
         """Count a rendered frame of a trajectory."""
@@ -33,11 +33,11 @@ class Report:
         self._progress.advance(self._task)
 
     def note(self, text: str) -> None:
-        """Show a text on the current step."""
+        """Show a text about the current step."""
         self._progress.update(self._task, note=text)
 
     def done(self, index: int, dark: Sequence[str]) -> None:
-        """Count a finished trajectory with the ids of its dark frames; after the last of a scene, warn of these."""
+        """Count a finished trajectory with the ids of its dark frames; warn of them after the last one of a scene."""
         scene_id = self._job.plan.trajectories[index].scene_id
         self._dark[scene_id] += dark
         self._rendered[scene_id] += self._job.n_frames(index)

@@ -2,7 +2,7 @@
 
 `SceneRenderer` renders a trajectory, which is finished once its commit is written (`dataset/work.py`).
 
-A dataset is resumed only with the plan that it was begun with. One hash identifies a plan: two manifests with the same
+A dataset resumes only with the plan with which it was begun. A hash identifies the plan, since two manifests with equal
 settings may differ in scenes, trajectories, frames and splits.
 """
 
@@ -38,13 +38,13 @@ _EXPECTED = "the plan or manifest that the dataset was started with"
 
 
 class Executor(Protocol):
-    """Renders trajectories of a job, in this process, in others or on other machines."""
+    """Renders trajectories of a job in this process, in other processes or on other machines."""
 
     def check_scene(self, scene_id: str) -> None:
         """Generate a scene and check that its poses fit it. Raises UserError."""
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
+        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +57,17 @@ class Shard:
     """Number of shards."""
 
     def indices(self, n_trajectories: int) -> range:
-        """Indices of its trajectories in the plan. Consecutive, so that few scenes are in several shards."""
+        """Indices of the shard's trajectories in the plan, consecutive so that few scenes are in several shards."""
         first, after = ((k * n_trajectories) // self.count for k in (self.number - 1, self.number))
         return range(first, after)
 
 
 MakeExecutor = Callable[[Job, Store], AbstractContextManager[Executor]]
-"""Makes the executor of a job and the store of its dataset."""
+"""Function that makes the executor for a job and the store of its dataset."""
 
 
 class RenderingFailed(Exception):
-    """Some trajectories failed N_ATTEMPTS times each; all others are rendered."""
+    """Raised if some trajectories failed N_ATTEMPTS times each; all others are rendered."""
 
     def __init__(self, out: Store, errors: dict[str, str]):
         self.out, self.errors = out, errors
@@ -78,7 +78,7 @@ def render_job(job: Job, address: Address, progress: Progress, executor: MakeExe
     """Render a job into the dataset at an address, or resume it.
 
     Raises UserError if the address holds something else, if another run is writing it, or if a pose does not fit the
-    ground. The first scene is checked before anything is written, each other scene before its first frame is rendered.
+    ground. The first scene is checked before anything is written; each other scene before its first frame is rendered.
     Raises RenderingFailed at the end if trajectories failed repeatedly.
     """
     out = open_store(address)
@@ -91,12 +91,12 @@ def render_job(job: Job, address: Address, progress: Progress, executor: MakeExe
             records.remove_running(out)
             _render(job, out, unfinished(job, out), renderers, progress)
         if out.folder is not None:
-            remove_temporary_files(out.folder)  # of workers that were killed
+            remove_temporary_files(out.folder)  # left by workers that were killed
         return finish(job, out, info)
 
 
 def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, executor: MakeExecutor) -> int:
-    """Render the unfinished trajectories of one shard of a job into the dataset at an address; returns their number.
+    """Render the unfinished trajectories of one shard of a job into the dataset at an address; return their number.
 
     Processes on many machines may render different shards into one dataset at the same time, so it is not locked.
     Raises the errors of `render_job`.
@@ -134,7 +134,7 @@ def _render(job: Job, out: Store, indices: list[int], executor: Executor, progre
 
 
 def check(job: Job) -> None:
-    """Make the checks of a job that need no terrain heights and write nothing. Raises UserError."""
+    """Check what needs no terrain heights in a job, without writing anything. Raises UserError."""
     grid = check_ground(job.config, job.plan.view)
     check_plan(job.plan, grid, job.where)
     if job.config.hazard is not None:
@@ -142,10 +142,10 @@ def check(job: Job) -> None:
 
 
 def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> DatasetInfo:
-    """Begin the dataset at `out`, or check that it belongs to the job; returns its dataset.json.
+    """Begin the dataset at `out`, or check that it belongs to the job; return its dataset.json.
 
     Before a dataset is begun, `check_scene` generates its first scene and checks all poses over it. Raises UserError if
-    a pose does not fit the ground, or if `out` holds something else or a dataset of other settings, code or plan.
+    a pose does not fit the ground, or if `out` holds something else or a dataset with different settings, code or plan.
     """
     if not is_begun(out) and job.plan.scenes:
         check_scene(job.plan.scenes[0].scene_id)
@@ -184,7 +184,7 @@ def finish(job: Job, out: Store, info: DatasetInfo) -> Dataset:
 
 
 def _begin_plan(store: Store, job: Job) -> None:
-    """Record size and hash of a job's plan in the dataset that it begins, or compare them with the record.
+    """Record size and hash of a job's plan in a new dataset, or compare them with the existing record.
 
     Raises UserError if the dataset was begun with another plan.
     """
@@ -211,7 +211,7 @@ def _is_recorded(plan: Plan) -> bool:
 
 
 def _ordered(plan: Plan) -> Iterator[TrajectoryPlan]:
-    """The trajectories of a plan, ordered by scene and name as in a manifest."""
+    """The trajectories of a plan, ordered by scene and id as in a manifest."""
     for scene_id in sorted(plan.ranges):
         yield from sorted(plan.of_scene(scene_id), key=lambda trajectory: trajectory.trajectory_id)
 

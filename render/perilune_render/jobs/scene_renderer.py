@@ -1,4 +1,4 @@
-"""Render one trajectory of a job: the unit of work, which any process can do that has the job and the store."""
+"""Render one trajectory of a job: the unit of work, for any process that has the job and the store."""
 
 import contextlib
 from collections.abc import Callable
@@ -26,10 +26,10 @@ from perilune_shared.storage.store import Store
 
 
 class SceneRenderer:
-    """Renders trajectories of a job, one at a time, and keeps the scene of the last one for the next.
+    """Renders trajectories of a job, one at a time, and keeps the current scene for the next trajectory.
 
-    Use as a context manager, and only one at a time in a process, since Blender holds only one scene. Raises UserError
-    if this process has other code than the job.
+    Use it as a context manager, and only one at a time in a process, since Blender holds only one scene. Raises
+    UserError if the code of this process differs from the job's.
     """
 
     def __init__(self, job: Job, out: Store):
@@ -44,15 +44,15 @@ class SceneRenderer:
 
     @property
     def scene_id(self) -> str | None:
-        """The scene that is kept, if any."""
+        """Id of the scene that is kept, if any."""
         if self._opened is not None:
             return self._opened[0][0]
         return self._grown[0] if self._grown is not None else None
 
     def grow(self, scene_id: str) -> Scene:
-        """Generate the ground of a scene and check that all its poses fit it. Raises UserError if one does not."""
+        """Generate the ground of a scene and check that all its poses fit it. Raises UserError otherwise."""
         if self._grown is None or self._grown[0] != scene_id:
-            self.close()  # frees the ground of the last scene first
+            self.close()  # frees the ground of the previous scene first
             job = self._job
             with interrupts_held():
                 scene = cached_scene(job.config, job.plan.view, job.scene(scene_id).seed, self._shared)
@@ -62,14 +62,14 @@ class SceneRenderer:
         return self._grown[1]
 
     def check(self, scene_id: str) -> list[str]:
-        """`grow` a scene; returns warnings: Suns that leave the site in shadow, if the poses are given."""
+        """`grow` a scene; return warnings about Suns that leave the site in shadow, if the poses are given."""
         scene, job = self.grow(scene_id), self._job
         return [] if job.config.scene is None else shadow_warnings(scene, job.plan.scenes)
 
     def render(self, index: int, advance: Callable[[], object], note: Callable[[str], object]) -> list[str]:
-        """Render a trajectory and write its files, labels and frames; returns the ids of its dark frames.
+        """Render a trajectory and write its files, labels and frames; return the ids of its dark frames.
 
-        `advance` is called after each frame, `note` with a text on the current step.
+        `advance` is called after each frame, `note` with a text about the current step.
         """
         trajectory = self._job.plan.trajectories[index]
 
@@ -110,7 +110,7 @@ class SceneRenderer:
         return self._opened[1:]
 
     def _outputs_of(self, scene_id: str, scene: Scene, note: Callable[[str], object]) -> SceneOutputs:
-        """Outputs beside the frames of a scene, which all its cameras share."""
+        """Outputs of a scene beside the frames, shared by all its cameras."""
         if self._outputs is None or self._outputs[0] != scene_id:
             if self._job.config.hazard is not None:
                 note(f"{scene_id}: making the hazard map")
@@ -118,7 +118,7 @@ class SceneRenderer:
         return self._outputs[1]
 
     def _write_hazard(self, scene_id: str, scene: Scene, outputs: SceneOutputs) -> dict[str, str | int]:
-        """Write the hazard map of a scene if there is one; returns its columns of the table `scenes`."""
+        """Write the hazard map of a scene if there is one; return its columns of the table `scenes`."""
         if outputs.hazard is None:
             return {}
         path = scene_file_path(scene_id, "hazard")

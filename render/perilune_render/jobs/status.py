@@ -12,12 +12,12 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Store
 
 SILENT_S = 300.0
-"""Age of its record after which a process counts as ended, seconds."""
+"""Age of a process's record above which the process counts as ended, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The state of a dataset that is rendered."""
+    """The state of a dataset that is being rendered."""
 
     complete: bool
     """Whether the dataset is finished."""
@@ -28,24 +28,24 @@ class Status:
     n_frames: int
     """Number of frames."""
     frames_done: int
-    """Number of frames in finished trajectories; a mean over all if trajectories differ in length."""
+    """Number of frames in finished trajectories; estimated from the mean length if trajectories differ in length."""
     running: tuple[str, ...]
     """Trajectories that are being rendered."""
     n_silent: int
-    """Number of processes without a sign of life for SILENT_S seconds."""
+    """Number of processes whose record is older than SILENT_S seconds."""
     failed: dict[str, str]
     """Error of each trajectory that failed repeatedly."""
     frames_per_s: float
-    """Frames per second of all running processes, with the time to generate ground."""
+    """Frames per second of all running processes, including the time to generate ground."""
 
     @property
     def left_s(self) -> float | None:
-        """Time left at this rate, seconds; None if nothing is running."""
+        """Remaining time at this rate, seconds; None if nothing is running."""
         return (self.n_frames - self.frames_done) / self.frames_per_s if self.frames_per_s > 0 else None
 
 
 def datasets_below(store: Store) -> list[Store]:
-    """The dataset at an address, or the datasets `detect` and `nav` below it. Raises UserError if there is none."""
+    """The dataset at an address, or the datasets `detect` and `nav` below it. Raises UserError without a dataset."""
     found = [each for each in (store, *map(store.sub, KINDS)) if each.exists(INFO_NAME)]
     if not found:
         raise UserError(store.address, INFO_NAME, "no such file", "the address of a dataset that was begun")

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from perilune_render.flight.plan import Plan
 
 N_ATTEMPTS = 4
-"""Number of times that a trajectory is tried: once, and again three times."""
+"""Number of attempts for each trajectory: a first and three more."""
 
 
 class WorkList:
-    """Hands out trajectories by their index in the plan, so that each process changes scenes rarely."""
+    """Hands out trajectories by their index in the plan, so that each process rarely changes scenes."""
 
     def __init__(self, plan: Plan, indices: Iterable[int]):
         self._scene = [trajectory.scene_id for trajectory in plan.trajectories]
@@ -31,8 +31,8 @@ class WorkList:
     def take(self, scene_id: str | None) -> int | None:
         """The next trajectory for a process that keeps the scene `scene_id`; None if no trajectory is waiting.
 
-        The first choice is a trajectory of the same scene, the second a scene that no process has begun, the third the
-        scene that the fewest processes render.
+        The first choice is a trajectory of the same scene, the second a trajectory of a scene that no process has
+        begun, the third a trajectory of the scene that the fewest processes are rendering.
         """
         if scene_id not in self._waiting:
             while self._untouched and self._untouched[0] not in self._waiting:
@@ -56,7 +56,7 @@ class WorkList:
         self._running[self._scene[index]] -= 1
 
     def failed(self, index: int, error: str) -> int:
-        """Record a failed attempt; returns the number of attempts left. With some left, the trajectory waits again."""
+        """Record a failed attempt; return the number of attempts left. If it is not 0, the trajectory waits again."""
         self._running[self._scene[index]] -= 1
         left = N_ATTEMPTS - self._attempts[index]
         if left > 0:

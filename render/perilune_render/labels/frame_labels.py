@@ -33,15 +33,16 @@ class Labels:
     crater_id: np.ndarray
     """Id in the table `craters` of the scene (N,)."""
     ellipses: Ellipses
-    """Images of the rims."""
+    """Ellipses of the rims in the image."""
     visible_fraction: Array
     """Share of the rim that is inside the image and not hidden (N,)."""
     sunlit_fraction: Array
-    """Share of the ellipse's pixels in the image that are sunlit; 0 if it has none (N,)."""
+    """Share of the ellipse's pixels in the image that are sunlit; 0 without such pixels (N,)."""
     contrast: Array
-    """Amplitude of the crater's shading over its standard error from noise and clutter; NaN if not measured (N,)."""
+    """Amplitude of the crater's shading, divided by its standard error from noise and clutter; NaN if not measured
+    (N,)."""
     n_above: int | None = None
-    """Number of craters centred in the image that are too large for a label; None if not counted."""
+    """Number of craters with their centre in the image that are too large for a label; None if not counted."""
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "Labels":
@@ -111,9 +112,9 @@ def label_frame(
 ) -> Labels:
     """Labels by the paper's rule: centre in the frame, radius sqrt(a b) from radii_px[0] to radii_px[1].
 
-    `position_m` (3,) is in O_L. Visibility is measured in the rendered depth. `radiance` is in the pixels of `camera`
+    `position_m` (3,) is in O_L. Visibility is computed from the rendered depth. `radiance` has the pixels of `camera`
     (`perilune_render.imaging.resampling.seen_by`). The contrast also depends on the sensor and is NaN here:
-    `with_contrast` measures it.
+    `with_contrast` adds it.
     """
     pose, (min_radius_px, max_radius_px) = (position_m, rotation_camera_from_site), radii_px
     if any(camera.distortion):
@@ -147,7 +148,7 @@ def label_frame(
 
 
 def _in_camera(points_m: Array, position_m: Array, rotation_camera_from_site: Array) -> Array:
-    """`camera_from_site` for many points (N, 3): NumPy subtracts columns ten times as fast as rows of three numbers."""
+    """`camera_from_site` for many points (N, 3): NumPy subtracts long columns ten times as fast as rows of three."""
     offset = np.empty_like(points_m)
     for k in range(3):
         np.subtract(points_m[:, k], position_m[k], out=offset[:, k])
@@ -172,11 +173,11 @@ def with_contrast(
 def _image_from_rim(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
 ) -> Array:
-    """Matrices (N, 2, 2) from the rim's plane, in radii along and across the Sun's direction, to pixels."""
+    """Matrices (N, 2, 2) from the rim's plane, in radii along and across the direction of the Sun, to pixels."""
     centre, normal = circles.centre_m[rows], circles.normal[rows]
     along = sun - (normal @ sun)[:, None] * normal
     length = np.linalg.norm(along, axis=1, keepdims=True)
-    # With the Sun along the rim's normal, no direction in the plane points towards it: use any.
+    # With the Sun along the rim's normal, no direction in the plane points towards the Sun: use any direction.
     along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), plane_basis(normal)[0])
     axes = circles.radius_m[rows, None, None] * np.stack([along, np.cross(normal, along)], axis=1)
     ends = [camera.project(camera_from_site(centre[:, None] + side * axes, position_m, rotation)) for side in (1, -1)]
@@ -188,9 +189,9 @@ def _visible_fraction(
 ) -> Array:
     """Visible share (N,) of each rim, by comparing the rim's depth with the rendered depth.
 
-    The label circle is plane and the real rim is rough, so a point of the circle may be below the ground. It counts as
-    hidden only if the ground in front of it is nearer by more than SLACK_RADII radii and by more than SLACK_PX pixel
-    widths. A point on a pixel of the sky, beyond the horizon, is hidden.
+    The label circle is flat and the real rim is rough, so a point of the circle may be below the ground. The point
+    counts as hidden only if the ground in front of it is nearer by more than SLACK_RADII radii and by more than
+    SLACK_PX pixel widths. A point beyond the horizon, on a pixel of the sky, is hidden.
     """
     if not len(rows):
         return np.empty(0)
@@ -219,9 +220,9 @@ def crater_index(
     """Instance image (h, w) float32: id of the smallest crater whose visible interior holds the pixel's centre, or -1.
 
     The interior is the disc within the rim. It is visible where the ground, at `depth_m` (h, w) metres along the axis,
-    is not nearer than the disc's plane by more than SLACK_RADII radii and SLACK_PX pixel widths; without depth all of
-    it is visible. Pixels of the sky, whose depth is infinite, are -1. Every crater at least a pixel wide counts, also
-    those without a label. `camera` has no distortion.
+    is not nearer than the disc's plane by more than SLACK_RADII radii and SLACK_PX pixel widths; without `depth_m` the
+    whole interior is visible. Pixels of the sky, whose depth is infinite, are -1. All craters at least a pixel wide are
+    included, even without a label. `camera` has no distortion.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     candidate = _reaching_in(camera, in_camera, circles.radius_m)
@@ -241,7 +242,7 @@ def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray
     rows = np.flatnonzero((z > 0) & (2 * camera.fx_px * radius_m > z))
     x, y, z, radius = x[rows], y[rows], z[rows], radius_m[rows]
     with np.errstate(divide="ignore"):
-        # Bound on how far a sphere of that radius extends from its centre in the image.
+        # Upper bound on how far a sphere of this radius extends from its centre in the image.
         wide = np.where(z > radius, radius / np.abs(z - radius), np.inf)
     size = np.array([camera.width_px, camera.height_px])
     middle = np.stack([camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px], axis=-1)

@@ -2,7 +2,8 @@
 
 The returned energy follows the lidar equation of an extended Lambertian target without atmosphere: it is proportional
 to albedo x cos(incidence) / range^2 (Wagner et al. 2006, ISPRS Journal of Photogrammetry and Remote Sensing 60, 100).
-Deviations: a pixel is one ray through its centre, so edges give no mixed ranges; the camera does not move meanwhile.
+Deviations: a pixel is one ray through its centre, so edges give no mixed ranges; the camera does not move during the
+flash.
 """
 
 from dataclasses import dataclass
@@ -26,9 +27,9 @@ class FlashImage:
     range_m: Array
     """Measured distances along the pixels' rays; NaN without a return."""
     true_m: Array
-    """True distances to ground or boulders; NaN where there are none."""
+    """True distances to ground or boulders; NaN without a hit."""
     intensity: Array
-    """Energy of the returns, as a multiple of the least that is detected; NaN without a return."""
+    """Energy of the returns, as a multiple of the smallest detectable energy; NaN without a return."""
 
     def exr(self) -> bytes:
         """An EXR file with the channels range, range_true and intensity."""
@@ -36,12 +37,12 @@ class FlashImage:
 
 
 def lidar_camera(config: FlashLidarConfig) -> Camera:
-    """The pinhole whose pixels the lidar has."""
+    """The pinhole camera with the pixels of the lidar."""
     return Camera.from_field_of_view(config.width_px, config.height_px, config.horizontal_fov_deg)
 
 
 def flash(surface: Surface, shot: Shot, config: FlashLidarConfig) -> FlashImage:
-    """The image of the lidar at the pose of a shot; the noise depends on its seed and index alone."""
+    """The image of the lidar at the pose of a shot; the noise depends only on the shot's seed and index."""
     camera = lidar_camera(config)
     rays = (camera.rays(camera.pixel_centres()) @ shot.rotation_camera_from_site).reshape(-1, 3)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -60,9 +61,9 @@ def flash(surface: Surface, shot: Shot, config: FlashLidarConfig) -> FlashImage:
 def _noisy(
     distance_m: Array, energy: Array, config: FlashLidarConfig, rng: np.random.Generator
 ) -> tuple[Array, Array, np.ndarray]:
-    """Measured ranges, metres, energies and whether there is a return (N,), from true distances and mean energies."""
+    """Measured ranges, metres, energies, and whether there is a return (N,), from true distances and mean energies."""
     n = len(distance_m)
-    # Drawn always and in this order, so that one setting does not change the noise of another.
+    # Always draw all of these in this order, so that no setting changes the noise of another.
     of_range, of_energy, is_false, false_m = rng.normal(size=n), rng.normal(size=n), rng.random(n), rng.random(n)
     energy = energy * (1 + config.energy_sigma_share * of_energy)
     measured = np.where(np.isfinite(distance_m), distance_m, 0.0)

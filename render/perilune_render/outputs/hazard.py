@@ -2,9 +2,9 @@
 
 The definitions come from hazard detection in the ALHAT project (Johnson et al. 2008, IEEE Aerospace Conference,
 "Analysis of on-board hazard detection and avoidance for safe lunar landing"): a plane is fitted to the heights in a
-footprint; its slope is the slope, and the largest deviation from it is the roughness. Deviations: the map shows the
-true ground, not measurements; the plane is fitted by least squares to the ground without boulders, which count in the
-roughness.
+footprint; the slope is the slope of this plane, and the roughness is the largest deviation from it. Deviations: the map
+shows the true ground, not measurements; the plane is fitted by least squares to the ground without boulders, but
+boulders count in the roughness.
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ LAYERS = {
     "shadow": "1",
     "safe": "1",
 }
-"""Layers of a map in their order, with their units."""
+"""Layers of a map, in order, with their units."""
 FRAME_LAYERS = ("slope", "roughness", "boulder", "safe")
-"""Layers that the EXRs of frames have as channels on request."""
+"""Layers that become channels of the frames' EXRs on request."""
 _LIFT_M = 1e-3
 """Start of a shadow ray above its facet, metres."""
 _ROWS_AT_ONCE = 128
@@ -41,16 +41,16 @@ _ROWS_AT_ONCE = 128
 
 @dataclass(frozen=True, slots=True)
 class HazardMap:
-    """Layers of n x n square pixels around the site; rows go south, columns east, as -x and y of O_L do."""
+    """Layers of n x n square pixels around the site; rows go south (y of O_L), columns east (-x of O_L)."""
 
     pixel_m: float
     """Size of a pixel, metres."""
     layers: dict[str, np.ndarray]
-    """Layers (n, n) float32 by the names in LAYERS: height of the surface, boulders included; slope, roughness, largest
-    height of a boulder and share of shadow in the footprint around the pixel's centre; safe, 1 or 0."""
+    """Layers (n, n) float32 by the names in LAYERS: height of the surface with boulders; slope, roughness, largest
+    boulder height and share of shadow in the footprint around the pixel's centre; safe (1 or 0)."""
 
     def at(self, x_m: Array, y_m: Array) -> dict[str, np.ndarray]:
-        """The FRAME_LAYERS (...) float32 of the pixels at places (...) of O_L; NaN off the map and for NaN."""
+        """The FRAME_LAYERS (...) float32 of the pixels at positions (...) in O_L; NaN off the map and at NaN."""
         n = len(self.layers["safe"])
         with np.errstate(invalid="ignore"):
             column, row = (np.floor(offset_m / self.pixel_m + n / 2) for offset_m in (-x_m, y_m))
@@ -60,7 +60,7 @@ class HazardMap:
 
 
 def check_hazard(config: HazardConfig, grid: Grid) -> None:
-    """Raise UserError if the footprints of a map do not all lie on the ground of `grid`."""
+    """Raise UserError unless all footprints of a map lie on the ground of `grid`."""
     needed = (config.side_px() + 2 * config.margin_px() + 1) * config.pixel_m
     if needed > grid.extent_m:
         most = grid.extent_m - config.footprint_m - config.pixel_m
@@ -71,8 +71,8 @@ def check_hazard(config: HazardConfig, grid: Grid) -> None:
 def hazard_map(surface: Surface, scene: Scene, sun: Array, config: HazardConfig) -> HazardMap:
     """The hazard map of a scene lit from `sun` (3,), a unit vector in O_L; takes a second for 500 x 500 pixels.
 
-    Heights and shadows are those at the pixels' centres. A boulder counts with its highest point, however small it is.
-    The Sun is a point at its centre, so shadows have no penumbra.
+    Heights and shadows are evaluated at pixel centres. Every boulder, however small, counts with its highest point. The
+    Sun is treated as a point, so shadows have no penumbra.
     """
     n, margin = config.side_px(), config.margin_px()
     side = n + 2 * margin
@@ -101,7 +101,7 @@ def hazard_map(surface: Surface, scene: Scene, sun: Array, config: HazardConfig)
 
 
 def _top_and_shadow(surface: Surface, x_m: Array, y_m: Array, sun: Array) -> tuple[Array, Array]:
-    """Heights (N,) of the surface with boulders, metres, and 1 where the Sun does not reach it, else 0."""
+    """Heights (N,) of the surface with boulders, metres, and shadow: 1 where the Sun does not reach it, else 0."""
     above = surface.ground.highest_m + 1.0
     start = np.stack([x_m, y_m, np.full(len(x_m), above)], axis=1)
     distance, normal = first_hits(surface, start, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)))
@@ -139,10 +139,10 @@ class _Footprint(NamedTuple):
 
 @njit()
 def _footprints(ground, above, dark, footprint):
-    """Slope, degrees, roughness and largest boulder, metres, and share of shadow of the footprint of each pixel.
+    """For the footprint of each pixel: slope, degrees, roughness and largest boulder, metres, and share of shadow.
 
-    The arrays (side, side) extend beyond these pixels by the footprint's margin. A footprint is symmetric, so the sums
-    of the plane's fit have no mixed terms.
+    The arrays (side, side) extend beyond these pixels by the margin of the footprint. A footprint is symmetric, so the
+    sums for the fit of the plane have no mixed terms.
     """
     down, right, margin, pixel_m = footprint
     n, m = len(ground) - 2 * margin, len(down)
@@ -178,7 +178,7 @@ def _footprints(ground, above, dark, footprint):
 
 
 def hazard_tiff(hazard: HazardMap, latitude_deg: float, longitude_deg: float) -> bytes:
-    """A float32 GeoTIFF with a named band for each layer: north up, azimuthal equidistant about the site."""
+    """A float32 GeoTIFF with a named band for each layer: north up, azimuthal equidistant around the site."""
     from rasterio.io import MemoryFile
 
     n = len(hazard.layers["safe"])

@@ -1,4 +1,4 @@
-"""The outputs beside the frames of one lit scene, as a configuration asks for them."""
+"""The outputs that a configuration requests beside the frames of one lit scene."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,12 +17,12 @@ from perilune_shared.geometry.frames import Array
 
 @dataclass(frozen=True, slots=True)
 class FrameOutputs:
-    """Outputs of a frame beside its rendering."""
+    """Outputs of a frame in addition to its rendering."""
 
     channels: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """More channels of the EXR (h, w), in the pixels of the engine's camera."""
+    """Additional EXR channels (h, w), in the pixels of the engine's camera."""
     lidar: bytes | None = None
-    """File of the flash lidar; None for none."""
+    """File of the flash lidar; None without a flash lidar."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +32,11 @@ class SceneOutputs:
     surface: Surface | None = None
     """Surface of the scene; None if no output needs it."""
     hazard: HazardMap | None = None
-    """Hazard map of the scene; None for none."""
+    """Hazard map of the scene; None without a map."""
     has_channels: bool = False
-    """Whether the EXRs have channels of the hazard map."""
+    """Whether the EXRs have channels from the hazard map."""
     flash_lidar: FlashLidarConfig | None = None
-    """Settings of the flash lidar; None for none."""
+    """Settings of the flash lidar; None without a flash lidar."""
 
     @classmethod
     def of(cls, scene: Scene, config: DatasetConfig, sun: Array) -> "SceneOutputs":
@@ -50,7 +50,7 @@ class SceneOutputs:
         return cls(surface, hazard, config.hazard.frame_channels, config.flash_lidar)
 
     def of_frame(self, frame: Frame, places_m: Callable[[Frame], Array]) -> FrameOutputs:
-        """The outputs beside a frame; `places_m` is the method of its frame source."""
+        """The outputs beside a frame; `places_m` is the method of the frame source."""
         channels: Mapping[str, np.ndarray] = {}
         if self.hazard is not None and self.has_channels:
             points = places_m(frame)

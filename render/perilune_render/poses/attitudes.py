@@ -1,4 +1,4 @@
-"""Attitudes as a file states them, and the other ways in which the same numbers can be read."""
+"""Attitudes as stated in a file, and other interpretations of the same numbers."""
 
 from dataclasses import dataclass, replace
 
@@ -10,12 +10,12 @@ from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 
 @dataclass(frozen=True, slots=True)
 class Attitudes:
-    """Quaternions of N poses and what they mean."""
+    """Quaternions of N poses, and their meaning."""
 
     quaternion_wxyz: Array
     """Unit quaternions (N, 4) in the file, w first."""
     site_from_camera: bool
-    """Whether they rotate from the camera to the site."""
+    """Whether the quaternions rotate from the camera to the site."""
     scalar_last: bool
     """Whether the file has w last."""
     axes: Array
@@ -30,7 +30,7 @@ class Attitudes:
         return np.where(q[:, :1] < 0, -q, q) + 0.0
 
     def alternatives(self) -> list[list[tuple[str, "Attitudes"]]]:
-        """Other readings of the same numbers with what to try: those that differ in one way, then those in two."""
+        """Other interpretations of the numbers, with hints: first those that differ in one way, then in two ways."""
         shift, order = (-1, "w first (qw qx qy qz)") if self.scalar_last else (1, "w last (qx qy qz qw)")
         reordered = replace(self, quaternion_wxyz=np.roll(self.quaternion_wxyz, shift, axis=1))
         is_default = np.array_equal(self.axes, np.eye(3))
@@ -48,7 +48,7 @@ class Attitudes:
 
 
 def _multiplied(left: Array, right: Array) -> Array:
-    """Products (N, 4) of a quaternion (4,) and quaternions (N, 4): the rotation of the right one is first."""
+    """Products (N, 4) of a quaternion (4,) and quaternions (N, 4): the rotation `right` is applied first."""
     a, b, c, d = left
     e, f, g, h = right.T
     return np.stack(

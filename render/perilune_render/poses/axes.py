@@ -1,4 +1,4 @@
-"""Axes of a camera's frame: which of them point right, down and forward in the image."""
+"""Axes of a camera's frame: which axes point right, down and forward in the image."""
 
 import numpy as np
 
@@ -13,9 +13,9 @@ NAMED_AXES = {"opencv": "x,y,z", "blender": "x,-y,-z"}
 
 
 def camera_axes(text: str, where: object) -> Array:
-    """The rotation (3, 3) to the axes right, down, forward from a camera's frame, by text as `x,y,z` or `blender`.
+    """The rotation (3, 3) from a camera's frame to right, down, forward, from a text such as `x,y,z` or `blender`.
 
-    Raises UserError about `where`.
+    Raises UserError that names `where`.
     """
     stated = text.strip().lower()
     names = [name.strip() for name in NAMED_AXES.get(stated, stated).split(",")]

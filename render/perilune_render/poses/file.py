@@ -1,17 +1,17 @@
 """Read poses from a file: CSV, Parquet, TUM (`timestamp tx ty tz qx qy qz qw`), EuRoC, or KITTI (3 x 4 matrices).
 
-The frame of the positions is stated in the file: in text by a comment line `# frame: O_L` above the first pose (in CSV
-above the names of the columns), in Parquet by the key `frame` of the metadata.
+The frame of the positions is stated in the file: in text files by a comment line `# frame: O_L` above the first pose
+(in CSV above the column names), in Parquet by the key `frame` of the metadata.
 
 - `O_L`: x_m, y_m, z_m of the landing site's frame.
 - `O_W`: the same axes, with the origin at `# origin_m: x y z`, the lander's first position in O_L.
 - `selenographic`: latitude_deg, longitude_deg, and height_m above the plane of O_L.
 
-Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns qw, qx, qy, qz, as `rotation_wxyz` in a
-manifest. `# rotation: site_from_camera` states the opposite direction; in TUM, EuRoC and KITTI files that is always so.
-`# camera_axes: blender`, or three axes, states other axes of the camera than x right, y down, z forward.
+Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns qw, qx, qy, qz, like `rotation_wxyz` in
+a manifest. `# rotation: site_from_camera` states the opposite direction, which TUM, EuRoC and KITTI files always have.
+`# camera_axes: blender`, or three axes, states camera axes other than x right, y down, z forward.
 
-`# site: latitude longitude`, degrees, is optional; poses of another site than the scene's are refused.
+`# site: latitude longitude`, degrees, is optional; poses of a site that differs from the scene's are rejected.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ FRAMES = {"O_L": POSITION, "O_W": POSITION, "selenographic": SELENOGRAPHIC}
 """Columns of the position in each frame."""
 _DIRECTIONS = ("camera_from_site", SITE_FROM_CAMERA)
 _LENGTH_TOLERANCE = 0.01
-"""Largest deviation of a quaternion's length from 1 that rounding of its digits explains."""
+"""Largest deviation of a quaternion's length from 1 that rounded digits can explain."""
 _LARGEST_M = 1e6
 _SAME_SITE_M = 0.1
 
@@ -60,18 +60,18 @@ class GivenPoses:
     rotation_wxyz: Array
     """rotation_camera_from_site, unit quaternions (N, 4) with w >= 0."""
     velocity_mps: Array
-    """Velocity of the camera, metres per second (N, 3); 0 where the file has none."""
+    """Velocity of the camera, metres per second (N, 3); 0 if the file has no velocities."""
     sun_deg: Array | None
-    """Azimuth, clockwise from north, and elevation of the Sun, degrees (N, 2); None if the file has none."""
+    """Azimuth, clockwise from north, and elevation of the Sun, degrees (N, 2); None if the file has no Sun."""
     trajectory: np.ndarray
     """Number of the trajectory of each frame, from 0, not descending (N,)."""
     angular_velocity_radps: Array | None = None
-    """Angular velocity of the camera, O_C, radians per second (N, 3); None if the file has none."""
+    """Angular velocity of the camera, O_C, radians per second (N, 3); None if not in the file."""
 
     line: np.ndarray | None = None
-    """Line of each pose in the file, from 1 (N,); None for a file of rows, counted from 0."""
+    """Line of each pose in the file, from 1 (N,); None for a file with rows instead, which count from 0."""
     attitudes: Attitudes | None = None
-    """The attitudes as in the file; None if there is none."""
+    """The attitudes as in the file; None without a file."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -92,10 +92,10 @@ class GivenPoses:
 
 
 def read_poses(path: Path, latitude_deg: float, longitude_deg: float, axes: str | None = None) -> GivenPoses:
-    """The poses of a file, for a site at these coordinates.
+    """Read the poses of a file, for a site at these coordinates.
 
-    `axes` are the camera's axes as in `camera_axes`, if the file does not state them. Raises UserError with the first
-    line that is wrong.
+    `axes` states the camera's axes as in `camera_axes`, if the file does not state them. Raises UserError with the
+    first faulty line.
     """
     table = read_pose_table(path)
     columns, stated = table.columns, table.stated
@@ -142,7 +142,7 @@ def read_poses(path: Path, latitude_deg: float, longitude_deg: float, axes: str 
 
 
 def _refuse(table: PoseTable, wrong: np.ndarray, field: str, found: Callable[[int], str], expected: str) -> None:
-    """Raise UserError for the first true value of `wrong` (N,); `found` makes a text from its index."""
+    """Raise UserError for the first true value of `wrong` (N,); `found` returns a text for its index."""
     if wrong.any():
         row = int(np.argmax(wrong))
         raise UserError(*table.columns.at(row, field), found(row), expected)
@@ -162,7 +162,7 @@ def _axes(path: Path, stated: str | None, given: str | None) -> Array:
 
 
 def _motion(table: PoseTable, field: str, names: tuple[str, ...], largest: float, unit: str) -> Array | None:
-    """Vectors (N, 3) of at most this length; None if the file has none."""
+    """Vectors (N, 3) with a length of at most `largest`; None if the file has no such columns."""
     if names[0] not in table.columns:
         return None
     values = _vectors(table, names)
@@ -173,7 +173,7 @@ def _motion(table: PoseTable, field: str, names: tuple[str, ...], largest: float
 
 
 def _check_site(path: Path, stated: str | None, latitude_deg: float, longitude_deg: float) -> None:
-    """Raise UserError if a file states another site than the scene's."""
+    """Raise UserError if a file states a site that differs from the scene's."""
     if stated is None:
         return
     try:
@@ -218,7 +218,7 @@ def _attitudes(table: PoseTable, axes: Array) -> Attitudes:
 
 
 def _trajectories(table: PoseTable) -> np.ndarray:
-    """Number of each pose's trajectory, by the column `trajectory`, whose equal values must follow each other."""
+    """Number of each pose's trajectory, from the column `trajectory`, in which equal values must be consecutive."""
     if TRAJECTORY not in table.columns:
         return np.zeros(table.columns.n_rows, int)
     names = table.columns.texts(TRAJECTORY)

@@ -1,4 +1,4 @@
-"""Load SPICE kernels. A meta-kernel names further files: all are checked before SPICE opens one."""
+"""Load SPICE kernels. A meta-kernel names further files, and all are checked before SPICE opens any."""
 
 import contextlib
 import stat
@@ -26,7 +26,7 @@ def library() -> Any:
 
 @contextlib.contextmanager
 def loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
-    """Load kernels, and those that meta-kernels name, into an empty pool; clear it at the end.
+    """Load kernels, and the kernels that meta-kernels name, into an empty pool; clear the pool at the end.
 
     Raises UserError for a file that is missing or is not a regular file, and for a meta-kernel within a meta-kernel,
     before SPICE opens it: opening a pipe or a device can block for ever.
@@ -39,7 +39,7 @@ def loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
                 if not named[path]:
                     spice.furnsh(str(path))
                     continue
-                # Load the files that were checked, not those that SPICE would find.
+                # Load the files that were checked, not the files that SPICE would find.
                 spice.ldpool(str(path))
                 for name in (_LISTED, _VALUES, _SYMBOLS):
                     spice.dvpool(name)
@@ -52,7 +52,7 @@ def loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
 
 
 def _named_by(spice: Any, path: Path) -> list[Path]:
-    """The files that a kernel names, checked; none unless it is a meta-kernel."""
+    """The files that a kernel names, checked; empty unless it is a meta-kernel."""
     _check_regular(path, path, "a SPICE kernel or meta-kernel")
     named = []
     for name in _listed(spice, path):
@@ -79,7 +79,7 @@ def _check_regular(where: Path, path: Path, expected: str) -> None:
 
 
 def _listed(spice: Any, path: Path) -> list[str]:
-    """Paths in KERNELS_TO_LOAD of a text kernel, with the values of its path symbols. Leaves the pool empty."""
+    """Paths in KERNELS_TO_LOAD of a text kernel, with path symbols replaced. Leaves the pool empty."""
     with reported(spice, str(path)):
         architecture, _ = spice.getfat(str(path))
     if architecture not in ("KPL", "?"):
@@ -89,7 +89,7 @@ def _listed(spice: Any, path: Path) -> list[str]:
         try:
             spice.ldpool(str(path))
         except spice.exceptions.SpiceyError:
-            # Loading it reports the same error, with the place.
+            # Loading the kernel will report this error with its location.
             return []
         names, values, symbols = (_texts(spice, path, name) for name in (_LISTED, _VALUES, _SYMBOLS))
     finally:
@@ -97,14 +97,14 @@ def _listed(spice: Any, path: Path) -> list[str]:
     if len(values) != len(symbols):
         found = f"{len(values)} values for {len(symbols)} symbols"
         raise UserError(path, f"{_VALUES} and {_SYMBOLS}", found, "as many of each")
-    # The longest first: a symbol may begin with another one.
+    # The longest first, since a symbol may begin with another symbol.
     for symbol, value in sorted(zip(symbols, values, strict=True), key=lambda pair: -len(pair[0])):
         names = [name.replace(f"${symbol}", value) for name in names]
     return names
 
 
 def _texts(spice: Any, path: Path, name: str) -> list[str]:
-    """Texts of a variable of the pool; a text that ends with + continues in the next one."""
+    """Texts of a variable of the pool; a text that ends with + continues in the next text."""
     try:
         n_parts, kind = spice.dtpool(name)
     except spice.exceptions.NotFoundError:
@@ -141,4 +141,4 @@ _EXPECTED = {
     "SPICE(KERNELVARNOTFOUND)": "kernels (PCK, SCLK) with these values",
     "SPICE(NOLEAPSECONDS)": "a kernel of leap seconds (LSK)",
 }
-"""What is needed, by SPICE's short message."""
+"""What is missing, by SPICE's short error message."""

@@ -22,15 +22,16 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 SAME_SUN_DEG = 0.05
-"""Frames whose Suns differ by less share the Sun of the first of them in the file: a tenth of the Sun's diameter."""
+"""Frames whose Suns differ by less than this share the Sun of the first such frame; a tenth of the Sun's diameter,
+degrees."""
 _MOST_SCENES = 1000
 _N_VIEWS = 24
 _LOWER = 0.9
-"""Rise of the ground towards a camera for which the views have a margin, share of the camera's height."""
+"""Lowest camera height that the views allow for, as a share of its height: the ground may rise towards the camera."""
 _WIDER = 1.05
 _SPLIT = "test"
 _N_CHECKED = 1000
-"""Number of poses, evenly spread, whose attitudes are checked for another reading of the file."""
+"""Number of evenly spaced poses whose attitudes are checked for other interpretations of the file."""
 
 
 def scene_seed(config: DatasetConfig) -> int:
@@ -44,7 +45,7 @@ def trajectory_seed(seed: int, number: int) -> int:
 
 
 def views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
-    """Views that hold what all cameras see from all poses, with margins for relief, rounded to three digits.
+    """Views that contain all ground seen by any camera from any pose, with margins for relief, to three digits.
 
     The ground is taken to be at most a tenth of a camera's height above or below the plane z = 0. Raises UserError for
     a pose that is not above the plane or that shows the horizon.
@@ -55,7 +56,7 @@ def views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ..
 
 
 def horizon_views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
-    """Views with horizon that hold all poses, rounded to three digits; the last one has the height of the highest pose.
+    """Views with horizon that contain all poses, rounded to three digits; the last view is at the highest pose.
 
     The ground is taken to be at most a tenth of a camera's height above the plane z = 0. Raises UserError for a pose
     that is not above the plane, or higher than HIGHEST_M.
@@ -75,7 +76,7 @@ def horizon_views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewCo
 
 
 def _views(height_m: Array, reach_m: Array) -> list[ViewConfig]:
-    """Views that hold cameras at heights (N,) with reaches (N,), both in metres."""
+    """Views that contain cameras at heights (N,) with reaches (N,), both in metres."""
     edges = np.geomspace(_LOWER * height_m.min(), _LOWER * height_m.max() * 1.001, _N_VIEWS + 1)
     views: list[ViewConfig] = []
     for low, high in pairwise(edges):
@@ -87,7 +88,7 @@ def _views(height_m: Array, reach_m: Array) -> list[ViewConfig]:
 
 
 def _check_above(height_m: Array, poses: GivenPoses, where: object) -> None:
-    """Refuse cameras at heights (N,) above O_L's plane that are not above it."""
+    """Raise UserError for cameras whose height (N,) over O_L's plane is not positive."""
     _refuse(height_m <= 0, poses, where, lambda n: f"z {height_m[n]:.1f} m", "above 0, the height of the site")
 
 
@@ -99,9 +100,9 @@ def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tu
 
 
 def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: bool) -> None:
-    """Refuse attitudes that do not show the ground if another reading of the file shows it in all frames; name it.
+    """Raise UserError if attitudes miss the ground and another interpretation shows it in all frames; name that one.
 
-    Checks up to _N_CHECKED poses. Others that leave the ground are refused later.
+    Checks up to _N_CHECKED poses. Other poses that miss the ground are rejected later.
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _N_CHECKED)).round().astype(int))
     position = poses.position_m[chosen]
@@ -153,7 +154,7 @@ def _corner_rays(camera: Camera, matrices: Array) -> Array:
 def _reach(poses: GivenPoses, mounted: MountedCamera, name: str | None, where: object) -> tuple[Array, Array]:
     """Height of a camera and largest |x| or |y| of the ground that it sees, metres, (N,) each, for poses of the body.
 
-    Raises UserError as `views_of`.
+    Raises the errors of `views_of`.
     """
     camera, (position, rotation) = mounted.exr_camera, _poses_of(poses, mounted, name)
     height = position[:, 2]
@@ -211,7 +212,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
 
 
 def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarray]:
-    """Azimuth and elevation of each different Sun, degrees, and for each frame the index (N,) of its Sun."""
+    """Azimuth and elevation of each different Sun, degrees, and the index (N,) of each frame's Sun."""
     if poses.sun_deg is None:
         return [np.array([scene.sun_azimuth_deg, scene.sun_elevation_deg])], np.zeros(len(poses), int)
     suns: list[Array] = []
@@ -242,20 +243,20 @@ def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: i
     whole = np.flatnonzero(poses.trajectory == number)
     part, origin = partial(_flight, poses, rows, whole), partial(_origin, poses, rows)
     seed = trajectory_seed(scene.seed, number)
-    # Number frames across a change of the Sun: equal numbers would have equal noise.
+    # Continue the numbers when the Sun changes, since equal numbers would give equal noise.
     index = (rows - whole[0]).tolist()
     return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False, origin=origin)
 
 
 def _origin(poses: GivenPoses, rows: np.ndarray, index: int) -> str:
-    """Where the pose at an index of `rows` stands in the file of poses."""
+    """Location in the pose file of the pose at an index of `rows`, for messages."""
     return poses.origin(int(rows[index]))
 
 
 def _flight(poses: GivenPoses, rows: np.ndarray, whole: np.ndarray) -> Flight:
-    """The flight through the poses `rows` of a trajectory with the poses `whole`; its first one has the time 0.
+    """The flight through the poses `rows` of a trajectory; the first pose of the trajectory's poses `whole` has time 0.
 
-    The nominal trajectory is a straight line from the first pose of the whole one to the last.
+    The nominal trajectory is a straight line from the first to the last pose of the whole trajectory.
     """
     first, last = whole[0], whole[-1]
     duration = float(poses.time_s[last] - poses.time_s[first])

@@ -1,4 +1,4 @@
-"""Read the table of a file of poses: CSV, Parquet, TUM, EuRoC or KITTI, with what its header states.
+"""Read the table of a pose file (CSV, Parquet, TUM, EuRoC or KITTI) and the statements in its header.
 
 All formats are converted to the columns of the CSV format. The reader of tables has limits on rows and bytes.
 """
@@ -39,7 +39,7 @@ _OTHER_SUFFIXES = {".json": "JSON, as of NeRF or Blender", ".bag": "a ROS bag", 
 _LARGEST_S = 1e11
 """Largest time that can be in seconds; nanoseconds since 1970 are 1e18."""
 _MATRIX_TOLERANCE = 0.01
-"""Largest deviation of a rotation matrix that rounding of its digits explains."""
+"""Largest deviation of a rotation matrix that rounded digits can explain."""
 _IDENTITY_TOLERANCE = 1e-6
 _EULER = re.compile(r"(roll|pitch|yaw|euler|heading|omega|phi|kappa|rot_?[xyz]$|r[xyz]$)", re.IGNORECASE)
 _MATRIX = re.compile(r"(r|m|rot)_?[0-3][0-3]$", re.IGNORECASE)
@@ -50,13 +50,13 @@ class PoseTable:
     """The table of a file, with the columns of the CSV format."""
 
     columns: Columns
-    """Time, position, rotation, and what else the file has."""
+    """Time, position, rotation, and the other columns of the file."""
     stated: dict[str, str]
-    """What its header states: frame, rotation, origin_m, site, camera_axes."""
+    """Statements in the header: frame, rotation, origin_m, site, camera_axes."""
     format: str
     """Name of the format: CSV, Parquet, TUM, EuRoC or KITTI."""
     time_ns: np.ndarray | None = None
-    """Times in the file (N,), if they are nanoseconds; `time_s` then starts from 0."""
+    """Times in the file (N,), if the file has nanoseconds; `time_s` then starts from 0."""
 
     def time_text(self, row: int) -> str:
         """The time of a row as in the file."""
@@ -66,7 +66,7 @@ class PoseTable:
 
 
 def read_pose_table(path: Path) -> PoseTable:
-    """The table of a file. Raises UserError if it cannot be read, names an unknown column, or is of another format."""
+    """Read the table of a file. Raises UserError if it is unreadable, of another format or has an unknown column."""
     suffix = path.suffix.lower()
     if path.exists() and suffix not in _SUFFIXES:
         found = _OTHER_SUFFIXES.get(suffix, suffix or "none")
@@ -101,7 +101,7 @@ def read_pose_table(path: Path) -> PoseTable:
 
 
 def _stated(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """What pairs of key and value state; other keys are ignored."""
+    """The known statements among pairs of key and value; other keys are ignored."""
     return {key.strip(): value.strip() for key, value in pairs if key.strip() in _KEYS and value}
 
 
@@ -123,7 +123,7 @@ def _euroc_header(comments: Sequence[str], n_columns: int) -> list[str] | None:
 
 
 def _check_columns(path: Path, found: Sequence[str], position: tuple[str, ...]) -> None:
-    """Raise UserError for a column that is missing, unknown, given twice, or without the others of its group."""
+    """Raise UserError for a column that is missing, unknown, given twice, or without the other columns of its group."""
     needed = (TIME, *position, *ROTATION)
     known = (*needed, *VELOCITY, *TURN, *SUN, TRAJECTORY)
     if ROTATION[0] not in found:
@@ -144,7 +144,7 @@ def _check_columns(path: Path, found: Sequence[str], position: tuple[str, ...]) 
 
 
 def _seconds(columns: Columns) -> Columns:
-    """The columns. Raises UserError for times that cannot be seconds."""
+    """Return the columns. Raises UserError for times that cannot be seconds."""
     expected = "seconds; these may be nanoseconds: divide by 1e9"
     columns.check(TIME, ~(np.abs(columns.numbers(TIME)) > _LARGEST_S), expected)
     return columns
@@ -156,7 +156,7 @@ def _renamed(columns: Columns, names: Mapping[str, str]) -> Columns:
 
 
 def _fixed_direction(path: Path, stated: dict[str, str], name: str) -> dict[str, str]:
-    """What a header states, with the direction of rotation of a format. Raises UserError if both differ."""
+    """The header's statements with the format's direction of rotation. Raises UserError if the two differ."""
     if stated.get("rotation", SITE_FROM_CAMERA) != SITE_FROM_CAMERA:
         raise UserError(path, "rotation", stated["rotation"], f"{SITE_FROM_CAMERA}, as in every {name} file")
     if stated.get("frame") == "selenographic":
@@ -165,7 +165,7 @@ def _fixed_direction(path: Path, stated: dict[str, str], name: str) -> dict[str,
 
 
 def _without_header(path: Path, stated: dict[str, str], line: int, words: Sequence[str]) -> PoseTable:
-    """A TUM or KITTI file, by the number of values in its first line."""
+    """The table of a TUM or KITTI file, recognised by the number of values in its first line."""
     n_columns = len(words)
     if n_columns not in (len(_TUM), len(_KITTI)):
         expected = "timestamp tx ty tz qx qy qz qw (TUM), or 12 values of a 3 x 4 matrix (KITTI)"
@@ -178,7 +178,7 @@ def _without_header(path: Path, stated: dict[str, str], line: int, words: Sequen
 
 
 def _euroc(path: Path, names: Sequence[str], header: Sequence[str] | None, stated: dict[str, str]) -> PoseTable:
-    """A file of EuRoC or TUM-VI: nanoseconds, and names with units, such as `q_RS_w []`."""
+    """The table of an EuRoC or TUM-VI file: times in nanoseconds, and names with units, such as `q_RS_w []`."""
     plain = {name: re.sub(r"\s*\[.*$", "", name) for name in names}
     known = {"timestamp": TIME, **_EUROC}
     for name in plain.values():
@@ -216,7 +216,7 @@ def _kitti(path: Path, columns: Columns) -> Columns:
 
 
 def _kitti_times(path: Path, n_poses: int) -> Array:
-    """Times of a KITTI file, from the file NAME.times.txt or times.txt beside it."""
+    """Times of a KITTI file, read from NAME.times.txt or times.txt beside it."""
     beside = [path.with_name(f"{path.stem}.times.txt"), path.with_name("times.txt")]
     times_file = next((each for each in beside if each.is_file()), None)
     if times_file is None:

@@ -35,9 +35,9 @@ _N_FRAMES = 4
 def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, map_path: Path) -> None:
     """Write a contact sheet of the first scene and trajectory, frames evenly spaced in time, and a map of the scene.
 
-    Beneath each camera's frames are the same frames with labels and, if there is one, the outline of the elevation
-    model. The map shows the trajectories over this ground. Prints a warning for each Sun that leaves the site in
-    shadow. Raises UserError if the engine is not installed, and at `where` if poses do not fit the ground.
+    Below each camera's frames, the frames are repeated with labels and the outline of the elevation model, if any. The
+    map shows the trajectories over this ground. Prints a warning for each Sun that leaves the site in shadow. Raises
+    UserError if the engine is not installed, and with `where` if poses do not fit the ground.
     """
     check_installed(config.render.engine)
     scene_plan = plan.scenes[0]
@@ -77,7 +77,7 @@ def _rows(
     config: DatasetConfig,
     n_frames: int,
 ) -> tuple[list[np.ndarray], list[str]]:
-    """Frames of a trajectory, then the same frames with labels, and the ids of the dark ones."""
+    """Frames of a trajectory, then these frames with labels, and the ids of the dark frames."""
     depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
     outline = None if model is None else outline_m(model)
     plain, drawn, dark = [], [], []

@@ -18,7 +18,7 @@ _UNKNOWN = (150, 150, 150)
 _SHADOW = np.array([52.0, 30.0, 22.0])
 _MAP_PX, _EDGE_PX, _LEGEND_PX = 900, 20, 320
 _SHIFT = 4
-"""Fractional bits of the coordinates that OpenCV draws lines with."""
+"""Number of fractional bits in the coordinates of lines that OpenCV draws."""
 
 
 def map_picture(
@@ -29,7 +29,7 @@ def map_picture(
     tracks: Sequence[Array],
     horizon: SiteHorizon,
 ) -> np.ndarray:
-    """The picture (h, w, 3) uint8, BGR, north up. `tracks` are places (N, 2 or more) of O_L from the first frame on."""
+    """The picture (h, w, 3) uint8, BGR, north up. `tracks` are positions (N, 2 or more) in O_L, first frame first."""
     relief = cv2.resize(_shaded(site_map), (_MAP_PX, _MAP_PX), interpolation=cv2.INTER_AREA)
     _draw_square(relief, site_map)
     if site_map.outline_m is not None:
@@ -48,7 +48,7 @@ def map_picture(
 
 
 def _shaded(site_map: SiteMap) -> np.ndarray:
-    """Grey relief where the Sun shines, dark blue shadows, plain grey where nothing is known."""
+    """Grey relief where the Sun shines, dark blue shadows, plain grey where no heights are known."""
     known, lit = np.isfinite(site_map.height_m), site_map.sunlit
     tone = site_map.shade / (site_map.shade + max(float(np.median(site_map.shade[known])), 1e-3))
     shown = tone[known & lit]
@@ -60,7 +60,7 @@ def _shaded(site_map: SiteMap) -> np.ndarray:
 
 
 def _pixels(site_map: SiteMap, places_m: Array) -> Array:
-    """Pixels (N, 2) of places (N, 2) of O_L's plane: x is west, to the left, and y south, down."""
+    """Pixels (N, 2) of positions (N, 2) on O_L's plane: x is west (left), y is south (down)."""
     scale = _MAP_PX / (2 * site_map.half_width_m)
     return (np.asarray(places_m) - site_map.centre_m) * [-scale, scale] + _MAP_PX / 2
 
@@ -74,7 +74,7 @@ def _draw_line(
 
 
 def _draw_square(picture: np.ndarray, site_map: SiteMap) -> None:
-    """The extent of the scene's ground, if the map shows more."""
+    """Draw the extent of the scene's ground, if the map shows more."""
     half = site_map.ground_half_m
     if half < 0.99 * site_map.half_width_m:
         _draw_line(picture, site_map, half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), _GROUND, closed=True)
@@ -90,7 +90,7 @@ def _draw_site(picture: np.ndarray, u: float, v: float) -> None:
 
 
 def _draw_scale(picture: np.ndarray, pixel_m: float) -> None:
-    """A bar of a round length, at most a quarter of the map."""
+    """Draw a scale bar of a round length, at most a quarter of the map."""
     most = picture.shape[1] * pixel_m / 4
     digit = 10.0 ** np.floor(np.log10(most))
     length = float(digit * max(k for k in (1, 2, 5) if k * digit <= most))
@@ -157,7 +157,7 @@ def _draw_legend(
 
 
 def _draw_compass(picture: np.ndarray, at: tuple[int, int], azimuth_deg: float) -> None:
-    """North up, and an arrow along which sunlight falls across the map."""
+    """Draw north up, and an arrow along the direction in which sunlight crosses the map."""
     cv2.circle(picture, at, 50, _FAINT, 1, cv2.LINE_AA)
     cv2.arrowedLine(picture, (at[0], at[1] + 40), (at[0], at[1] - 40), _INK, 2, cv2.LINE_AA, tipLength=0.2)
     _write(picture, "N", (at[0] - 6, at[1] - 58))

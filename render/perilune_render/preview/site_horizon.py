@@ -16,7 +16,7 @@ _MOST_LINES = 5
 
 @dataclass(frozen=True, slots=True)
 class SiteHorizon:
-    """The ground that stands highest above the site in one direction."""
+    """The ground with the largest elevation angle seen from the site in one direction."""
 
     elevation_deg: float
     """Elevation above the site's plane, degrees."""
@@ -29,7 +29,8 @@ class SiteHorizon:
 def site_horizon_of(scene: Scene, azimuth_deg: float) -> SiteHorizon:
     """The horizon seen from the ground at the site, at an azimuth clockwise from north.
 
-    Only the ground of the scene counts, without boulders. The ground beyond its edge casts no shadow in frames either.
+    Only the ground of the scene counts, without boulders. Ground beyond the scene's edge casts no shadow in frames
+    either.
     """
     towards = sun_direction(azimuth_deg, 0.0)[:2]
     distance = _distances(scene.grid, towards)
@@ -52,7 +53,7 @@ def _distances(grid: Grid, towards: Array) -> Array:
 
 
 def shadow_warnings(scene: Scene, plans: Sequence[ScenePlan]) -> list[str]:
-    """A line for each plan over this ground whose Sun is below the site's horizon; at most _MOST_LINES of them."""
+    """One warning per plan over this ground whose Sun is below the site's horizon; at most _MOST_LINES lines."""
     lines = []
     for plan in plans:
         horizon = site_horizon_of(scene, plan.sun_azimuth_deg)

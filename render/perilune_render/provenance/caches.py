@@ -1,4 +1,4 @@
-"""Cache folders, for files that can be computed again."""
+"""Cache folders for files that can be computed again."""
 
 import contextlib
 import functools
@@ -19,9 +19,9 @@ from perilune_render.provenance.fingerprint import FOLDERS, Fingerprint, compile
 from perilune_shared.storage.files import write_text
 
 _KEPT = 5
-"""Number of machine code folders kept, one for each version of the kernels."""
+"""Number of machine code folders to keep, one for each version of the compiled functions."""
 _LONGEST_WAIT_S = 120.0
-"""Longest time to wait for another process that compiles a kernel; then this process compiles it too."""
+"""Longest wait for another process that compiles a function; after it, this process compiles the function too."""
 
 
 def cache_home() -> Path:
@@ -52,7 +52,7 @@ def _has_home() -> bool:
 
 @functools.cache
 def machine_code_folder() -> Path:
-    """The folder of machine code for the current kernels, in NUMBA_CACHE_DIR if that is set, else in `cache_home()`.
+    """The folder of machine code for the current compiled functions, in NUMBA_CACHE_DIR if set, else in `cache_home()`.
 
     Removes the least recently used folders. If the folder cannot be written, a temporary one is used.
     """
@@ -73,7 +73,7 @@ def machine_code_folder() -> Path:
 
 @contextlib.contextmanager
 def compiling(path: Path) -> Iterator[None]:
-    """Hold the lock file of a kernel, if the file system has locks and no other process holds it for too long."""
+    """Hold a compiled function's lock file, if the file system has locks and no other process holds it for too long."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError, NotImplementedError, Timeout):
             stack.enter_context(FileLock(path).acquire(timeout=_LONGEST_WAIT_S, poll_interval=0.02))
@@ -114,8 +114,8 @@ def _kept(name: str, compute: Callable[[], Fingerprint]) -> Fingerprint:
 def _state_of_sources() -> str:
     """Hash of the version of Python and of path, size and times of every source file.
 
-    The time of the last change of the inode cannot be set, so even a file that was replaced by one of the same size and
-    modification time is noticed.
+    The time of the inode's last change cannot be set, so a replacement with equal size and modification time is
+    noticed.
     """
     states = [sys.version]
     for root in FOLDERS.values():

@@ -1,8 +1,8 @@
 """Hash of the code that determines a result.
 
 Starting from some functions and classes, the hash covers every function, class and constant of perilune that they use,
-directly or indirectly. It leaves out comments, docstrings, error messages and unused code: a new docstring or command
-does not change it, a new value of a constant five calls away does.
+directly or indirectly. It omits comments, docstrings, error messages and unused code: a new docstring or command does
+not change the hash, but a new value of a constant five calls away does.
 """
 
 import ast
@@ -39,7 +39,7 @@ class Fingerprint:
     modules: frozenset[str]
     """Modules of perilune that contain this code."""
     libraries: frozenset[str]
-    """Import names of the other packages that this code uses."""
+    """Import names of other packages that this code uses."""
 
 
 @dataclass(slots=True)
@@ -56,7 +56,7 @@ class _Module:
     """Cached results of `content`."""
 
     def content(self, name: str) -> tuple[str, frozenset[tuple[str, ...]]]:
-        """The code that defines a name, and the dotted names in it; for "" the statements that define nothing."""
+        """The code that defines a name, and the dotted names in it; for "", the statements that define no name."""
         if name not in self.contents:
             statements = self.definitions[name] if name else self.others
             names = frozenset(names for statement in statements for names in _names(statement))
@@ -78,7 +78,7 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
     for root in roots:
         module, _, name = root.partition(":")
         walk.follow(module, (name,) if name else ())
-    # Without module names and empty modules, so that moving code between files does not change the hash.
+    # Omit module names and empty modules, so that moving code between files does not change the hash.
     code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items() if text))
     modules = frozenset(module for module, _ in walk.code)
     libraries = frozenset(walk.libraries - sys.stdlib_module_names)
@@ -100,7 +100,7 @@ def compiled_functions() -> tuple[str, ...]:
 
 
 class _Walk:
-    """Collects the code that names refer to, across modules."""
+    """Collects, across modules, the code to which names refer."""
 
     def __init__(self, folders: dict[str, Path]):
         self.folders = folders
@@ -109,7 +109,7 @@ class _Walk:
         self.sources: dict[str, _Module | None] = {}
 
     def follow(self, module: str, names: tuple[str, ...]) -> None:
-        """Collect what a dotted name refers to in a module; names that the module does not define are ignored."""
+        """Collect the code to which a dotted name in a module refers; ignore names that the module does not define."""
         if module.startswith(_NO_EFFECT):
             return
         source = self._source(module)
@@ -139,7 +139,7 @@ class _Walk:
                 self.follow(module, names)
 
     def _source(self, module: str) -> _Module | None:
-        """The parsed module, or None if it is not perilune's."""
+        """The parsed module, or None if it does not belong to perilune."""
         if module not in self.sources:
             package, *parts = module.split(".")
             path = self.folders[package].joinpath(*parts) if package in self.folders else None
@@ -153,7 +153,7 @@ class _Walk:
 def _parsed(text: str, settings: bool = False) -> _Module:
     """Parse a source file without docstrings and error messages; `settings` also omits fields and checks."""
     module, tree = _Module(), ast.parse(text)
-    # Imports inside a function too.
+    # Includes imports inside functions.
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:

@@ -1,16 +1,16 @@
-"""Settings of the numerical libraries, with which x86-64 processors with AVX2 and FMA compute the same digits.
+"""Settings of numerical libraries that make all x86-64 processors with AVX2 and FMA compute the same digits.
 
 NumPy, OpenBLAS, OpenCV and numba select their code by the processor, and OpenBLAS also by the number of threads; both
-change last digits. The libraries read these environment variables when they are loaded, so `perilune_render` imports
-this module first. Processors without AVX2 and FMA still differ: the C library (sin, exp, log, power), OpenCV and Cycles
-have other code for them.
+choices change the last digits. The libraries read these environment variables when they are loaded, so
+`perilune_render` imports this module first. Processors without AVX2 and FMA still differ: the C library (sin, exp, log,
+power), OpenCV and Cycles have different code for them.
 """
 
 import os
 import sys
 
 SETTINGS = {
-    # NumPy's least common code. Its code for AVX-512 has other last digits in log, power and others.
+    # Use NumPy's baseline code: its code for AVX-512 gives different last digits in log, power and other functions.
     "NPY_DISABLE_CPU_FEATURES": "SSSE3 SSE41 POPCNT SSE42 AVX F16C FMA3 AVX2 AVX512F AVX512CD AVX512_KNL AVX512_KNM"
     " AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
     # These need SSE 4.2, as Blender does.
@@ -25,6 +25,6 @@ SETTINGS = {
 }
 """Environment variables and their values."""
 IN_FORCE = "numpy" not in sys.modules or all(os.environ.get(name) == value for name, value in SETTINGS.items())
-"""Whether the settings came before NumPy. If not, results depend on this processor, and recipes say so."""
+"""Whether the settings came before NumPy. Otherwise results depend on this processor, and recipes record that."""
 
 os.environ.update(SETTINGS)

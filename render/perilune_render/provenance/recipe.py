@@ -15,15 +15,15 @@ from perilune_shared.errors import UserError
 _FILES = ("dem", "catalogue")
 _SPEED = ("threads", "cache_gib")
 DEFAULT_ENGINE = "cycles"
-"""Not recorded, so that recipes of older versions stay equal."""
+"""Engine that recipes do not record, so that recipes of older versions stay equal."""
 _SINCE = ("blur_poses", "row_time_s")
-"""Settings of the sensor that are recorded only if they are not the defaults, for the same reason."""
+"""Sensor settings that are recorded only if they differ from the defaults, so that older recipes stay equal."""
 _OPTIONAL = ("cameras", "hazard", "flash_lidar", "scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """The recipe of a dataset. With `planned`, the recipe of a plan: it lists only the versions behind the ground."""
+    """The recipe of a dataset. With `planned`, the recipe of a plan, with only the versions that affect the ground."""
     with_dem = config.terrain.dem is not None
     versions = (
         ground_versions(with_dem=with_dem)
@@ -41,8 +41,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are omitted: settings
-    of speed, settings of the other kind unless the kinds share terrain, optional sections that are not set, a site in
-    an elevation model if there is none, what its file states itself, and settings of a catalogue that are not used.
+    of speed, settings of the other kind unless the kinds share terrain, optional sections that are not set, the site in
+    an elevation model if there is no model, settings that repeat what the model's file states, and unused settings of a
+    catalogue.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -93,7 +94,7 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
     """The configuration of a recipe, with the user's copies of the files that it names.
 
     Recipes are untrusted: the files that they name are never opened, only `dem` and `catalogue`. Raises UserError if a
-    needed file is not given, if one is given that the recipe does not use, or if this version rejects the settings.
+    needed file is not given, if a given file is not used by the recipe, or if this version rejects the settings.
     """
     given = {"dem": dem, "catalogue": catalogue}
     terrain = recipe.config.get("terrain", {})
@@ -109,6 +110,6 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
             terrain[name] = str(given[name])
     elevation = terrain.get("elevation", {})
     if terrain.get("catalogue") is not None and isinstance(elevation, dict):
-        # Recipes from before this setting took all rims from the catalogue.
+        # Recipes older than this setting took all rims from the catalogue.
         terrain["elevation"] = {"rims": "catalogue", **elevation}
     return resolve_over(DatasetConfig, "dataset", str(where), {**settings_of(recipe), "terrain": terrain})

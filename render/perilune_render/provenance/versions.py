@@ -1,4 +1,4 @@
-"""Versions of the code behind ground, rendering and images: hashes of perilune's code, version numbers of libraries."""
+"""Versions of the code for ground, rendering and images: hashes of perilune's code, version numbers of libraries."""
 
 import functools
 import importlib.util
@@ -46,7 +46,7 @@ OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune
 """Code that makes hazard maps and images of the flash lidar."""
 _NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING, "outputs": OUTPUTS}
 _RECORDED = {"rays": "renderer"}
-"""Recorded name of what has another name here."""
+"""Recorded names of versions that have a different name in this module."""
 
 
 def ground_versions(*, with_dem: bool) -> dict[str, str]:
@@ -60,7 +60,7 @@ def imaging_versions() -> dict[str, str]:
 
 
 def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = False) -> dict[str, str]:
-    """Versions of everything that determines a frame of an engine, its labels and the `outputs` beside it.
+    """Versions of all code that determines a frame of an engine, its labels and additional `outputs`.
 
     Raises UserError if the engine is not installed.
     """
@@ -70,7 +70,7 @@ def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = Fals
 
 
 def check_installed(engine: str) -> None:
-    """Raise UserError for the engine `cycles` without Blender's module, which no other engine needs."""
+    """Raise UserError for the engine `cycles` if Blender's module is missing; other engines do not need it."""
     if engine == "cycles" and importlib.util.find_spec("bpy") is None:
         found = "cycles, without Blender's module bpy"
         expected = "heightfield, or on Python 3.11 `pip install 'perilune-render[blender]'`"
@@ -88,7 +88,7 @@ def _found(names: tuple[str, ...], with_dem: bool) -> dict[str, str]:
         **{
             recorded: metadata.version(distribution)
             for name, (recorded, distribution) in LIBRARIES.items()
-            # Without an elevation model rasterio is not used, and need not be installed.
+            # Without an elevation model, rasterio is not used and need not be installed.
             if name in used and (with_dem or name != "rasterio")
         },
     }

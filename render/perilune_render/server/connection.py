@@ -1,4 +1,4 @@
-"""One client of the server: its messages within time limits, and what it may ask for."""
+"""One client of the server: its messages with time limits, and limits on its requests."""
 
 import asyncio
 import time
@@ -11,15 +11,15 @@ Ask = Callable[[Callable[[], Any]], Awaitable[Any]]
 
 
 class Dropped(Exception):
-    """Ends a connection; the text says why."""
+    """Ends a connection; the text gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one client may ask for."""
+    """Limits on the clients and their requests."""
 
     clients: int = 16
-    """Largest number of clients at once."""
+    """Largest number of connected clients."""
     idle_s: float = 600.0
     """Time after which a client that sends nothing between two messages is disconnected, seconds."""
     message_s: float = 30.0
@@ -42,11 +42,11 @@ class Connection:
     name: str = ""
     """Address of the client, for messages."""
     is_extra: bool = False
-    """Whether the largest number of clients is connected already: this one gets an error."""
+    """Whether this client exceeds the largest number of clients and gets an error."""
     has_asked: bool = False
-    """Whether it has sent a whole request."""
+    """Whether the client has sent a complete request."""
     heard_s: float = field(default_factory=time.monotonic)
-    """When it connected or last sent something, by `time.monotonic`."""
+    """Time at which the client connected or last sent something, by `time.monotonic`."""
     _due_s: float = 0.0
     """Time by which the current message must be complete, by `time.monotonic`."""
 
@@ -56,7 +56,7 @@ class Connection:
         return await self.rest(n_bytes)
 
     async def first(self, n_bytes: int) -> bytes:
-        """The first bytes of a message. Raises TimeoutError after `limits.idle_s`, and if they come in part only."""
+        """The first bytes of a message. Raises TimeoutError after `limits.idle_s`, or if only part of them arrives."""
         async with asyncio.timeout(self.limits.idle_s):
             begun = await self.reader.readexactly(1)
         self._due_s = time.monotonic() + self.limits.message_s
@@ -72,6 +72,6 @@ class Connection:
     async def send(self, data: bytes) -> None:
         """Send a reply in one write. Raises TimeoutError if the client does not read it in `limits.message_s`."""
         self.writer.write(data)
-        # Not `wait_for`, which in Python 3.11 loses a cancellation that comes as it ends.
+        # Not `wait_for`, which in Python 3.11 loses a cancellation that arrives while it returns.
         async with asyncio.timeout(self.limits.message_s):
             await self.writer.drain()

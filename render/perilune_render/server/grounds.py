@@ -1,7 +1,7 @@
-"""The scenes of a server: scene 0, which is the scene of the configuration, and others that clients request by number.
+"""The scenes of a server: scene 0 of the configuration, and further scenes that clients request by number.
 
-Further scenes are generated in a thread of their own, one after another, while frames are rendered. A client has at
-most one scene in that queue. The last used scenes stay in memory.
+A separate thread generates further scenes, one after another, while frames are rendered. A client has at most one scene
+in this queue. The most recently used scenes stay in memory.
 """
 
 import queue
@@ -16,7 +16,7 @@ from perilune_render.terrain.cache import cached_scene
 from perilune_shared.errors import UserError
 
 MOST_KEPT = 3
-"""Largest number of scenes in memory beside scene 0 and the one that is being generated."""
+"""Largest number of scenes in memory besides scene 0 and the scene that is being generated."""
 MOST_WAITING = 16
 """Largest number of scenes that wait to be generated."""
 _STREAM = "served"
@@ -25,8 +25,7 @@ _STREAM = "served"
 def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
     """Random seed and Sun of a further scene, from 1; the Sun is drawn from `dataset.nav.sun`.
 
-    The seed is derived as for the scenes of a dataset, from another name: no dataset of any configuration has this
-    terrain.
+    The seed is derived as for the scenes of a dataset, but from another name, so that no dataset has this terrain.
     """
     return drawn_scene(config, config.nav.sun, _STREAM, number)
 
@@ -43,7 +42,7 @@ class Grounds:
         self._made: queue.SimpleQueue[tuple[int, SimulatedScene | Exception]] = queue.SimpleQueue()
         self._last = first
         if n_scenes > 1:
-            # A daemon: the server ends while a scene is being generated.
+            # A daemon, so that the server can end while a scene is being generated.
             threading.Thread(target=self._generate, name="grounds", daemon=True).start()
 
     def __enter__(self) -> "Grounds":
@@ -59,10 +58,11 @@ class Grounds:
         self._kept.clear()
 
     def simulated(self, number: int, client: object) -> SimulatedScene | None:
-        """The simulated scene of a number; None if it is not in memory: ask again.
+        """The simulated scene of a number; None if it is not in memory yet; then ask again.
 
-        It is then being generated or waits for that, unless another scene of the client or MOST_WAITING scenes wait.
-        Raises UserError for a number that the server does not have, and the error if the scene could not be generated.
+        The scene is then being generated or queued, unless another scene of the client or MOST_WAITING scenes are
+        queued. Raises UserError for a number that the server does not have, and the original error if generation
+        failed.
         """
         if number >= self.n_scenes:
             raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")
@@ -79,15 +79,15 @@ class Grounds:
 
     def _used(self, number: int) -> SimulatedScene:
         if number > 0:
-            self._kept[number] = self._kept.pop(number)  # the last used one is the last
+            self._kept[number] = self._kept.pop(number)  # the most recently used scene comes last
         simulated = self._kept.get(number, self.first)
         if simulated is not self._last and simulated.config.render.engine == "cycles":
-            self._last.close()  # Blender has one scene
+            self._last.close()  # Blender holds only one scene
         self._last = simulated
         return simulated
 
     def _collect(self) -> None:
-        """Take over what was generated, and forget the scenes that were not used for longest."""
+        """Take over generated scenes, and drop the least recently used scenes."""
         while not self._made.empty():
             number, result = self._made.get()
             del self._waiting[number]

@@ -2,7 +2,7 @@
 
 The first thread renders, since Blender must be in it. An event loop in a second thread holds the connections of all
 interfaces. It reads a connection again once its request is answered, so a client has at most one request in the queue,
-and the queue is fair. If the second thread ends for any reason but `stop`, `run` raises an error.
+and the queue is fair. If the second thread ends for any reason except `stop`, `run` raises an error.
 """
 
 import asyncio
@@ -22,20 +22,19 @@ from perilune_shared.errors import UserError
 
 _STOP_S = 5.0
 _WATCH_S = 1.0
-"""Time between two looks whether the ports are listened to, seconds."""
+"""Interval between checks that the ports are still open, seconds."""
 _NOTES_S = 1.0
-"""Time for which the end of the server waits for its last notes, seconds."""
+"""Longest time to wait for the last log lines when the server ends, seconds."""
 _GRACE_S = 1.0
-"""Silence before which a client without a request is not dropped in favour of another, seconds."""
+"""Time for which a client without a request is kept, even if another client needs its connection, seconds."""
 _EXTRA_S = 2.0
-"""Time within which a client that is one too many must say its hello and read its error, seconds."""
+"""Time within which a client above the limit must send its hello and read its error, seconds."""
 
 
 class LineQueue:
-    """Passes lines on to a function in a thread of its own, without ever blocking the caller.
+    """Passes lines to a function in a separate thread, without ever blocking the caller.
 
-    The function may block, for example on a pipe that nobody reads. Other lines then wait; lines beyond `most`
-    are dropped.
+    The function may block, for example on a full pipe. Further lines then wait; lines beyond `most` are dropped.
     """
 
     def __init__(self, note: Callable[[str], object], most: int = 1000):
@@ -45,56 +44,56 @@ class LineQueue:
         self._thread.start()
 
     def __call__(self, text: str) -> None:
-        """Pass a line on, or drop it."""
+        """Queue a line, or drop it if the queue is full."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(text)
 
     def close(self, wait_s: float) -> None:
-        """Pass on the waiting lines, for at most about `wait_s` seconds."""
+        """Pass on the queued lines, for at most about `wait_s` seconds."""
         with contextlib.suppress(queue.Full):
             self._lines.put(None, timeout=wait_s)
             self._thread.join(wait_s)
 
     def _pass_on(self) -> None:
         while (text := self._lines.get()) is not None:
-            # A closed pipe must end neither this thread nor the server.
+            # A closed pipe must stop neither this thread nor the server.
             with contextlib.suppress(Exception):
                 self._note(text)
 
 
 @dataclass(eq=False)
 class Interface:
-    """One port, and how its clients are served."""
+    """One port, and the function that serves its clients."""
 
     name: str
     """Name of the protocol, for messages."""
     host: str
     """Address to listen on."""
     port: int
-    """Port; 0 takes a free one, which is then found here."""
+    """Port; 0 takes a free port, which is then stored here."""
     handle: Callable[[Connection], Awaitable[None]]
     """Coroutine function that serves one connection until it ends. May raise `Dropped`."""
     greets: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[bool]]
-    """Whether the other end of a new connection greets as this interface does."""
+    """Whether the other end of a new connection sends the greeting of this interface."""
     limits: Limits
-    """What each client may ask for."""
+    """Limits on the clients."""
     clients: set[Connection] = field(default_factory=set)
-    """The connections, without those that are one too many."""
+    """The connections within the limit of clients."""
     probes: set[int] = field(default_factory=set)
-    """Ports from which the server itself connects to see that the interface answers."""
+    """Ports from which the server itself connects to check that the interface answers."""
     n_extra: int = 0
-    """Number of connections that are one too many."""
+    """Number of connections above the limit of clients."""
     listening: asyncio.Server | None = None
-    """Accepts connections, once the server has begun."""
+    """Socket server that accepts connections, once the server has begun."""
 
 
 @dataclass
 class Server:
-    """Accepts clients in a thread of its own; `run` answers their requests in the calling thread."""
+    """Accepts clients in a separate thread; `run` answers their requests in the calling thread."""
 
     interfaces: list[Interface]
     note: Callable[[str], object]
-    """Called with a line on what happens, in a thread of its own: it may block."""
+    """Called with one line per event, in a separate thread; it may block."""
     _ready: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
     _work: "queue.Queue[tuple[Callable[[], Any], Future[Any]] | None]" = field(default_factory=queue.Queue)
@@ -114,7 +113,7 @@ class Server:
             raise self._failure
 
     def run(self) -> None:
-        """Answer requests until `stop` is called. Raises UserError if the connections ended before that."""
+        """Answer requests until `stop` is called. Raises UserError if the thread of the connections ended before."""
         try:
             while (item := self._work.get()) is not None:
                 _answer(*item)
@@ -135,7 +134,7 @@ class Server:
         self._work.put(None)
 
     def _accept(self) -> None:
-        """The thread of the connections. However it ends, `run` ends too."""
+        """The thread of the connections. Whenever it ends, `run` ends too."""
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_error)
         try:
@@ -152,7 +151,7 @@ class Server:
                 self._loop.close()
 
     async def _watch(self) -> None:
-        """Wait for the end. Raises RuntimeError if a port is not listened to any more."""
+        """Wait for the end. Raises RuntimeError if a port is no longer open."""
         while not self._ending.is_set():
             for each in self.interfaces:
                 if each.listening is None or not each.listening.is_serving():
@@ -172,11 +171,11 @@ class Server:
             raise UserError("serve", "--host and ports", f"{each.host}:{each.port} ({error})", expected) from None
 
     def _on_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Note what asyncio reports outside of all tasks, such as too many open files."""
+        """Log errors that asyncio reports outside any task, such as too many open files."""
         self._say(f"connections: {context.get('exception') or context['message']}")
 
     async def _disconnect(self) -> None:
-        """Stop to listen and end all sessions."""
+        """Stop listening and end all sessions."""
         for each in self.interfaces:
             if each.listening is not None:
                 each.listening.close()
@@ -206,7 +205,7 @@ class Server:
         self._say(f"{connection.name}: {reason}")
 
     async def _serve(self, interface: Interface, connection: Connection) -> str:
-        """Serve a connection and close it. Returns why it ended."""
+        """Serve a connection and close it. Returns the reason for its end."""
         task, reason = asyncio.current_task(), "left"
         self._tasks.add(task)
         try:
@@ -229,7 +228,7 @@ class Server:
         return reason
 
     def _drop_silent(self, interface: Interface) -> bool:
-        """Drop the client that has been silent longest without ever having sent a request. False if there is none."""
+        """Close the connection that has been silent longest without any request. False without such a connection."""
         now_s = time.monotonic()
         silent = [each for each in interface.clients if not each.has_asked and now_s - each.heard_s >= _GRACE_S]
         if not silent:
@@ -241,7 +240,7 @@ class Server:
         return True
 
     async def _refuse(self, interface: Interface, connection: Connection) -> None:
-        """Let the interface tell a client that it is one too many; close it at once if there are many of those."""
+        """Let the interface tell a client that the limit is reached; with too many such clients, close at once."""
         self._say(f"{connection.name}: refused, {interface.limits.clients} clients are connected")
         if interface.n_extra >= interface.limits.clients:
             connection.writer.transport.abort()
@@ -260,9 +259,9 @@ class Server:
 
 
 async def answers(interface: Interface) -> bool:
-    """Whether a new connection to an interface of this event loop is greeted, beside its limit of clients.
+    """Whether an interface of this event loop greets a new connection, which does not count as a client.
 
-    Raises OSError if it cannot be connected to, and IncompleteReadError if it closes the connection.
+    Raises OSError if the connection fails, and IncompleteReadError if the interface closes it.
     """
     if interface.listening is None or not interface.listening.sockets:
         return False
@@ -286,7 +285,7 @@ async def answers(interface: Interface) -> bool:
 
 
 def _own_address(listening: Any) -> str:
-    """The address at which this machine reaches a listening socket: one that listens on all is reached at loopback."""
+    """The address by which this machine reaches a listening socket; loopback if it listens on all addresses."""
     host = listening.getsockname()[0]
     return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
 

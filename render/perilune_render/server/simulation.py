@@ -76,7 +76,7 @@ class SimulatedScene:
     def prepare(self) -> None:
         """Render a frame of the site with the camera and the Sun of the configuration, and label it.
 
-        The first frame in a new installation waits for the compilation of the kernels: half a minute of one core.
+        In a new installation, the first frame waits half a minute (on one core) for the compilation of functions.
         """
         stated = self.config.scene or SceneConfig()
         position = np.array([0.0, 0.0, float(self.heights_m(np.zeros(1), np.zeros(1))[0]) + _PREPARED_AT_M])
@@ -99,7 +99,7 @@ class SimulatedScene:
         velocity_mps: Array | None = None,
         angular_velocity_radps: Array | None = None,
     ) -> Frame:
-        """Render and develop a frame. Raises UserError as `check_view`, and above LARGEST_MPS and LARGEST_RADPS."""
+        """Render and develop a frame. Raises UserError like `check_view`, and above LARGEST_MPS or LARGEST_RADPS."""
         self.check_view(view)
         velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
         turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")
@@ -116,11 +116,11 @@ class SimulatedScene:
         return self._source(view).render(Shot(view.position_m, view.rotation_camera_from_site, np.zeros(3), 0))
 
     def check(self, position_m: Array) -> None:
-        """Raise UserError if a camera is off the ground, or not above its surface, as `frames` does."""
+        """Raise UserError if a camera is off the ground or not above its surface, as `perilune-render frames` does."""
         check_places(_poses(position_m, _DOWN), self.scene, "request")
 
     def check_view(self, view: View) -> None:
-        """Raise UserError for a view that `perilune-render frames` refuses."""
+        """Raise UserError for a view that `perilune-render frames` rejects."""
         pinhole = view.camera.covering_pinhole()
         check_poses(_poses(view.position_m, view.rotation_camera_from_site), pinhole, self.scene, "request")
 
@@ -133,10 +133,10 @@ class SimulatedScene:
         return heights_m(self.surface, x_m, y_m, boulders=boulders)
 
     def _source(self, view: View) -> FrameSource:
-        """The frame source of a camera and a Sun, opened if it is not yet."""
+        """The frame source of a camera and a Sun, opened if necessary."""
         key = (view.camera, tuple(view.sun.tolist()))
         source = self._sources.pop(key, None) or self._opened(view)
-        self._sources[key] = source  # the last used one is the last
+        self._sources[key] = source  # the most recently used source comes last
         return source[0]
 
     def _opened(self, view: View) -> tuple[FrameSource, ExitStack]:
@@ -155,7 +155,7 @@ class SimulatedScene:
 
 
 def open_simulation(config: DatasetConfig) -> SimulatedScene:
-    """The simulated scene of a configuration. Its ground suits `dataset.scene.views`, or the flights of `nav`."""
+    """The simulated scene of a configuration, with ground for `dataset.scene.views` or for the flights of `nav`."""
     pinhole = camera_of(config.camera).covering_pinhole()
     scene = config.scene or SceneConfig()
     if scene.views:
@@ -166,13 +166,13 @@ def open_simulation(config: DatasetConfig) -> SimulatedScene:
 
 
 def simulation_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> SimulatedScene:
-    """The simulated scene of a configuration over the ground of a seed, which suits the given views.
+    """The simulated scene of a configuration over the ground of a seed, made for the given views.
 
     Raises UserError if the engine is not installed or the ground is too large.
     """
     check_installed(config.render.engine)
     if config.render.engine == "cycles":
-        # No mesh in levels, which hold only the ground of one descent: a ground that is too large is refused.
+        # Do not use levels, which hold only the ground of one descent: ground that is too large raises an error.
         view = replace(view, seen=None)
     check_ground(config, view)
     say("generating the ground")
@@ -185,9 +185,9 @@ def _poses(position_m: Array, rotation_camera_from_site: Array) -> Poses:
 
 
 def _limited(values: Array | None, field: str, largest: float, unit: str) -> Array:
-    """A vector (3,), 0 if it is not given. Raises UserError if it is longer than `largest`."""
+    """A vector (3,), 0 if not given. Raises UserError if it is longer than `largest`."""
     vector = np.zeros(3) if values is None else np.asarray(values, np.float64)
-    # The components first: the length of a very large vector overflows.
+    # Test the components first, since the length of a very large vector overflows.
     if not np.abs(vector).max() <= largest or np.linalg.norm(vector) > largest:
         raise UserError("camera", field, vector.tolist(), f"at most {largest:g} {unit}")
     return vector

@@ -1,7 +1,7 @@
 """Albedo of the ground: patches, bright young craters with their ejecta, and rays.
 
-Fresh material is brighter than the mature soil around it and darkens with age. We chose amount and extent by eye, by
-comparison with NAC images, since published maturity trends are for much larger craters.
+Fresh material is brighter than the mature soil around it and darkens with age. We chose the amount and extent by eye,
+in comparison with NAC images, since published maturity trends apply to much larger craters.
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03
 RAYS_REACH = 9.0
 """Length of the longest ray from the centre, crater radii."""
 RAYED_WEAR = 0.004
-"""Wear K/R^2 of a crater at which its rays have vanished."""
+"""Wear K/R^2 above which a crater has no rays."""
 
 
 @dataclass(frozen=True, slots=True)
 class RayLaw:
-    """Which craters of a scene have rays, and how bright these are."""
+    """Which craters of a scene have rays, and how bright the rays are."""
 
     n_rayed: int
-    """Number of craters with rays: the largest fresh ones."""
+    """Number of craters with rays; the largest fresh craters have them."""
     strength: float
     """Factor on the brightening: `light.albedo_variation`."""
 
@@ -61,9 +61,9 @@ def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
 
 
 def brightness(craters: Craters) -> Array:
-    """Relative brightening (N,) of craters and their ejecta: largest for new ones, falls with wear K/R^2.
+    """Relative brightening (N,) of craters and their ejecta; it falls with wear K/R^2.
 
-    0 for craters of a catalogue.
+    Craters of a catalogue get 0.
     """
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     return 0.5 * np.exp(-wear / 0.004) * (craters.origin != 2)
@@ -74,13 +74,13 @@ def add_rays(
 ) -> None:
     """Brighten albedo (n_vertices,) along the rays of craters, in place.
 
-    The rays of `removed` craters (indices) are drawn like the others, but not added.
+    The rays of `removed` craters (indices) are drawn but not added, so that all other rays stay unchanged.
     """
     rng = stream(seed, "rays")
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
     able = np.flatnonzero((wear < RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
-    # The largest ones: rays of a small crater would be only a few pixels long.
+    # Only the largest: the rays of a small crater would be only a few pixels long.
     for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][: law.n_rayed]:
         n_rays = int(rng.integers(7, 15))
         direction = rng.uniform(0, 2 * np.pi, n_rays)

@@ -27,9 +27,9 @@ class Base:
     """The ground before craters: flat, or an elevation model and its surroundings."""
 
     height_m: Array
-    """Heights (n_vertices,), metres, changed in place."""
+    """Heights (n_vertices,), metres, modified in place."""
     beyond_m: Array
-    """Distances (n_vertices,) from known ground of the model, metres; infinite without a model."""
+    """Distances (n_vertices,) to the nearest ground with a height in the model, metres; infinite without a model."""
     model: ElevationModel | None
     """The elevation model, if any."""
     surroundings: FittedRelief | None
@@ -37,18 +37,18 @@ class Base:
 
     @property
     def largest_m(self) -> float | None:
-        """Largest diameter of generated craters, metres; None to use the configured one."""
+        """Largest diameter of generated craters, metres; None to use the configured value."""
         return None if self.model is None or self.surroundings is not None else resolved_m(self.model)
 
     def add_waves(self, grid: Grid, relief: ReliefConfig, seed: int, shortest_m: float, longest_m: float) -> None:
-        """Add relief: on a model only wavelengths that it does not resolve, around it all wavelengths."""
+        """Add relief: on the model only the wavelengths that it does not resolve, around it all wavelengths."""
         resolved = np.inf if self.model is None else resolved_m(self.model)
         add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
         if self.surroundings is not None:
             add_fitted_relief(self.height_m, grid, self.surroundings, self.beyond_m, seed, (shortest_m, longest_m))
 
     def permitted(self, craters: Craters) -> Craters:
-        """The craters to add: craters too small for the model to resolve, and craters that do not reach the model."""
+        """The craters to add: those too small for the model to resolve, and those that do not overlap the model."""
         if self.model is None or self.surroundings is None:
             return craters
         large = craters.diameter_m > resolved_m(self.model)
@@ -59,7 +59,7 @@ class Base:
 
 
 def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, seed: int) -> Base:
-    """The base: an elevation model and its surroundings, or flat ground."""
+    """The ground before craters: an elevation model and its surroundings, or flat ground."""
     if model is None:
         return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
     refuse_unseen(model, grid, terrain.elevation)

@@ -1,8 +1,8 @@
 """The boulder population and the rock shapes.
 
 Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758);
-some are cut by planes, like fractured rocks. Deviation: near fresh craters, observed counts fall more steeply above
-4.4 m (exponent -4). Here one exponent is used everywhere, and a boulder of a crater's field is at most a twentieth of
+some are cut by planes, like fractured rocks. Deviation: near fresh craters, observed counts fall more steeply above 4.4
+m (exponent -4). Here one exponent applies everywhere, and no boulder in a crater's field is larger than a twentieth of
 the crater's diameter.
 """
 
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     import trimesh
 
 MOST_BOULDERS = 3_000_000
-"""Largest mean number of boulders of the plain, or of all fields, in a scene; each needs about 1 kB in a renderer."""
+"""Largest mean number of boulders in a scene, on the plain or in all fields; each needs about 1 kB in a renderer."""
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
 _FIELD_DECAY = 0.7
 """Decay length of a boulder field's density beyond the crater's rim, crater radii."""
 FULL_SPACINGS = 5.0
-"""Smallest diameter, in vertex spacings, of a boulder with the finer mesh."""
+"""Smallest diameter of a boulder that gets the finer mesh, vertex spacings."""
 _FARTHEST = 0.9
-"""Largest distance of a rock's surface from its centre, mean diameters: the flattest, longest rock has it."""
+"""Largest distance of a rock's surface from its centre, mean diameters; reached by the flattest, longest rock."""
 N_POINTS, N_FEW_POINTS = 60, 14
-"""Numbers of points of a rock's finer and coarser mesh."""
+"""Numbers of points of the finer and the coarser mesh of a rock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +73,11 @@ def draw_boulders(
 ) -> Boulders:
     """Draw the boulders of a scene: a uniform density on the plain, and fields around young craters.
 
-    Fields surround primary craters of at least 10 m. At the rim of a newly formed crater the density of its field is
-    `field_density` times the density of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, with age as
-    (1 - age / 4 Gyr)^3, and with the crater's wear as exp(-K / 0.05 R^2), our choice.
-    The fields of `removed` craters (indices) are drawn like the others and then omitted.
+    Fields surround primary craters with a diameter of at least 10 m. At the rim of a newly formed crater the density of
+    its field is `field_density` times the density of the plain. It falls with distance as exp(-(x - 1) / 0.7), where x
+    = r/R, with age as (1 - age / 4 Gyr)^3, and with the crater's wear as exp(-K / 0.05 R^2); the last factor is our
+    choice.
+    The fields of `removed` craters (indices) are drawn and then omitted, so that all other fields stay unchanged.
     """
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
@@ -98,7 +99,7 @@ def draw_boulders(
 
 
 def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]:
-    """Law, edges of the bins (B + 1,) and half width (B,) of the ground that is fine enough for each, metres."""
+    """The size law, the bins' edges (B + 1,), and half-widths (B,) of the ground fine enough for each bin, metres."""
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
     edges = log_bins(smallest, config.max_diameter_m, 20)
     half = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
@@ -106,7 +107,7 @@ def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]
 
 
 def check_boulders(config: BouldersConfig, grid: Grid) -> None:
-    """Raise UserError if the plain has more boulders than memory, before any is drawn."""
+    """Raise UserError if the boulders of the plain would not fit in memory, before any is drawn."""
     if config.density > 0 and config.min_diameter_spacings * float(grid.spacings_m.min()) < config.max_diameter_m:
         law, edges, half = _bins(config, grid)
         _check_number(float(expected_numbers(law, edges, np.square(2 * half)).sum()), "density")
@@ -121,13 +122,13 @@ def _check_number(number: float, setting: str) -> None:
 def _fields(
     config: BouldersConfig, law: BoulderLaw, grid: Grid, craters: Craters, rng: np.random.Generator
 ) -> tuple[Array, Array, Array, np.ndarray]:
-    """x, y and diameters of the boulders around young craters, and the index of each one's crater."""
+    """x, y and diameters of the boulders around young craters, and the index of each boulder's crater."""
     radius = craters.diameter_m / 2
     age = np.nan_to_num(craters.age_myr, nan=4000.0)
     young = np.clip(1 - age / 4000, 0, 1) ** 3 * np.exp(-craters.wear_m2 / (0.05 * radius**2))
     young = np.where((craters.diameter_m >= 10) & (craters.origin == 0), young, 0.0)
     local = config.min_diameter_spacings * grid.spacing_under(craters.x_m, craters.y_m)
-    # The boulders of a field are at most a twentieth as large as its crater.
+    # The boulders of a field have at most a twentieth of the crater's diameter.
     largest = np.minimum(config.max_diameter_m, craters.diameter_m / 20)
     per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
     # The integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
@@ -152,9 +153,9 @@ def _fields(
 def rock(shape_id: int, seed: int, n_points: int = N_POINTS) -> trimesh.Trimesh:
     """A convex rock of mean diameter 1 centred on the origin; every third one has fracture faces.
 
-    Fewer points make the same kind of rock with fewer faces, for boulders only a few pixels wide.
+    With fewer points the rock has a similar shape and fewer faces, for boulders only a few pixels wide.
     """
-    import trimesh  # here, since it takes half a second
+    import trimesh  # imported here, since it takes half a second
 
     rng = stream(seed, "rock", shape_id)
     points = rng.normal(size=(60, 3))[:n_points]
@@ -177,7 +178,7 @@ def rock(shape_id: int, seed: int, n_points: int = N_POINTS) -> trimesh.Trimesh:
 
 
 def highest_points(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> Array:
-    """The highest vertex of each boulder (N, 3), O_L, metres; arguments as `boulder_mesh`."""
+    """The highest vertex of each boulder (N, 3), O_L, metres; takes the arguments of `boulder_mesh`."""
     full = boulders.diameter_m >= FULL_SPACINGS * grid.spacing_under(boulders.x_m, boulders.y_m)
     kinds = list(zip(boulders.shape_id.tolist(), np.where(full, N_POINTS, N_FEW_POINTS).tolist(), strict=True))
     solids = {kind: rock(kind[0], seed, kind[1]).vertices for kind in set(kinds)}
@@ -194,7 +195,7 @@ def largest_height_m(boulders: Boulders) -> float:
 
 
 def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_m: Array) -> Array:
-    """Heights (M,) of the highest boulder at places (M,), O_L, metres; -inf without a boulder. See `boulder_mesh`."""
+    """Heights (M,) of the highest boulder at positions (M,), O_L, metres; -inf without one. See `boulder_mesh`."""
     tops = np.full(len(x_m), -np.inf)
     widest = _FARTHEST * boulders.diameter_m.max(initial=0.0)
     if not len(x_m) or not len(boulders):
@@ -220,7 +221,7 @@ def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_
 
 
 def _top(solid: trimesh.Trimesh, origin: Array, direction: Array) -> float:
-    """Distance from `origin` to where a line leaves a convex solid; -inf if it misses the solid."""
+    """Distance from `origin` to the point where a line leaves a convex solid; -inf if it misses the solid."""
     normal, corner = solid.face_normals, solid.triangles[:, 0]
     gap, slope = np.einsum("fi,fi->f", normal, corner - origin), normal @ direction
     out, into = slope > 1e-9, slope < -1e-9
@@ -231,8 +232,9 @@ def _top(solid: trimesh.Trimesh, origin: Array, direction: Array) -> float:
 def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
 
-    Every boulder is a copy of one of the seed's rocks; boulders below FULL_SPACINGS local vertex spacings use the rock
-    with fewer faces. All are one mesh, since each object adds to the time of every frame in Cycles.
+    Every boulder is a copy of one of the rocks drawn from `seed`. Boulders smaller than FULL_SPACINGS local vertex
+    spacings use the mesh with fewer faces. They form one mesh, since each object in Cycles adds render time to every
+    frame.
     """
     local = grid.spacing_under(boulders.x_m, boulders.y_m)
     full = boulders.diameter_m >= FULL_SPACINGS * local

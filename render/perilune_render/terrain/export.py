@@ -1,4 +1,4 @@
-"""Export of a scene for other tools: meshes (GLB, PLY, OBJ, STL) and a height raster (GeoTIFF)."""
+"""Export a scene for other tools: meshes (GLB, PLY, OBJ, STL) and a height raster (GeoTIFF)."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ MESH_SUFFIXES = (".glb", ".ply", ".obj", ".stl")
 RASTER_SUFFIXES = (".tif", ".tiff")
 _LARGEST_SIDE = 20_000
 _Y_UP = (".glb", ".obj")
-"""Formats in which readers take Y for up: glTF by its specification, OBJ by habit. PLY and STL keep O_L's axes."""
+"""Formats whose readers take Y as up: glTF by specification, OBJ by convention. PLY and STL keep the axes of O_L."""
 _ROWS_AT_ONCE = 256
 
 
@@ -30,7 +30,7 @@ def vertices(grid: Grid, height_m: np.ndarray) -> np.ndarray:
 
 
 def coarser(grid: Grid, step: int) -> Grid:
-    """A grid over the same ground with every `step`-th ring and about 1 / step of the vertices per ring."""
+    """A grid over the same ground with every `step`-th ring and about 1 / step of the vertices in each ring."""
     n_half = max(grid.n_half // step, 1)
     rings = grid.half_widths_m[::-step][::-1] if len(grid.half_widths_m) > 1 else grid.half_widths_m
     return Grid(n_half, np.unique(np.concatenate([grid.half_widths_m[:1], rings])))
@@ -60,7 +60,7 @@ def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = Tru
 
 
 def site_profile(latitude_deg: float, longitude_deg: float, n: int, pixel_m: float, n_bands: int) -> dict[str, Any]:
-    """Options of rasterio for a float32 GeoTIFF of n x n pixels about a site: north up, azimuthal equidistant."""
+    """Options of rasterio for a float32 GeoTIFF of n x n pixels centred on a site: north up, azimuthal equidistant."""
     import rasterio
 
     centre = f"+lat_0={latitude_deg!r} +lon_0={longitude_deg!r}"
@@ -78,9 +78,9 @@ def site_profile(latitude_deg: float, longitude_deg: float, n: int, pixel_m: flo
 
 
 def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
-    """Write heights, metres, as a float32 GeoTIFF: square pixels, north up, azimuthal equidistant about the site.
+    """Write heights, metres, as a float32 GeoTIFF: square pixels, north up, azimuthal equidistant around the site.
 
-    The site is at height 0. Raises UserError unless a side has 1 to 20,000 pixels.
+    The site is at height 0. Raises UserError unless each side has 1 to 20,000 pixels.
     """
     import rasterio
 

@@ -4,8 +4,8 @@ Every ring has as many vertices as the inner square's border, so a ring of twice
 the distance between rings grows in the same proportion. Neighbouring rings are joined vertex to vertex, so the mesh has
 no hanging vertices and no gaps. The spacing at each place is set by the lowest height from which a camera can see it.
 
-Vertices are stored in one list: the inner square row by row (y, then x), then ring by ring, each counter-clockwise from
-its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices;
+Vertices are stored in one list: first the inner square row by row (y, then x), then the rings, each counter-clockwise
+from its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices;
 craters and waves are added line by line.
 """
 
@@ -20,10 +20,10 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
 _MOST_RINGS = 1_000_000
-"""Largest number of rings. The finest ground that fits in memory has fewer."""
+"""Largest number of rings; even the finest ground that fits in memory has fewer."""
 FAR_GROWTH = 0.07
-"""Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: the shadow
-of ground at a distance d enters the view only if it is about d tan(elevation of the Sun) high, and as wide."""
+"""Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: ground at a
+distance d casts a shadow into the view only if its height and width are about d tan(elevation of the Sun)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +51,12 @@ class Grid:
 
     @property
     def extent_m(self) -> float:
-        """Side of the largest square around the site that the grid covers, metres."""
+        """Side of the largest square around the site within the grid, metres."""
         return 2 * (float(self.half_widths_m[-1]) - self.off_site_m)
 
     @property
     def farthest_m(self) -> float:
-        """Depth beyond which nothing is rendered, metres: 100 km, and more over wider ground."""
+        """Depth beyond which nothing is rendered, metres: at least 100 km, and more for wider ground."""
         return max(100_000.0, 2 * float(self.half_widths_m[-1]))
 
     @property
@@ -66,13 +66,13 @@ class Grid:
 
     @property
     def spacings_m(self) -> Array:
-        """Spacing of the inner square and each ring, the larger of both directions, metres (n_rings + 1,)."""
+        """Spacing of the inner square and each ring, the larger of the two directions, metres (n_rings + 1,)."""
         across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
         return np.maximum(self.half_widths_m / self.n_half, across)
 
     @property
     def cell_sides_m(self) -> tuple[Array, Array]:
-        """Sides of the ground that belongs to a vertex, along and across its ring, metres, (n_rings + 1,) each."""
+        """Sides of the cell around a vertex, along and across its ring, metres, (n_rings + 1,) each."""
         around = self.half_widths_m / self.n_half
         across = np.gradient(self.half_widths_m) if len(self.half_widths_m) > 1 else around
         return around, np.append(around[0], across[1:])
@@ -83,11 +83,11 @@ class Grid:
         return self.spacings_m[np.minimum(ring, len(self.half_widths_m) - 1)]
 
     def spacing_under(self, x_m: Array, y_m: Array) -> Array:
-        """Vertex spacing, metres, at places of O_L (...), metres."""
+        """Vertex spacing, metres, at positions in O_L (...), metres."""
         return self.spacing_at(np.maximum(np.abs(x_m - self.centre_x_m), np.abs(y_m - self.centre_y_m)))
 
     def half_width_for(self, spacing_m: float) -> float:
-        """Half side, metres, of the square in which the spacing is at most `spacing_m`; 0 if there is none."""
+        """Half side, metres, of the square in which the spacing is at most `spacing_m`; 0 if no such square exists."""
         fine = self.spacings_m <= spacing_m * (1 + 1e-9)
         return float(self.half_widths_m[fine].max()) if fine.any() else 0.0
 
@@ -120,7 +120,7 @@ class Grid:
 def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
     """The grid for all views of a camera: spacing at most `terrain.spacing_px` times the smallest ground pixel.
 
-    It may have more vertices than `terrain.max_vertices` (`perilune_render.terrain.levels`).
+    The grid may have more vertices than `terrain.max_vertices` (see `perilune_render.terrain.levels`).
     """
     return grid_of(view.reach_m, terrain.spacing_px * view.height_m / view.focal_px, far=view.horizon)
 
@@ -133,10 +133,10 @@ def grid_of(
     *,
     far: bool = False,
 ) -> Grid:
-    """The grid whose spacing, metres, is at most `spacing_m` (N,) up to the distances `reach_m` (N,) from its centre.
+    """The grid with spacings, metres, of at most `spacing_m` (N,) within the distances `reach_m` (N,) of its centre.
 
-    Both are ascending. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to `edge_m`. `far`: the
-    reach is up to thousands of times the inner square, so distances are divided evenly in their logarithm.
+    Both are ascending. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to `edge_m`. With `far`, the
+    reach may be thousands of times the inner square, so distances are spaced evenly in their logarithm.
     """
     n_half = int(np.ceil((reach_m / spacing_m).max()))
     inner = min(n_half * spacing_m[0], reach_m[-1])
@@ -158,7 +158,7 @@ def grid_of(
 
 @njit(inline="always")
 def _put(lines, row, start, step, vertices, ring):
-    """Write a line: (x, y) of its start, its step (dx, dy), its vertices (first index, number) and its ring."""
+    """Write a line: (x, y) of its start, its step (dx, dy), its vertices (first index and number) and its ring."""
     lines[row, 0], lines[row, 1], lines[row, 2], lines[row, 3] = start[0], start[1], step[0], step[1]
     lines[row, 4], lines[row, 5], lines[row, 6] = vertices[0], vertices[1], ring
 
@@ -167,9 +167,9 @@ def _put(lines, row, start, step, vertices, ring):
 def lines_in(window, n_half, half_widths, lines):
     """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns the number of lines.
 
-    `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the grid's centre. A line is: x
-    and y of its first vertex, steps in x and y, index of its first vertex, number of vertices, and ring (0 is the inner
-    square).
+    `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the grid's centre. A line holds
+    x and y of its first vertex, the steps in x and y, the index of the first vertex, the number of vertices, and the
+    ring (0 is the inner square).
     """
     x_low, x_high, y_low, y_high = window
     count = 0
@@ -213,7 +213,7 @@ def lines_in(window, n_half, half_widths, lines):
 
 @njit()
 def place_in_ring(x, y, n_half):
-    """Position along the square ring through (x, y), in vertices from the corner at -x, -y, fractional."""
+    """Position along the square ring through (x, y), counted in vertices from the corner at -x, -y; fractional."""
     distance = max(abs(x), abs(y))
     if y <= -distance:
         side, along = 0, x
@@ -228,7 +228,7 @@ def place_in_ring(x, y, n_half):
 
 @njit()
 def vertex_of_ring(ring, position, n_half):
-    """Index of a vertex from its ring (0 is the inner square's border) and position from the corner at -x, -y."""
+    """Index of a vertex from its ring (0 is the inner square's border) and its position after the corner at -x, -y."""
     n = n_half
     position %= 8 * n
     if ring > 0:

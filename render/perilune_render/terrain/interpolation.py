@@ -1,4 +1,4 @@
-"""Values of a field between the vertices of the grid."""
+"""Interpolate a field between the vertices of the grid."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from perilune_shared.geometry.frames import Array
 
 
 def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -> Array:
-    """Values of a field (n_vertices,) at places of any shape, interpolated bilinearly; outside, the border's value."""
+    """Values of a field (n_vertices,) at positions of any shape, bilinear; outside, the value at the border."""
     x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
     relative = np.ravel(x) - grid.centre_x_m, np.ravel(y) - grid.centre_y_m
     return _values_at(field, grid.n_half, grid.half_widths_m, *relative).reshape(x.shape)
@@ -27,7 +27,7 @@ def _values_at(field, n_half, half_widths, x, y):
 
 @njit(inline="always")
 def corners(x, y, n_half, half_widths):
-    """Vertices around a place relative to the centre, lower two first, and the shares of the second and upper ones."""
+    """Vertices around a position relative to the centre, lower two first; weights of the second and the upper ones."""
     n = n_half
     distance = max(abs(x), abs(y))
     if distance < half_widths[0]:

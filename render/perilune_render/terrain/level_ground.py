@@ -1,4 +1,4 @@
-"""The ground of a level: the ground of a scene, averaged over the cells of a level's vertices."""
+"""The ground of a level: the ground of a scene, averaged over the cells around the vertices of a level."""
 
 import dataclasses
 from typing import NamedTuple
@@ -17,7 +17,7 @@ _MOST_SAMPLES = 8
 
 
 class _Mesh(NamedTuple):
-    """The grid whose vertices have the field."""
+    """The grid on whose vertices the field is given."""
 
     centre_x: float
     """x of its centre, O_L, metres."""
@@ -53,7 +53,7 @@ class _Cells(NamedTuple):
 
 
 def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
-    """The scene with the ground of a level alone, and the boulders that are large enough for its mesh."""
+    """The scene with only the ground of a level, and the boulders that are large enough for its mesh."""
     height, albedo = (averaged(field, scene.grid, grid) for field in (scene.height_m, scene.albedo))
     real = averaged(scene.real, scene.grid, grid) > 0.5 if scene.real.any() else np.zeros(grid.n_vertices, bool)
     shown = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
@@ -73,8 +73,8 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
 def averaged(field: np.ndarray, whole: Grid, grid: Grid) -> np.ndarray:
     """A field on the vertices of `whole`, averaged over the cell of each vertex of `grid`: (n_vertices,) float32.
 
-    The field is interpolated at as many evenly spaced points of a cell as `whole` has vertices in it, and at least one.
-    Outside `whole` the field has the values of its border.
+    The field is interpolated at evenly spaced points of a cell: as many as `whole` has vertices in the cell, and at
+    least one. Outside `whole` the field has the values of its border.
     """
     n_inner, n_ring = (2 * grid.n_half + 1) ** 2, 8 * grid.n_half
     mesh = _Mesh(whole.centre_x_m, whole.centre_y_m, whole.n_half, whole.half_widths_m, whole.spacings_m)

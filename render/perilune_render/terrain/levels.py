@@ -1,8 +1,8 @@
-"""Levels: meshes of the ground under one trajectory, each for a band of heights, where one mesh would be too large.
+"""Levels: meshes of the ground below one trajectory, each for a band of heights, used if one mesh would be too large.
 
-One mesh for a whole descent has the finest detail of the last frames within the wide ground of the first ones. A level
-is a mesh for the frames of one band: its spacing follows the smallest ground pixel of that band, and it is centred on
-the ground that a trajectory shows there. All levels are sampled from the ground of the scene
+One mesh for a whole descent would combine the finest detail of the last frames with the wide ground of the first. A
+level is a mesh for the frames of one band of heights: its spacing follows the smallest ground pixel of the band, and it
+is centred on the ground that the trajectory shows within the band. All levels are sampled from the ground of the scene
 (`perilune_render.terrain.level_ground`), so craters, rims and labels do not depend on them.
 """
 
@@ -17,11 +17,11 @@ from perilune_render.terrain.grid import Grid, graded_grid, grid_of
 from perilune_shared.errors import UserError
 
 _WIDEST_BAND = 1.25
-"""Largest ratio of the heights of a level's band. In a wider one the spacing, and with it the smallest craters, would
-change visibly between two frames."""
+"""Largest ratio of the highest to the lowest height in the band of a level. In a wider band, the spacing and with it
+the smallest craters would change visibly between two frames."""
 _GROUND_PER_MESH = 10
-"""Largest number of vertices of a scene's ground, divided by the largest number of a mesh. While the ground is
-generated, one of its vertices takes about a sixth of the memory that a vertex takes in Blender."""
+"""Largest number of vertices of a scene's ground, divided by the largest number of a mesh. During generation, a vertex
+needs about a sixth of the memory that it needs in Blender."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +35,10 @@ class Level:
 
 
 def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) -> tuple[Level, ...]:
-    """The levels of a trajectory, finest first: the whole ground if it has at most `terrain.max_vertices`.
+    """The levels of a trajectory, finest first; one level if the whole ground has at most `terrain.max_vertices`.
 
-    The trajectory comes from the direction `approach_deg` (clockwise from north) to within half a degree. Each band of
-    heights, from the lowest, is as wide as this limit on each level and _WIDEST_BAND allow. Spacing is at most
+    The trajectory comes from the direction `approach_deg` (clockwise from north) to within half a degree. From the
+    lowest upwards, each band of heights is as wide as this limit and _WIDEST_BAND allow. Spacing is at most
     `terrain.spacing_px` times the smallest ground pixel of the band. Raises UserError if no level fits.
     """
     whole = checked_grid(terrain, view)
@@ -57,7 +57,8 @@ def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) ->
 def checked_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
     """The grid of the ground for all views (`graded_grid`).
 
-    Raises UserError if a mesh needs more than `terrain.max_vertices`, or the ground _GROUND_PER_MESH times as many.
+    Raises UserError if a mesh needs more than `terrain.max_vertices`, or if the ground needs _GROUND_PER_MESH times as
+    many.
     """
     grid = graded_grid(terrain, view)
     if grid.n_vertices > terrain.max_vertices:
@@ -75,7 +76,7 @@ def level_index(levels: tuple[Level, ...], z_m: float) -> int:
 def _band(
     terrain: TerrainConfig, view: ViewEnvelope, seen: SeenGround, approach_deg: int, first: int
 ) -> Callable[[int], Grid]:
-    """The grid of a band of `seen` from the index `first` to a given one, both included."""
+    """Function from an index to the grid of the band of `seen` from index `first` to this index, both included."""
     all_low, all_high = seen.box_m(approach_deg)
     edge_m = float(view.reach_m[-1])
 
@@ -90,10 +91,7 @@ def _band(
 
 
 def _needed(terrain: TerrainConfig, view: ViewEnvelope) -> int:
-    """Number of vertices that the limit must allow: of the largest of the narrowest bands, or of the whole ground.
-
-    A trajectory along an axis shows the widest square of ground.
-    """
+    """Number of vertices that the limit must allow: for the largest of the narrowest bands, or for the whole ground."""
     whole = graded_grid(terrain, view).n_vertices
     if view.seen is None:
         return whole
@@ -103,7 +101,7 @@ def _needed(terrain: TerrainConfig, view: ViewEnvelope) -> int:
 
 
 def _refusal(terrain: TerrainConfig, view: ViewEnvelope, needed: int) -> UserError:
-    """The error if no level fits; it names the smallest spacing that does, rounded up to 0.01."""
+    """The error if no level fits; it states the smallest spacing that fits, rounded up to 0.01."""
     spacing_px, most = terrain.spacing_px, terrain.max_vertices
 
     def allowed(hundredths: int) -> bool:
@@ -127,7 +125,7 @@ def _refusal(terrain: TerrainConfig, view: ViewEnvelope, needed: int) -> UserErr
 
 
 def _last_that_fits(band: Callable[[int], Grid], low: int, high: int, most: int) -> int:
-    """The last index from `low` to `high` up to which a band has at most `most` vertices; `low` is assumed to fit."""
+    """The last index from `low` to `high` for which a band has at most `most` vertices; `low` is assumed to fit."""
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if band(middle).n_vertices <= most else (low, middle - 1)

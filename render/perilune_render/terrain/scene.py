@@ -44,7 +44,7 @@ from perilune_shared.geometry.frames import Array
 _ROUGHNESS_M = 100.0
 """Wavelength below which relief is added on top of the craters, metres."""
 _LEAST_RIM = 0.3
-"""Share of a crater's rim that younger craters must leave; with less, the crater is no longer counted."""
+"""Share of a crater's rim that must remain; below it, the crater is no longer counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Scene:
     albedo: np.ndarray
     """Factor on the reflectance (n_vertices,) float32, about 1."""
     craters: Craters
-    """Craters of a catalogue, then generated ones that are still visible, oldest first, without removed ones."""
+    """Visible craters without removed ones: first the craters of a catalogue, then generated craters, oldest first."""
     rims: Rims
     """Rims of the same craters, measured on the finished ground."""
     boulders: Boulders
@@ -72,24 +72,24 @@ class Scene:
     boulder_z_m: Array
     """Heights of the boulders' centres, metres."""
     dem_source: str
-    """Name and hash of the elevation model, or 'procedural'."""
+    """File name and hash of the elevation model, or 'procedural'."""
     real: np.ndarray
     """Whether each vertex (n_vertices,) is on known ground of the elevation model; false on procedural ground."""
     view: ViewEnvelope | None = None
-    """The views that the ground was made for; None allows one mesh only (`perilune_render.terrain.levels`)."""
+    """The views for which the ground was made; None allows only one mesh (`perilune_render.terrain.levels`)."""
     removed: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
     """crater_id (N,) of the craters that were removed from the ground, ascending."""
 
     @property
     def crater_id(self) -> np.ndarray:
-        """Ids of `craters`: their indices in the scene from which no crater is removed."""
+        """Ids of `craters`: their indices in the same scene without removals."""
         everything = np.arange(len(self.craters) + len(self.removed))
         return np.delete(everything, self.removed)
 
 
 @dataclass(frozen=True, slots=True)
 class _Soil:
-    """What craters change at the vertices, in place."""
+    """The values at the vertices that craters change in place."""
 
     height_m: Array
     """Heights, metres (n_vertices,)."""
@@ -104,9 +104,9 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     """Generate the scene of a seed: base, relief, craters from oldest to youngest, boulders.
 
     Craters that the configuration removes are omitted, with their rays and boulders. All random numbers are drawn as if
-    they were there, and the heights keep their zero. Beyond `craters.removal.REACH_RADII` of them the heights are those
-    of the scene with all craters. Raises UserError if frames of `view` need too many vertices, or if the scene has no
-    such crater.
+    these craters were present, and the zero of the heights does not change. Farther than `craters.removal.REACH_RADII`
+    from the removed craters, the heights equal the heights with all craters. Raises UserError if frames of `view` need
+    too many vertices, or if a crater to remove does not exist.
     """
     terrain = config.terrain
     grid = checked_grid(terrain, view)
@@ -115,7 +115,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     base = base_of(model, grid, terrain, seed)
     soil = _Soil(base.height_m, np.ones(grid.n_vertices))
     base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
-    # 2. Craters and rays; those that younger craters have erased no longer count.
+    # 2. Craters and rays; drop the craters that younger craters have erased.
     drawn = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
     if config.light.albedo_variation > 0:
         add_patches(soil.albedo, grid, config.light.albedo_variation, seed)
@@ -129,7 +129,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     if model is not None and terrain.catalogue is not None:
         real = read_catalogue(Path(terrain.catalogue), model, grid, terrain).craters
         craters, sag, n_real = real.joined(craters), np.concatenate([np.zeros(len(real)), sag]), len(real)
-    # 4. Removed craters: stamp all others again, and take this ground near the removed ones only.
+    # 4. Removed craters: stamp all others again, and use this ground only near the removed ones.
     removed = indices_of(wanted, n_real, len(craters), seed)
     raised_m = 0.0
     if len(removed):
@@ -140,13 +140,13 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         soil.height_m[changed], soil.albedo[:] = uncratered.height_m[changed], uncratered.albedo
         raised_m = float(_at_site(soil.height_m, grid) - before_m)
         sag[n_real:] = np.where(near(craters.x_m, craters.y_m, gone)[n_real:], again.sag_m[visible], sag[n_real:])
-    # 5. Short waves on top of the craters; the site is at height 0; far ground drops with the Moon's curvature.
+    # 5. Short waves on top of the craters; the site is at height 0; distant ground drops with the Moon's curvature.
     base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
     height = soil.height_m
     height -= _at_site(height, grid) - raised_m
     if view.horizon:
         height -= drop_m(*grid.vertices_xy())
-    # 6. Boulders and rims on the finished ground. Boulders are drawn around all craters, the removed ones included.
+    # 6. Boulders and rims on the finished ground. Boulders are drawn around all craters, including removed ones.
     boulders = draw_boulders(terrain.boulders, grid, craters, seed, removed)
     kept = np.delete(np.arange(len(craters)), removed)
     craters, sag = craters.chosen(kept), sag[kept]
@@ -170,7 +170,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
 def _stamp(
     config: DatasetConfig, soil: _Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
 ) -> Stamped:
-    """Add rays and stamp craters except the `removed` ones (indices), in place; their results in `Stamped` are 0."""
+    """Add rays and stamp craters except the `removed` ones (indices), in place; removed craters have 0 in `Stamped`."""
     kept = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
     variation, stays, law = config.light.albedo_variation, craters.chosen(kept), config.terrain.craters
     if variation > 0:
@@ -190,7 +190,7 @@ def _at_site(height_m: Array, grid: Grid) -> Array:
 
 
 def check_ground(config: DatasetConfig, view: ViewEnvelope) -> Grid:
-    """Check grid, relief and input files before the ground is generated; returns the grid. Raises UserError.
+    """Check grid, relief and input files before the ground is generated; return the grid. Raises UserError.
 
     Prints remarks on the elevation model.
     """
@@ -216,7 +216,7 @@ def site_of(config: DatasetConfig) -> tuple[float, float]:
 
 
 def model_of(terrain: TerrainConfig, ground_m: float | None = None) -> ElevationModel | None:
-    """The elevation model of a configuration for ground of side `ground_m` (`read_elevation`), metres, or None.
+    """The elevation model of a configuration for ground of side `ground_m`, metres (`read_elevation`), or None.
 
     Raises UserError if it cannot be read.
     """

@@ -1,6 +1,6 @@
 """Size-frequency laws of craters and boulders: one class for each published law.
 
-A law gives `csfd`, the cumulative number per square metre of objects of at least a diameter, and its support,
+A law gives `csfd`, the cumulative number per square metre of objects with at least a given diameter, and its support,
 `min_diameter_m` to `max_diameter_m`. `draw_diameters` draws a population.
 """
 
@@ -25,7 +25,7 @@ _NEUKUM_2001 = (
     8.25e-4,
     5.54e-5,
 )
-"""Coefficients of log10(D / 1 km)^1 to ^11 in the logarithm of the number."""
+"""Coefficients of log10(D / 1 km)^1 to ^11 in the logarithm of the cumulative number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class SizeFrequency(ABC):
 
     @abstractmethod
     def csfd(self, diameter_m: ArrayLike) -> Array:
-        """Number per square metre of at least this diameter (metres), also outside the support."""
+        """Number per square metre of objects with at least this diameter (metres); also defined outside the support."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +87,7 @@ class TraskEquilibrium(SizeFrequency):
 class MintonEquilibrium(SizeFrequency):
     """Equilibrium of small craters on a mare, N(>D) = 0.0336 D^-2 per square metre.
 
-    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support equals the support of Trask's law.
+    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support is the support of Trask's law.
     """
 
     share: float = 1.0
@@ -103,7 +103,7 @@ class MintonEquilibrium(SizeFrequency):
 class ViperEquilibrium(SizeFrequency):
     """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per km^2 up to 80 m.
 
-    Above 80 m the law is extrapolated (our extension); there production is below it for most ages.
+    Above 80 m the law is extrapolated (our extension); there, production is lower than the law for most ages.
     """
 
     share: float = 1.0
@@ -119,10 +119,10 @@ class ViperEquilibrium(SizeFrequency):
 class ChangE4Equilibrium(SizeFrequency):
     """Craters marked by people in 12 Narrow Angle Camera images of the Chang'e-4 site, counted by us.
 
-    Relative to Trask's law the density is 1.22 up to 6 m and 0.57 from 24 m, with a power law between. This follows
-    from marks of 6 to 50 m and is extrapolated beyond (our extension). The marks were published with Yang et al.,
-    CraterDANet (IEEE TGRS); the ground sampling of the images is not recorded and was assumed to be 0.75 m. People do
-    not mark nearly erased craters: a population that includes them needs a `share` of about 1.3.
+    Relative to Trask's law the density is 1.22 up to 6 m and 0.57 from 24 m, with a power law between the two. The fit
+    uses craters of 6 to 50 m and is extrapolated beyond (our extension). The marked craters were published with Yang et
+    al., CraterDANet (IEEE TGRS). The ground sampling of the images is not recorded; we assumed 0.75 m. People do not
+    mark nearly erased craters, so a population that includes them needs a `share` of about 1.3.
     """
 
     share: float = 1.0
@@ -184,15 +184,16 @@ def log_bins(min_diameter_m: float, max_diameter_m: float, per_decade: int = 50)
 
 
 def expected_numbers(law: SizeFrequency, edges_m: Array, areas_m2: Array) -> Array:
-    """Mean number (B,) in each bin of edges_m (B + 1,), for the bins' areas (B,)."""
+    """Mean number (B,) in each bin of edges_m (B + 1,), with the area of each bin in areas_m2 (B,)."""
     cumulative = law.csfd(edges_m)
     return np.maximum(cumulative[:-1] - cumulative[1:], 0) * areas_m2
 
 
 def draw_diameters(law: SizeFrequency, edges_m: Array, areas_m2: Array, rng: np.random.Generator) -> Array:
-    """Draw diameters (N,), metres, largest bin first, with a Poisson number in each bin for that bin's area.
+    """Draw diameters (N,), metres, largest bin first, with a Poisson-distributed number in each bin.
 
-    edges_m (B + 1,) ascending, areas_m2 (B,). Within a bin the law is approximated by a power law.
+    edges_m (B + 1,) is ascending; areas_m2 (B,) holds the area for each bin. Within a bin the law is approximated by a
+    power law.
     """
     cumulative = law.csfd(edges_m)
     numbers = rng.poisson(expected_numbers(law, edges_m, areas_m2))[::-1]

@@ -1,7 +1,7 @@
 """Build shader nodes from Python arithmetic, so that one formula serves NumPy arrays and the shader.
 
 Operators and NumPy ufuncs applied to a `Symbol` add a Math node to the tree. A sum with a product becomes one node,
-since a shader's run time grows with its number of nodes; unused nodes cost nothing.
+since the run time of a shader grows with the number of nodes; unused nodes cost nothing.
 """
 
 import numbers

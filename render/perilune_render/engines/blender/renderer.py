@@ -31,22 +31,22 @@ from perilune_shared.threads import usable_cores
 
 _FAR_M = 1e9
 BAND_PX = 0.2
-"""Largest motion of the image between two bands of rows with a pose each, pixels."""
+"""Largest image motion between two neighbouring bands of rows, which have one pose each, pixels."""
 _LEAST_FREE_BYTES = 16_000_000
 _LIT = 1e-4
-"""Sunlight above which a pixel counts as sunlit: shadows have none, and earthshine gives less."""
+"""Sunlight above which a pixel counts as sunlit; in shadow, sunlight is 0 and earthshine gives less than this."""
 
 
 _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
-"""Renderers of this process that are not closed."""
+"""Open renderers of this process."""
 
 
 class Renderer:
     """Renders frames of one scene. Use as a context manager: it holds a temporary folder and Blender's only scene.
 
     If the ground is too large for one mesh, a frame shows the level (`perilune_render.terrain.levels`) of its
-    trajectory for the height of its camera. Blender holds the mesh of one level at a time, so render frames in an order
-    with few changes of level.
+    trajectory that is made for the height of the camera. Blender holds the mesh of one level at a time, so render
+    frames in an order with few changes of level.
 
     It is an `Engine` of `perilune_render.engines.frame_source`: `camera` has no distortion, `sun` (3,) is the unit
     vector towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only
@@ -77,12 +77,12 @@ class Renderer:
         self._folder = tempfile.TemporaryDirectory(prefix="perilune-")
 
     def _stage_with(self, ground: Scene) -> None:
-        """Build the stage with one mesh."""
+        """Build the stage with a single mesh."""
         self.stage = blender_stage.build(ground, self._config, self.camera, self.sun)
         configure(self.stage, self.camera, self._config.render, self._config.light)
 
     def _show_level(self, view: ViewEnvelope, approach_deg: int, z_m: float) -> None:
-        """Build the stage with the level of a trajectory for a height of the camera, unless it is shown already."""
+        """Build the stage with a trajectory's level for a height of the camera, unless it is already shown."""
         terrain = self._config.terrain
         if self._levels is None or self._levels[0] != approach_deg:
             self._levels = approach_deg, cut_levels(terrain, view, approach_deg)
@@ -90,7 +90,7 @@ class Renderer:
         level = approach_deg, level_index(levels, z_m)
         if level != self._shown:
             self._shown = None
-            blender_stage.clear()  # frees the last mesh before the next is sampled
+            blender_stage.clear()  # frees the previous mesh before the next is sampled
             self._stage_with(on_level(self._scene, levels[level[1]].grid, terrain.boulders))
             self._shown = level
 
@@ -112,7 +112,7 @@ class Renderer:
     ) -> Radiance:
         """Render one frame: radiance factor averaged over each pixel, and depth of the ray through its centre.
 
-        With dataset.render.exr this ray also gives the normal; otherwise the normal is the mean over the pixel's
+        With dataset.render.exr, this ray also gives the normal; otherwise the normal is the mean over the pixel's
         samples. `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable frame, and
         RuntimeError if the Renderer is closed.
         """
@@ -121,10 +121,10 @@ class Renderer:
             return self._through(path, seed)
 
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
-        """Render one frame with a rolling shutter, by bands of rows that have one pose each.
+        """Render one frame with a rolling shutter, in bands of rows with one pose each.
 
-        There are as many bands as let the image move by at most BAND_PX between two of them, and at most one for each
-        row. Depth is along the axis at the band's pose. Raises what `render` raises.
+        There are enough bands that the image moves by at most BAND_PX between neighbours, but at most one per row.
+        Depth is along the camera's axis at the band's pose. Raises the errors of `render`.
         """
         middle = poses.pose_at(0.0)
         with self._rendering(float(middle[0][2]), approach_deg) as path:
@@ -146,7 +146,7 @@ class Renderer:
             return whole
 
     def _through(self, path: Path, seed: int) -> Radiance:
-        """Render the stage as it is."""
+        """Render the stage in its current state."""
         radiance = render_through(path, self.stage, seed)
         if not self._exact:
             return radiance
@@ -166,7 +166,7 @@ class Renderer:
             with interrupts_held():
                 yield path
         except (UserError, RuntimeError) as error:
-            # Blender reports a failed write only in its log; the file is then missing or truncated.
+            # Blender reports a failed write only in its log, and the file is then missing or truncated.
             full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, f"no frame ({error})", str(path.parent)) from None
 
@@ -196,10 +196,10 @@ def rows_only(stage: bpy.types.Scene, first: int, last: int, n_rows: int) -> Ite
 
 @contextlib.contextmanager
 def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
-    """Configure a stage to send a single ray through each pixel's centre, to within 1e-5 px, while the block runs.
+    """Configure a stage to send one ray through each pixel's centre, to within 1e-5 px, until the block ends.
 
-    Cycles puts the first sample of a pixel at the centre of its filter for any seed, but takes this centre from
-    a table, which is 5e-4 px off for the box filter of one pixel. The width of the box cannot be set, so the narrowest
+    Cycles puts the first sample of a pixel at the centre of its filter for any seed, but it reads this centre from a
+    table, which is off by 5e-4 px for the box filter of one pixel. The width of the box cannot be set, so the narrowest
     Gaussian is used.
     """
     narrow = {"samples": 1, "pixel_filter_type": "GAUSSIAN", "filter_width": 0.01}
@@ -216,8 +216,8 @@ def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
 def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, light: LightConfig) -> None:
     """Configure Cycles: direct light and at most one bounce, linear float32.
 
-    The acceleration structure is kept between frames. A bounce traces one random ray per sample: few samples give noisy
-    light in the shadows.
+    The acceleration structure is kept between frames. A bounce traces one random ray per sample: with few samples, the
+    light in shadows is noisy.
     """
     render, cycles = stage.render, stage.cycles
     render.engine = "CYCLES"
@@ -229,7 +229,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     render.pixel_aspect_x, render.pixel_aspect_y = _pixel_aspect(camera)
     render.use_persistent_data = True
     render.use_file_extension = False
-    # Blender itself would count the cores that it could use when it started, which is one.
+    # Blender's default is the number of cores that it could use when it started: one.
     render.threads_mode = "FIXED"
     render.threads = settings.threads or usable_cores()
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
@@ -242,7 +242,8 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     cycles.use_denoising = False
     cycles.max_bounces = cycles.diffuse_bounces = int(light.bounce)
     cycles.use_light_tree = False
-    # Cycles drops contributions below this threshold at random. At the default of 0.01 this is most ground at low Sun.
+    # Cycles drops contributions below this threshold at random. At the default of 0.01, it would drop most ground at
+    # low Sun.
     cycles.light_sampling_threshold = 0.0
     cycles.pixel_filter_type = "BOX"
     # A box of one pixel: the sensor model applies its point spread later.
@@ -263,17 +264,17 @@ def _radiance(path: Path) -> Radiance:
     channels = read_exr(path)
     by_pass = {name.split(".", 1)[1]: pixels for name, pixels in channels.items() if "." in name}
     depth = by_pass["Depth.Z"].astype(np.float32)
-    # Cycles averages normals over the pixel's samples, which shortens them at edges; the sky has none.
+    # Cycles averages normals over the pixel's samples, which shortens them at edges; sky pixels have no normal.
     normal = np.stack([by_pass[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     radiance_factor = by_pass["Combined.R"]
-    # With other light than the Sun's, the pass of direct light divided by colour shows where the Sun reaches.
+    # If there is light besides the Sun's, the pass of direct light divided by colour shows where the Sun reaches.
     sunlit = by_pass.get("DiffDir.R", radiance_factor) > _LIT
     return Radiance(radiance_factor, np.where(depth > _FAR_M, np.float32(np.inf), depth), normal, sunlit)
 
 
 class quiet:
-    """Discard what Blender prints to file descriptor 1."""
+    """Context manager that discards what Blender prints to file descriptor 1."""
 
     def __enter__(self) -> None:
         self._saved = os.dup(1)

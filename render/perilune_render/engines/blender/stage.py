@@ -17,9 +17,9 @@ from perilune_shared.geometry.frames import Array, earth_direction
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Axes of Blender's camera: y up, looking along -z."""
 _EARTH_ANGULAR_DIAMETER_DEG = 1.9
-"""Angular diameter of the Earth from the Moon's mean distance."""
+"""Angular diameter of the Earth at the Moon's mean distance."""
 _EARTHSHINE = 0.1 / 1361
-"""Irradiance of the full Earth over the irradiance of the Sun."""
+"""Irradiance of the full Earth divided by the irradiance of the Sun."""
 
 
 def clear() -> bpy.types.Scene:
@@ -62,13 +62,13 @@ def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.ty
     """A mesh from vertices (V, 3) and faces (F, k)."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(points))
-    # Blender copies whole arrays into attributes; filling vertices and loops instead takes a hundred times longer.
+    # Blender copies whole arrays into attributes; filling vertices and loops takes a hundred times longer.
     mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(points, np.float32).ravel())
     mesh.loops.add(faces.size)
     mesh.attributes[".corner_vert"].data.foreach_set("value", np.ascontiguousarray(faces, np.int32).ravel())
     mesh.polygons.add(len(faces))
     mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, faces.shape[1], dtype=np.int32))
-    # Blender finds the edges of a mesh that has none, which takes 2 s for 6 million vertices. Cycles reads no edges.
+    # Without an edge, Blender would compute all edges: 2 s for 6 million vertices. Cycles reads no edges.
     mesh.edges.add(1)
     mesh.update()
     return mesh
@@ -92,9 +92,9 @@ def boulders_object(scene: Scene) -> bpy.types.Object:
 def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | None = None) -> bpy.types.Material:
     """A material whose radiance under the lamp "Sun" is the radiance factor of a law.
 
-    Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi. The colour that gives the
-    radiance I/F is therefore I/F over mu0, evaluated at the shading point. Approximation: for light from the Earth or
-    from other ground, this colour for the Sun's direction serves as the diffuse albedo.
+    Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi. The colour for the radiance I/F
+    is therefore I/F divided by mu0, evaluated at the shading point. Approximation: the colour for the Sun's direction
+    also serves as diffuse albedo for light from the Earth and from other ground.
     """
     material = bpy.data.materials.new(name)
     material.use_nodes = True
@@ -117,7 +117,7 @@ def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | No
 
 
 def lamp_object(name: str, towards: Array, angular_diameter_deg: float, suns: float = 1.0) -> bpy.types.Object:
-    """A lamp at infinity of irradiance `suns` x pi; with pi for the Sun, radiance equals the radiance factor."""
+    """A lamp at infinity of irradiance `suns` x pi; with irradiance pi, radiance equals the radiance factor."""
     lamp = bpy.data.lights.new(name, "SUN")
     lamp.energy = suns * np.pi
     lamp.angle = np.radians(angular_diameter_deg)

@@ -1,8 +1,9 @@
-"""Where the rays of a block of pixels begin: the height above which none hits anything, and the mesh part below.
+"""Where the rays of a block of pixels begin: the height above which no ray hits anything, and the mesh part below.
 
-A raster of squares has the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays of
-a block of pixels fill a pyramid. It is followed downwards, layer after layer: as long as the ground and the boulders
-below a layer do not reach into it, no ray ends there. All rays of the block then begin below these layers.
+A raster of squares stores the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays
+of a block of pixels fill a pyramid. The search follows it downwards, layer by layer: as long as the ground and the
+boulders below a layer do not reach into the layer, no ray ends in it. All rays of the block then begin below these
+layers.
 """
 
 from typing import NamedTuple
@@ -15,32 +16,32 @@ from perilune_render.provenance.kernels import njit
 BLOCK_PX = 4
 """Width and height of the blocks of pixels."""
 _SQUARES = 1024
-"""Squares along an axis, a power of two."""
+"""Number of squares along an axis, a power of two."""
 _LEVEL = 2
-"""Level of the ground's pyramid from which the raster is made."""
+"""Level of the ground's pyramid from which the raster is built."""
 _LAYERS = 16
 """Largest number of layers that are tried."""
 _THINNEST_M = 0.5
 """Thickness of a layer below which the search ends."""
 _LEAST_FALL = -1e-3
-"""Vertical component of a ray, whose component along the camera's axis is 1, above which it does not surely fall."""
+"""Vertical component above which a ray, with component 1 along the camera's axis, may fail to fall."""
 _MARGIN_M = 0.01
-"""Margin of heights and places for the rounding of the rays, metres."""
+"""Margin of heights and positions for rounding errors of the rays, metres."""
 
 
 class Tops(NamedTuple):
-    """The raster, as an argument of compiled functions. Places are relative to the grid's centre."""
+    """The raster, as an argument of compiled functions. Positions are relative to the grid's centre."""
 
     top_m: np.ndarray
-    """Largest height in each square, by y and x, metres: the levels one after another, float32; -inf for no ground."""
+    """Largest height in each square, by y and x, metres, float32, level after level; -inf without ground."""
     edge_m: float
     """Distance from the grid's centre to the raster's edges, metres."""
     per_m: float
-    """Squares of the finest level per metre."""
+    """Number of squares of the finest level per metre."""
 
 
 def tops_of(ground: Ground) -> Tops:
-    """The raster of a ground; takes a few hundredths of a second for ten million vertices."""
+    """The raster of a ground; takes some hundredths of a second for ten million vertices."""
     edge_m = float(ground.half_widths_m[-1])
     level = np.full((_SQUARES, _SQUARES), -np.inf, np.float32)
     _fill(ground, level, edge_m, _SQUARES / (2 * edge_m))
@@ -80,7 +81,7 @@ def _fill(ground, raster, edge, scale):
 
 @njit(**INLINED)
 def _squares(x0, x1, y0, y1, edge, scale):
-    """First and last column, and first and last row, of the squares that a rectangle touches."""
+    """First and last column and first and last row of the squares that a rectangle touches."""
     last = _SQUARES - 1
     i0, i1 = int(np.floor((x0 + edge) * scale - 1e-6)), int(np.floor((x1 + edge) * scale + 1e-6))
     j0, j1 = int(np.floor((y0 + edge) * scale - 1e-6)), int(np.floor((y1 + edge) * scale + 1e-6))
@@ -89,7 +90,7 @@ def _squares(x0, x1, y0, y1, edge, scale):
 
 @njit(**WITHOUT_COUNTS)
 def _highest(tops, x0, x1, y0, y1):
-    """Largest height in the squares that a rectangle touches, of the finest level with at most 4 x 4 of them."""
+    """Largest height below a rectangle, from the finest level of which it touches at most 4 x 4 squares."""
     i0, i1, j0, j1 = _squares(x0, x1, y0, y1, tops.edge_m, tops.per_m)
     level = 0
     while max((i1 >> level) - (i0 >> level), (j1 >> level) - (j0 >> level)) > 3:
@@ -105,7 +106,7 @@ def _highest(tops, x0, x1, y0, y1):
 
 @njit(**WITHOUT_COUNTS)
 def begin_m(tops, ground, origin, basis, rectangle):
-    """Height at which the rays through a rectangle of the image may begin, metres; inf if not all of them fall.
+    """Height at which the rays through a rectangle of the image may begin, metres; inf if not all rays fall.
 
     The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above this height no ray through the
     rectangle (u0, u1, v0, v1), pixels, hits anything.
@@ -117,7 +118,7 @@ def begin_m(tops, ground, origin, basis, rectangle):
         dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
         if dz > _LEAST_FALL:
             return np.inf
-        # Horizontal distance that the ray covers for a metre of height.
+        # Horizontal distance that the ray covers per metre of height.
         x = (u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]) / dz
         y = (u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]) / dz
         x_low, x_high, y_low, y_high = min(x_low, x), max(x_high, x), min(y_low, y), max(y_high, y)
@@ -140,10 +141,10 @@ def begin_m(tops, ground, origin, basis, rectangle):
 
 @njit(**WITHOUT_COUNTS)
 def only_part(ground, origin, basis, rectangle, begin):
-    """The part of the mesh in which all rays of `begin_m` stay from the height `begin` to below the ground.
+    """The part of the mesh that contains all rays of `begin_m` from the height `begin` to below the ground.
 
-    0 for the inner square, 1 to 4 for the sectors; -1 if there are several, or if not all rays fall. `begin` is in
-    metres.
+    0 is the inner square, 1 to 4 are the sectors; -1 if the rays cross several parts, or if not all rays fall. `begin`
+    is in metres.
     """
     u0, u1, v0, v1 = rectangle
     if begin > min(ground.highest_m, origin[2]):

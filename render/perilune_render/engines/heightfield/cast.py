@@ -36,12 +36,12 @@ from perilune_render.provenance.kernels import njit
 _FIRST_LEVEL = 1
 """Level of the pyramid at which a walk begins."""
 _BEHIND = 1e-6
-"""Relative distance behind a ray's current point at which a line no longer counts as ahead."""
+"""Relative distance behind a ray's current point beyond which a line no longer counts as ahead."""
 
 
 @njit(**INLINED)
 def _walk_inner(ground, rocks, horizon, ray, span):
-    """The first hit in the inner square within span, (t0, t1); see `first_hit`."""
+    """The first hit in the inner square within span, (t0, t1); arguments as in `first_hit`."""
     n, coarsest = ground.n_half, ground.level[0, -1]
     cells = 2 * n
     t, t1 = span
@@ -84,11 +84,11 @@ def _walk_inner(ground, rocks, horizon, ray, span):
             tg, triangle = cross_inner(ground, j, i, in_cells, (t, end))
             if tg < best:
                 return tg, Facet(0, j, i, triangle, -1, -1)
-        # A boulder that is entered beyond this block may lie behind ground of the next one.
+        # A boulder hit beyond this block may lie behind ground in the next block.
         if best <= end:
             break
         t = end
-        # Near its start the ray has the answer of its start: ask again only after it has passed a block.
+        # Near the start, the answer is the same as at the start, so test only after the ray has passed a block.
         if horizon is not None and above and _lit_at(horizon, ray, t):
             return -np.inf, NO_FACET
         if t >= t1:
@@ -104,7 +104,7 @@ def _walk_inner(ground, rocks, horizon, ray, span):
             i = min(max(int(p0 + t * dp), low), min(((bi + 1) << level), cells) - 1)
         if i < 0 or j < 0 or i >= cells or j >= cells:
             break
-        # A ray that falls cannot pass the rest of a block whose beginning it could not pass.
+        # A falling ray cannot pass the rest of a block if it could not pass the beginning.
         if level < coarsest and (rises or i >> (level + 1) != bi >> 1 or j >> (level + 1) != bj >> 1):
             level += 1
     if best < np.inf:
@@ -120,7 +120,7 @@ def _lit_at(horizon, ray, t):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _ring_at(half_widths, d, low, high):
-    """Ring r of low..high with half_widths[r] <= d < half_widths[r + 1], the nearest of them if none."""
+    """Ring r of low..high with half_widths[r] <= d < half_widths[r + 1], clipped to low and high."""
     while low < high:
         middle = (low + high + 1) >> 1
         if half_widths[middle] <= d:
@@ -132,7 +132,7 @@ def _ring_at(half_widths, d, low, high):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def any_ring_at(ground, d, high):
-    """`_ring_at` among all rings, by a table."""
+    """`_ring_at` among all rings, with the help of a table."""
     half_widths, table = ground.half_widths_m, ground.ring
     ring = table[min(max(int((d - half_widths[0]) * ground.rings_per_m), 0), len(table) - 1)]
     while ring < high and half_widths[ring + 1] <= d:
@@ -144,7 +144,7 @@ def any_ring_at(ground, d, high):
 
 @njit(**INLINED)
 def _walk_sector(ground, rocks, horizon, side, ray, span):
-    """The first hit in a sector within span, (t0, t1); see `first_hit`."""
+    """The first hit in a sector within span, (t0, t1); arguments as in `first_hit`."""
     n, coarsest = ground.n_half, ground.level[1, -1]
     n_rings, spokes = len(ground.half_widths_m) - 1, 2 * n
     half = ground.half_widths_m
@@ -159,7 +159,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
     else:
         a0, da, d0, dd = -ray.y, -ray.dy, -ray.x, -ray.dx
     in_sector = Ray(a0, d0, ray.z, da, dd, ray.dz, ray.start)
-    # Spokes meet at the centre. The sign of `turning` tells whether the ray crosses them upwards or downwards.
+    # Spokes meet at the centre. The sign of `turning` says whether the ray crosses them upwards or downwards.
     turning, per_d, per_n = da * d0 - a0 * dd, 1 / dd if dd != 0 else 0.0, 1 / n
     rises = ray.dz > 0
     d = d0 + t * dd
@@ -183,7 +183,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             if slope != 0:
                 ts = (u * d0 - a0) / slope
                 if ts < t - _BEHIND * (abs(t) + 1):
-                    # The line is crossed behind the ray's start, on its way towards the centre.
+                    # The ray crosses this line behind its start, on the way towards the centre.
                     ts = np.inf
         end = max(min(min(tr, ts), t1), t)
         if level > 0:
@@ -203,11 +203,11 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             tg, triangle = cross_sector(ground, side, (ring, spoke), in_sector, (t, end))
             if tg < best:
                 return tg, Facet(side + 1, ring, spoke, triangle, -1, -1)
-        # A boulder that is entered beyond this block may lie behind ground of the next one.
+        # A boulder hit beyond this block may lie behind ground in the next block.
         if best <= end:
             break
         t = end
-        # Near its start the ray has the answer of its start: ask again only after it has passed a block.
+        # Near the start, the answer is the same as at the start, so test only after the ray has passed a block.
         if horizon is not None and above and _lit_at(horizon, ray, t):
             return -np.inf, NO_FACET
         if t >= t1:
@@ -222,7 +222,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             ring = _ring_at(half, d0 + t * dd, first_ring, last_ring - 1)
         if ring < 0 or spoke < 0 or ring >= n_rings or spoke >= spokes:
             break
-        # A ray that falls cannot pass the rest of a block whose beginning it could not pass.
+        # A falling ray cannot pass the rest of a block if it could not pass the beginning.
         if level < coarsest and (rises or ring >> (level + 1) != br >> 1 or spoke >> (level + 1) != bs >> 1):
             level += 1
     if best < np.inf:
@@ -232,10 +232,10 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
 
 @njit(**INLINED)
 def first_hit(ground, rocks, horizon, ray, span):
-    """The first hit of a ray within span, (t0, t1): its parameter t and the facet; inf and `NO_FACET` for no hit.
+    """The first hit of a ray within span, (t0, t1): its parameter t and the facet; inf and `NO_FACET` without a hit.
 
-    A ray to the Sun's disc may have its `horizon`, others None. Where such a ray comes to a place that is surely lit,
-    nothing is ahead of it, and t is -inf.
+    For a ray to the Sun's disc, `horizon` may be the Sun's horizon; for other rays it is None. If such a ray reaches a
+    point that is surely lit, no hit lies ahead, and t is -inf.
     """
     (x, y, z, dx, dy, dz, _), (t0, t1) = ray, span
     half, outer = ground.half_widths_m[0], ground.half_widths_m[-1]
@@ -264,7 +264,7 @@ def first_hit(ground, rocks, horizon, ray, span):
             if begin < cut < end:
                 end = cut
         if end > begin:
-            # The middle of a piece tells its part, since its ends are on borders.
+            # The middle of a piece determines its part of the mesh, since the ends are on borders.
             middle = 0.5 * (begin + end)
             mx, my = x + middle * dx, y + middle * dy
             if max(abs(mx), abs(my)) <= half:
@@ -283,9 +283,9 @@ def first_hit(ground, rocks, horizon, ray, span):
 
 @njit(**INLINED)
 def first_hit_in_part(ground, rocks, part, ray, span):
-    """As `first_hit` without horizon, for a ray that stays in one part of the mesh from t0 to the lowest ground.
+    """Like `first_hit` without horizon, for a ray that stays in one part of the mesh from t0 to the lowest ground.
 
-    It omits the tests of the parts' borders. The ray falls, and begins below the highest ground.
+    The borders of the parts are not tested. The ray must fall and begin below the highest ground.
     """
     piece = span[0], min(span[1], (ground.lowest_m - ray.z) / ray.dz)
     if part == 0:
@@ -295,5 +295,5 @@ def first_hit_in_part(ground, rocks, part, ray, span):
 
 @njit(**WITHOUT_COUNTS)
 def first_hit_anywhere(ground, rocks, ray, span):
-    """As `first_hit` without horizon, compiled apart, since an image rarely needs it."""
+    """Like `first_hit` without horizon, but compiled separately, since an image rarely needs it."""
     return first_hit(ground, rocks, None, ray, span)

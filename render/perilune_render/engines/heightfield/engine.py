@@ -1,7 +1,7 @@
-"""The engine `heightfield`: renders a scene by rays over its height field, with the same light as the stage in Blender.
+"""The engine `heightfield`: casts rays at the height field of a scene, with the light of the stage in Blender.
 
-Light, photometry, albedo, the Sun's disc and the pixel's box filter equal `perilune_render.engines.blender`.
-Deviations: NumPy draws the sample points in the pixel and on the disc; light scattered by other ground, and earthshine,
+Light, photometry, albedo, the Sun's disc and the pixel's box filter match `perilune_render.engines.blender`.
+Deviations: NumPy draws the sample points in the pixel and on the disc; earthshine and light scattered by other ground
 are not rendered.
 """
 
@@ -25,17 +25,17 @@ from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array
 
 _TILE_PX = 64
-"""Width of the tiles of an image that are rendered one after another."""
+"""Width of the tiles in which an image is rendered one after another, pixels."""
 _RAYS_AT_ONCE = 8192
-"""Rays of a tile, if a row of it has no more: their photometry fits the cache of a core."""
+"""Largest number of rays in a tile of several rows; their photometry fits the cache of a core."""
 _LIT = 1e-4
 """Radiance factor above which a pixel counts as sunlit."""
 _RAYS_PER_VERTEX = 0.3
-"""Rays per vertex of the ground after which the horizon is computed: for fewer it costs more time than it saves."""
+"""Rays per ground vertex after which the horizon is computed; for fewer it costs more time than it saves."""
 
 
 class HeightfieldEngine:
-    """Renders frames of one scene. It is an `Engine` of `perilune_render.engines.frame_source`; several may be open.
+    """Renders frames of one scene; an `Engine` of `perilune_render.engines.frame_source`. Several may be open.
 
     Raises UserError if the configuration asks for light that this engine does not render.
     """
@@ -61,7 +61,7 @@ class HeightfieldEngine:
         self._disc_rad = np.float32(np.radians(config.light.sun_angular_diameter_deg) / 2)
         self._far_m = scene.grid.farthest_m
         self.horizon, self._n_rays = NOWHERE, 0
-        # One thread is the caller's: handing tiles over takes longer than that.
+        # A single thread is the caller's: handing tiles to another thread would cost more than it gains.
         self._threads = ThreadPoolExecutor(n_threads, "rays") if n_threads > 1 else None
 
     def close(self) -> None:
@@ -80,7 +80,7 @@ class HeightfieldEngine:
     ) -> Radiance:
         """Render one frame: radiance factor averaged over each pixel; depth and normal of the ray through its centre.
 
-        The first sample of a pixel is at its centre. `approach_deg` is not used: the ground is one mesh.
+        The first sample of a pixel is at its centre. `approach_deg` is not used, since the ground is one mesh.
         """
         shape = self.camera.height_px, self.camera.width_px
         image = Radiance.empty(shape)
@@ -89,7 +89,7 @@ class HeightfieldEngine:
         return image
 
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
-        """Render one frame with a pose for each row of the sensor; a depth is along the axis at its row's pose."""
+        """Render one frame with a pose for each row of the sensor; depth is along the camera's axis at this pose."""
         shape = self.camera.height_px, self.camera.width_px
         whole, band = Radiance.empty(shape), Radiance.empty(shape)
         drawn, horizon = self._drawn(seed), self._horizon_now()
@@ -104,7 +104,7 @@ class HeightfieldEngine:
         return whole
 
     def _drawn(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Places of the samples in their pixels and uniform numbers for the Sun's disc: (samples, h, w, 2) each."""
+        """Positions of the samples in their pixels, and uniform numbers for the Sun's disc: (samples, h, w, 2) each."""
         rng, shape = stream(seed, "rays"), (self._samples, self.camera.height_px, self.camera.width_px, 2)
         moved = rng.random(shape, np.float32) - np.float32(0.5)
         moved[0] = 0.0
@@ -113,7 +113,7 @@ class HeightfieldEngine:
     def _cast(
         self, image: Radiance, rows: slice, pose: Pose, drawn: tuple[np.ndarray, np.ndarray], horizon: Horizon
     ) -> None:
-        """Render rows of an image from one pose into `image`, in tiles by all threads."""
+        """Render rows from one pose into `image`, tile by tile on all threads."""
         position_m, rotation_camera_from_site = pose
         moved, disc = drawn
         origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
@@ -140,7 +140,7 @@ class HeightfieldEngine:
             cast(each)
 
     def _horizon_now(self) -> Horizon:
-        """The horizon for a frame; `NOWHERE` while this costs less time. Frames do not depend on it."""
+        """The horizon for a frame; `NOWHERE` until computing it saves time. Frames do not depend on the choice."""
         self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
         if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
             self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))

@@ -1,10 +1,10 @@
-"""Where the ground is surely lit: places from which no ray to the Sun's disc can hit anything.
+"""Where the ground is surely lit: points from which no ray to the Sun's disc can hit anything.
 
-A raster lies along the Sun's azimuth. For each of its squares it has the height above which a point of the ground is
-surely lit. Such a point needs no shadow ray, and the image is the same as with one. The test has two parts:
+A raster lies along the Sun's azimuth. For each square, it stores the height above which a point of the ground is surely
+lit. Such a point needs no shadow ray; the image does not change. The test has two parts:
 
-- near, in the square of the point and the next ones towards the Sun: no facet is as steep against the Sun as the
-  lowest ray to the disc, and no boulder touches the cells, so that the ray's height above the ground never decreases;
+- near, in the square of the point and the next ones towards the Sun: no facet is as steep against the Sun as the lowest
+  ray to the disc, and no boulder touches the cells, so that the ray's height above the ground never decreases;
 - far, in the squares beyond: their highest points are below the lowest ray to the disc.
 """
 
@@ -19,23 +19,24 @@ from perilune_shared.geometry.frames import Array
 _MOST_SQUARES = 2048
 """Largest number of squares along an axis."""
 _CELLS = 4
-"""Least width of a square, in cells of the inner square of the ground."""
+"""Smallest width of a square, in cells of the inner square of the ground."""
 _NEAR = 4
 """Number of squares of the near part."""
 _WIDEST = 0.2
-"""Largest tangent of half the disc's range of azimuths for which one square at each side of the near part suffices."""
+"""Largest tangent of half the disc's range of azimuths for which one more square on each side of the near part
+suffices."""
 _MARGIN = 1e-3
-"""Margin of slopes for the rounding of the rays."""
+"""Margin of slopes for rounding errors of the rays."""
 _MARGIN_M = 0.01
 """Margin of heights, metres."""
 
 
 class Horizon(NamedTuple):
-    """The raster, as an argument of compiled functions. Places are relative to the grid's centre."""
+    """The raster, as an argument of compiled functions. Positions are relative to the grid's centre."""
 
     clear_m: np.ndarray
-    """Height above which ground is surely lit, metres, infinite where it may be dark: squares along the direction
-    towards the Sun, and across it, to the left (N, N) float32."""
+    """Height above which ground is surely lit, metres, infinite where it may be dark (N, N) float32: by square towards
+    the Sun, then by square across this direction, to the left."""
     along_x: float
     """x of the horizontal unit vector towards the Sun."""
     along_y: float
@@ -43,17 +44,17 @@ class Horizon(NamedTuple):
     edge_m: float
     """Distance from the grid's centre to the raster's edges, metres."""
     per_m: float
-    """Squares per metre."""
+    """Number of squares per metre."""
 
 
 NOWHERE = Horizon(np.full((1, 1), np.inf, np.float32), 1.0, 0.0, 0.0, 1.0)
-"""A horizon that calls no place surely lit."""
+"""A horizon by which no point is surely lit."""
 
 
 def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
-    """The horizon of a ground for a Sun of angular radius `disc_rad` whose centre is towards `sun` (3,), O_L.
+    """The horizon of a ground for a Sun of angular radius `disc_rad` in the direction `sun` (3,), O_L.
 
-    Takes about a second for ten million vertices. It is `NOWHERE` for a Sun in the zenith or at the horizon.
+    Takes about a second for ten million vertices. Returns `NOWHERE` for a Sun at the zenith or at the horizon.
     """
     elevation, level = np.arcsin(sun[2]), float(np.hypot(sun[0], sun[1]))
     radius = 1.001 * disc_rad + 1e-6
@@ -74,13 +75,13 @@ def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
     near = steep.copy()
     for k in range(1, _NEAR):
         near[:-k] |= steep[k:]
-    # Beyond a square k steps further a ray has risen by at least k - 1 steps.
+    # After k squares, a ray has risen by at least the rise over k - 1 squares.
     rise, every = np.float32(lowest * pitch_m), int(0.75 / max(np.tan(turn), 1e-6))
     clear = np.full((n, n), -np.inf, np.float32)
     for row in range(n - 2, -1, -1):
         clear[row] = np.maximum(highest[row + 1], clear[row + 1] - rise)
         if row % every == 0:
-            # The disc's range of azimuths reaches one more square at each side.
+            # The disc's range of azimuths extends over one more square on each side.
             clear[row] = _widened(clear[row : row + 1])[0]
     far = np.full((n, n), -np.inf, np.float32)
     far[: 1 - _NEAR] = clear[_NEAR - 1 :] - rise * np.float32(_NEAR - 1)
@@ -113,7 +114,7 @@ def _fill(ground, raster, steepest, turned, steep):
 
 @njit(**WITHOUT_COUNTS)
 def _add_cell(ground, raster, cell, steepest, turned, steep):
-    """Add one cell to the squares that its bounds along and across the Sun's azimuth touch; see `_fill`."""
+    """Add one cell to all squares that its bounds along and across the Sun's azimuth touch; see `_fill`."""
     (part, row, column), n, half, highest = cell, ground.n_half, ground.half_widths_m, raster.clear_m
     v0, v1 = vertex_index(part, row, column, 0, n), vertex_index(part, row, column, 1, n)
     v2, v3 = vertex_index(part, row, column, 2, n), vertex_index(part, row, column, 3, n)
@@ -133,7 +134,7 @@ def _add_cell(ground, raster, cell, steepest, turned, steep):
     against = max(against, _against(edge_2, edge_3, turned))
     rough = against > steepest
     if ground.vertex[v0, 3] < 0:
-        # The first level of the pyramid has the boulders' tops too.
+        # The first level of the pyramid also includes the boulders' tops.
         sizes = (2 * n, 2 * n) if part == 0 else (len(half) - 1, 2 * n)
         n_rows, n_columns = (sizes[0] + 1) >> 1, (sizes[1] + 1) >> 1
         block = (max(part - 1, 0) * n_rows + (row >> 1)) * n_columns + (column >> 1)
@@ -162,7 +163,7 @@ def _against(first, second, turned):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def surely_lit(horizon, x, y, z):
-    """Whether no ray from a point of the ground to the Sun's disc hits anything; false if this is not known."""
+    """Whether surely no ray from a point of the ground to the Sun's disc hits anything; false if unknown."""
     i = int((x * horizon.along_x + y * horizon.along_y + horizon.edge_m) * horizon.per_m)
     j = int((y * horizon.along_x - x * horizon.along_y + horizon.edge_m) * horizon.per_m)
     n = horizon.clear_m.shape[0]

@@ -1,7 +1,7 @@
-"""Light of the rays' hits: points of the Sun's disc, and photometry, compiled for speed.
+"""Light at the hits of rays: points on the Sun's disc, and photometry, compiled for speed.
 
-Compiled Hapke photometry has the operations of `perilune_render.imaging.photometry` in their order, in float32, and
-calls the functions of the C library that NumPy calls: the results are the same to the bit.
+The compiled Hapke law runs the operations of `perilune_render.imaging.photometry` in the same order, in float32, and
+calls the C library functions that NumPy calls, so the results are equal to the bit.
 """
 
 from typing import NamedTuple
@@ -45,7 +45,7 @@ class _Factors(NamedTuple):
 
 
 def _factors(p: HapkeParameters) -> _Factors:
-    """The constants of a parameter set. Each is computed in double precision and rounded once, as by NumPy."""
+    """The constants of a parameter set. Each is computed in double precision and rounded once, as NumPy does."""
     slope, chi, gamma = slope_of(p.theta_bar_deg), chi_of(p.theta_bar_deg), float(np.sqrt(1 - p.w))
     scale = (1 - p.b**2) / 2
     values = (
@@ -71,14 +71,14 @@ def _factors(p: HapkeParameters) -> _Factors:
 
 
 def disc_places(drawn: np.ndarray, radius_rad: np.float32) -> np.ndarray:
-    """Uniform places (..., 2) on the Sun's disc at unit distance, for uniform random numbers (..., 2), float32."""
+    """Uniform points (..., 2) on the Sun's disc at unit distance, from uniform random numbers (..., 2), float32."""
     points = np.empty(drawn.shape, np.float32)
     _fill_disc(drawn, radius_rad, points)
     return points
 
 
 def reflected(law: str, angles: np.ndarray) -> np.ndarray:
-    """Radiance factor (...) of a law for `angles` (5, ...) float32 as `see` writes them."""
+    """Radiance factor (...) of a law for `angles` (5, ...) float32 as written by `see`."""
     mu0, mu, cos_phase, albedo, lit = angles
     if law not in HAPKE:
         return reflectance_factor(law, mu0, mu, cos_phase) * albedo * lit
@@ -100,7 +100,7 @@ def _fill_disc(drawn, radius_rad, points):
 
 @njit(**INLINED)
 def _slopes(f, cosine):
-    """See `photometry`."""
+    """Compiled copy of `photometry._slopes`."""
     sine = np.sqrt(max(cosine * cosine * -_ONE + _ONE, _LEAST))
     exponent = cosine / sine * f.exponent_1
     return sine, np.exp(exponent), np.exp(exponent * exponent * f.exponent_2)
@@ -108,7 +108,7 @@ def _slopes(f, cosine):
 
 @njit(**WITHOUT_COUNTS)
 def _hapke(f, angles, result):
-    """`photometry.hapke` times albedo and cosine of incidence of each sample: angles (5, N), result (N,)."""
+    """Write `photometry.hapke` times albedo and cosine of incidence of each sample: angles (5, N), result (N,)."""
     for k in range(len(result)):
         mu0, mu, cos_phase = angles[0, k], angles[1, k], angles[2, k]
         cos_l, cos_s = min(mu0, mu), max(mu0, mu)

@@ -1,4 +1,4 @@
-"""Ask the processor to read memory before it is needed: the rays of an image wait for memory most of their time."""
+"""Prefetch memory, since the rays of an image spend most of their time waiting for memory."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Begin to read the element of a contiguous array at an index of its flat form. Changes no value."""
+    """Prefetch the element of a contiguous array at an index into its flat form. Changes no value."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -17,7 +17,7 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
         ir, number = cgutils.ir, cgutils.int32_t
         kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        # To read, keep in all caches, data.
+        # Arguments of LLVM's prefetch: read access, keep in all caches, data.
         builder.call(function, [address, number(0), number(3), number(1)])
         return context.get_dummy_value()
 

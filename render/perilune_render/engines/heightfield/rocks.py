@@ -1,4 +1,4 @@
-"""Boulders for casting rays: convex rocks as half-spaces, and the cells of the ground that each one touches."""
+"""Boulders for casting rays: convex rocks as half-spaces, and the ground cells that each boulder touches."""
 
 from typing import NamedTuple
 
@@ -11,16 +11,16 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 
 class Rocks(NamedTuple):
-    """N boulders, as arguments of compiled functions. Places are relative to the grid's centre."""
+    """N boulders, as arguments of compiled functions. Positions are relative to the grid's centre."""
 
     rows: Array
-    """Of each boulder (N, 15): its centre, metres (3); its matrix rotation_rock_from_site over its diameter, 1 / metre
-    (9); radius of the sphere that holds it, metres; first face in `planes`, and the face after its last."""
+    """For each boulder (N, 15): centre, metres (3); matrix rotation_rock_from_site divided by the diameter, 1 / metre
+    (9); radius of the enclosing sphere, metres; index of its first face in `planes`, and index after its last face."""
     planes: Array
     """Outer unit normal and distance from the centre of each face, for a rock of diameter 1 (F, 4)."""
     cell_start: np.ndarray
-    """Index in `cell_rock` of each cell's first boulder, and their number (C + 1,) int64: cells of the inner square by
-    y and x, then cells of the sectors by side, ring and spoke."""
+    """Index in `cell_rock` of each cell's first boulder, then the total number (C + 1,) int64: cells of the inner
+    square by y and x, then cells of the sectors by side, ring and spoke."""
     cell_rock: np.ndarray
     """Indices of the boulders in each cell (M,) int64."""
 
@@ -28,8 +28,8 @@ class Rocks(NamedTuple):
 def rocks_of(scene: Scene) -> tuple[Rocks, tuple[np.ndarray, np.ndarray]]:
     """The boulders of a scene, with the shapes of `perilune_render.terrain.boulders.boulder_mesh`.
 
-    Also returns the largest height of boulders in each cell of the inner square (2 n, 2 n) and of the sectors
-    (4, R, 2 n), -inf for none, float32.
+    Also returns the largest boulder height in each cell of the inner square (2 n, 2 n) and of the sectors (4, R, 2 n),
+    float32, -inf without boulders.
     """
     boulders, grid = scene.boulders, scene.grid
     local = grid.spacing_under(boulders.x_m, boulders.y_m)
@@ -59,7 +59,7 @@ def cells_of_rocks(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Cells of the boulders with these `Rocks.rows`: `cell_start`, `cell_rock`, and the largest height in each cell.
 
-    The heights have two arrays: inner square (2 n, 2 n) and sectors (4, R, 2 n), float32.
+    The heights are two arrays: inner square (2 n, 2 n) and sectors (4, R, 2 n), float32.
     """
     n, n_rings = n_half, len(half_widths_m) - 1
     inner, sectors = np.full((2 * n, 2 * n), -np.inf, np.float32), np.full((4, n_rings, 2 * n), -np.inf, np.float32)
@@ -74,9 +74,10 @@ def cells_of_rocks(
 
 @njit()
 def _fill(rows, n, half_widths, tops, position, numbers):
-    """Write the boulders of each cell into `numbers` from `position` of the cell on, and advance that position.
+    """Write the boulders of each cell into `numbers`, starting at the cell's `position`, and advance this position.
 
-    With empty `numbers`, count them in `position`. Raise `tops` of the inner square and of the sectors to the boulders.
+    If `numbers` is empty, only count the boulders in `position`. Raise the heights in `tops`, for the inner square and
+    the sectors, to the boulders.
     """
     (inner, sectors), write = tops, len(numbers) > 0
     step = half_widths[0] / n

@@ -31,15 +31,15 @@ from perilune_render.provenance.kernels import njit
 from perilune_shared.geometry.frames import Array
 
 _LIFT = 1e-4
-"""Distance from the hit at which a shadow ray begins, metres. It cannot hit its own triangle or boulder, but from an
-edge of its triangle it could hit the next one by rounding."""
+"""Distance from the hit at which a shadow ray begins, metres. A shadow ray cannot hit its own triangle or boulder, but
+from an edge of the triangle it could hit the neighbour because of rounding."""
 _TERMINATOR = 0.1
 """Cosine between ground and Sun below which Cycles moves the start of a shadow ray from the facet to the curved
 surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
 
 
 class View(NamedTuple):
-    """Camera and Sun of an image. Places are relative to the grid's centre, vectors are in O_L."""
+    """Camera and Sun of an image. Positions are relative to the grid's centre, vectors are in O_L."""
 
     origin: Array
     """Position of the camera, metres (3,)."""
@@ -47,40 +47,40 @@ class View(NamedTuple):
     """The ray at image coordinates (u, v), pixels, is u basis[0] + v basis[1] + basis[2], with z = 1 along the camera's
     axis (3, 3)."""
     far_m: float
-    """Depth at which rays end, metres."""
+    """Depth along the camera's axis at which rays end, metres."""
     sun: Array
     """Unit vector to the centre of the Sun's disc (3,)."""
     plane: Array
     """The ray to the point (p, q) of the disc is along sun + p plane[0] + q plane[1] (2, 3)."""
     horizon: Horizon
-    """Where the ground is surely lit by this Sun."""
+    """Where this Sun surely lights the ground."""
 
 
 class Tile(NamedTuple):
-    """A tile of the image: S samples in each of h x w pixels, and the arrays that take what they see."""
+    """A tile of the image: S samples in each of h x w pixels, and the arrays for their results."""
 
     first: tuple[int, int]
     """Row and column of the tile's first pixel."""
     moved: np.ndarray
-    """Places of the samples from their pixels' centres, pixels (S, h, w, 2)."""
+    """Offsets of the samples from the centres of their pixels, pixels (S, h, w, 2)."""
     disc: np.ndarray
     """Points (p, q) of the Sun's disc for the samples' shadow rays (S, h, w, 2)."""
     depth: np.ndarray
-    """Depth image, metres, of which the tile's pixels are written for the first sample; inf for a miss (H, W)."""
+    """Depth image, metres (H, W); the first sample writes the tile's pixels, inf for a miss."""
     normal: np.ndarray
-    """Image of the unit shading normal, O_L, written likewise; 0 for a miss (H, W, 3)."""
+    """Image of the unit shading normal, O_L (H, W, 3); the first sample writes the tile's pixels, 0 for a miss."""
     angles: np.ndarray
-    """Written for each sample (5, S, h, w): mu0, mu, cosine of the phase angle, albedo, and the cosine of incidence of
-    the point of the disc, 0 in shadow."""
+    """Results of each sample (5, S, h, w): mu0, mu, cosine of the phase angle, albedo, and cosine of incidence for the
+    sampled point of the disc, 0 in shadow."""
 
 
 class _Block(NamedTuple):
     """Start of all rays of a block of pixels."""
 
     begin_m: float
-    """Height at which they may begin, metres (`beam.begin_m`)."""
+    """Height at which the rays may begin, metres (`beam.begin_m`)."""
     part: int
-    """Part of the mesh below them, -1 if it is not known (`beam.only_part`)."""
+    """Part of the mesh below this height, -1 if unknown (`beam.only_part`)."""
 
 
 @njit(inline="always", **WITHOUT_COUNTS)
@@ -90,7 +90,7 @@ def _dot(ax, ay, az, bx, by, bz):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _normal(vertices, k):
-    """Unit normal of a vertex, which points upwards."""
+    """Unit normal of a vertex, pointing upwards."""
     x, y = float(vertices[k, 0]), float(vertices[k, 1])
     return x, y, np.sqrt(max(1 - x * x - y * y, 0.0))
 
@@ -141,8 +141,8 @@ def ground_at(ground, facet, x, y):
 def lift_at(ground, facet, x, y):
     """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle at (x, y), metres.
 
-    It leads along the interpolated normal to the lowest of the vertices' tangent planes, each raised over the triangle,
-    or to half the height of a quadratic patch with these vertex normals, whichever is higher.
+    It points along the interpolated normal. Its length reaches the lowest of the vertices' tangent planes, each raised
+    above the triangle, or half the height of a quadratic patch with these vertex normals, whichever is higher.
     """
     vertices = ground.vertex
     v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, facet, x, y)
@@ -151,12 +151,12 @@ def lift_at(ground, facet, x, y):
     bx, by, bz = _normal(vertices, v1)
     cx, cy, cz = _normal(vertices, v2)
     nx, ny, nz = u * ax + v * bx + w * cx, u * ay + v * by + w * cy, u * az + v * bz + w * cz
-    # A patch that is normal to the vertex normals bulges over an edge by its length times the change of slope.
+    # A patch perpendicular to the vertex normals bulges over an edge by the edge's length times the change of slope.
     edge_1 = (bx - ax) * e1x + (by - ay) * e1y + (bz - az) * e1z
     edge_2 = (cx - ax) * e2x + (cy - ay) * e2y + (cz - az) * e2z
     edge_3 = (cx - bx) * (e2x - e1x) + (cy - by) * (e2y - e1y) + (cz - bz) * (e2z - e1z)
     bulge = u * v * edge_1 + u * w * edge_2 + v * w * edge_3
-    # The tangent plane of each vertex, raised over the other two vertices: its height above the place.
+    # Height at the point of each vertex's tangent plane, raised above the other two vertices.
     px, py, pz = v * e1x + w * e2x, v * e1y + w * e2y, v * e1z + w * e2z
     over_0 = max(max(_dot(e1x, e1y, e1z, ax, ay, az), _dot(e2x, e2y, e2z, ax, ay, az)), 0.0)
     over_1 = max(max(-_dot(e1x, e1y, e1z, bx, by, bz), _dot(e2x - e1x, e2y - e1y, e2z - e1z, bx, by, bz)), 0.0)
@@ -185,7 +185,7 @@ def rock_normal(rocks, k, face):
 def _see(ground, rocks, view, tile, block, sample):
     """Cast the ray of one sample, (s, row, column) in the tile, and its shadow ray; see the module's sketch.
 
-    Returns the height of the hit, metres; without a hit, the height at which the ray begins.
+    Returns the height of the hit, metres, or without a hit the height at which the ray begins.
     """
     (s, i, j), horizon, angles, sun, plane = sample, view.horizon, tile.angles, view.sun, view.plane
     u, v = _coordinates(tile, s, i, j)
@@ -210,7 +210,7 @@ def _see(ground, rocks, view, tile, block, sample):
         row, column = tile.first[0] + i, tile.first[1] + j
         tile.depth[row, column] = t
         tile.normal[row, column, 0], tile.normal[row, column, 1], tile.normal[row, column, 2] = nx, ny, nz
-    # The direction l to a point of the Sun's disc. Photometry takes the disc's centre.
+    # Direction l to a point of the Sun's disc; photometry uses the centre of the disc.
     p, q = tile.disc[s, i, j, 0], tile.disc[s, i, j, 1]
     lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
     lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
@@ -225,7 +225,7 @@ def _see(ground, rocks, view, tile, block, sample):
     angles[4, s, i, j] = 0.0
     if cosine <= 0:
         return hit_z
-    # 3. A shadow ray that grazes the ground begins above its facet, as in Cycles.
+    # 3. A shadow ray that grazes the ground begins above the facet, as in Cycles.
     if facet.rock < 0:
         on_facet = fx * lx + fy * ly + fz * lz
         share = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
@@ -236,7 +236,7 @@ def _see(ground, rocks, view, tile, block, sample):
         elif surely_lit(horizon, x, y, z):
             angles[4, s, i, j] = cosine
             return hit_z
-    # 4. The shadow ray; its parameter is -inf where it reaches ground that is surely lit.
+    # 4. The shadow ray; its parameter is -inf if it reaches ground that is surely lit.
     shadow_ray = Ray(x, y, z, lx, ly, lz, facet)
     if abs(first_hit(ground, rocks, horizon, shadow_ray, (_LIFT, np.inf))[0]) == np.inf:
         angles[4, s, i, j] = cosine
@@ -261,7 +261,7 @@ def _direction(basis, u, v):
 
 @njit(**INLINED)
 def _read_ahead(ground, horizon, x, y):
-    """Begin to read what a ray needs that hits the ground near (x, y)."""
+    """Prefetch the data for a ray that hits the ground near (x, y)."""
     n, half = ground.n_half, ground.half_widths_m
     i = int((x * horizon.along_x + y * horizon.along_y + horizon.edge_m) * horizon.per_m)
     j = int((y * horizon.along_x - x * horizon.along_y + horizon.edge_m) * horizon.per_m)
@@ -293,7 +293,7 @@ def _read_ahead(ground, horizon, x, y):
 def see(ground, rocks, tops, view, tile):
     """Cast the rays of a tile of the image, and a shadow ray from each hit that may be dark, into the tile's arrays.
 
-    `tops` tells where the rays of a block of pixels begin.
+    `tops` gives where the rays of a block of pixels begin.
     """
     n_samples, height, width, _ = tile.moved.shape
     origin, basis, (first_row, first_column) = view.origin, view.basis, tile.first
@@ -307,7 +307,7 @@ def see(ground, rocks, tops, view, tile):
             part = -1
             if begin < np.inf:
                 part = only_part(ground, origin, basis, rectangle, begin)
-                # Close rays hit at similar heights, so the last hit tells where memory will be read.
+                # Neighbouring rays hit at similar heights, so the last hit predicts which memory will be read.
                 for i in range(row, last_row):
                     for j in range(column, last_column):
                         for s in range(n_samples):
@@ -315,7 +315,7 @@ def see(ground, rocks, tops, view, tile):
                             dx, dy, dz = _direction(basis, u, v)
                             t = (near_m - origin[2]) / dz
                             _read_ahead(ground, view.horizon, origin[0] + t * dx, origin[1] + t * dy)
-            # The samples of a pixel come one after another, since they read the same memory.
+            # The samples of a pixel follow each other, since they read the same memory.
             for i in range(row, last_row):
                 for j in range(column, last_column):
                     for s in range(n_samples):

@@ -5,11 +5,11 @@ parts:
 
 - the inner square, a regular grid;
 - four sectors between the rings, one for each side (south y = -d, then x = d, y = d, x = -d). In a sector a point has
-  two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines
-  d = half_widths[r], spokes are the lines along / d = s / n_half - 1. They cross at the vertices.
+  two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines d =
+  half_widths[r], spokes are the lines along / d = s / n_half - 1. They cross at the vertices.
 
-A cell is a quad. Level L of the pyramid, from 1, has the largest height of blocks of 2^L x 2^L cells, with the boulders
-that touch them. A ray spends most of its time on reading memory, so the four numbers of a vertex stand side by side.
+A cell is a quad. Level L of the pyramid, from 1, stores the largest height in blocks of 2^L x 2^L cells, including the
+boulders that touch them. A ray spends most of its time reading memory, so the four numbers of a vertex are adjacent.
 """
 
 from dataclasses import dataclass
@@ -24,28 +24,29 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
 WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
-"""Options of kernels that make no arrays: no counts of references to arrays, which all threads would write."""
+"""Options of kernels that create no arrays: they skip reference counts, which all threads would write."""
 INLINED = WITHOUT_COUNTS | {"forceinline": True}
-"""Options of kernels that are compiled into their callers: a call passes `Ground` and `Rocks` as about 70 numbers."""
+"""Options of kernels that are compiled into their callers: a call would pass `Ground` and `Rocks` as about 70
+numbers."""
 _MOST_LEVELS = 16
 _MARGIN_M = 0.01
-"""Between the heights where rays begin and end, and the surface: a ray must cross the ground between them."""
+"""Margin between the surface and the heights where rays begin and end, so that each ray crosses the ground."""
 
 
 class Ground(NamedTuple):
-    """Arrays of the ground, as an argument of compiled functions; few, since each is passed as eight numbers."""
+    """Arrays of the ground, as an argument of compiled functions; few arrays, since each is passed as eight numbers."""
 
     half_widths_m: Array
-    """Half-widths of inner square and rings, ascending, metres (R + 1,)."""
+    """Half-widths of the inner square and the rings, ascending, metres (R + 1,)."""
     vertex: np.ndarray
-    """Of each vertex, in the grid's order (V, 4) float32: x and y of its unit normal, O_L; height, metres; albedo,
-    negative if boulders touch the cell whose first vertex it is."""
+    """For each vertex, in the grid's order (V, 4) float32: x and y of the unit normal, O_L; height, metres; albedo,
+    negative if boulders touch the cell that has this vertex as its first."""
     top_m: np.ndarray
-    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and spoke, metres: levels from 1
-    one after another, float32."""
+    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and spoke, metres, float32: level
+    after level, from 1."""
     level: np.ndarray
     """Index in `top_m` at which each level of the inner square and of the sectors begins (2, L + 1) int64; the last
-    column is the index of the coarsest level."""
+    column holds the number of the coarsest level."""
     n_half: int
     """Vertex spacings from the centre of the inner square to its border."""
     lowest_m: float
@@ -53,9 +54,9 @@ class Ground(NamedTuple):
     highest_m: float
     """Height above all ground and boulders, metres."""
     ring: np.ndarray
-    """Ring at equal steps of the distance max(|x|, |y|), beginning at the first ring (N,) int64."""
+    """Ring number at equal steps of the distance max(|x|, |y|), starting at the first ring (N,) int64."""
     rings_per_m: float
-    """Elements of `ring` per metre."""
+    """Number of elements of `ring` per metre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +66,13 @@ class Surface:
     ground: Ground
     """Ground."""
     rocks: Rocks
-    """Boulders, with the cells that each touches."""
+    """Boulders, and the cells that each touches."""
     centre_m: tuple[float, float]
     """x and y of the grid's centre, O_L, metres; the arrays are relative to it."""
 
 
 def surface_of(scene: Scene) -> Surface:
-    """The surface of a scene, built in a few seconds for ten million vertices."""
+    """Build the surface of a scene; takes a few seconds for ten million vertices."""
     grid, n = scene.grid, scene.grid.n_half
     half = np.ascontiguousarray(grid.half_widths_m, np.float64)
     height = np.ascontiguousarray(scene.height_m, np.float32)
@@ -115,7 +116,7 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
 
 @njit()
 def _coarser(tops):
-    """The largest values of blocks of 2 x 2 of `tops` (sides, rows, columns); fewer at the end of an odd length."""
+    """The largest values in blocks of 2 x 2 of `tops` (sides, rows, columns); blocks at an odd end are smaller."""
     n_sides, n_rows, n_columns = tops.shape
     coarse = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
     for side in range(n_sides):
@@ -128,7 +129,7 @@ def _coarser(tops):
 
 @njit(inline="always")
 def ring_vertex(ring, index, n):
-    """As `vertex_of_ring` for indices in the ring up to 8 n, without a division."""
+    """Like `vertex_of_ring`, for indices in the ring up to 8 n, without a division."""
     if index >= 8 * n:
         index -= 8 * n
     return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + index if ring > 0 else vertex_of_ring(ring, index, n)
@@ -177,7 +178,7 @@ def _raise_to_ground(height, n, inner_top, sector_top):
 
 @njit()
 def _add_face(cell, n, half_widths, height, points, total):
-    """Add to `total` (V, 3) at each vertex of a cell the normal of its face, weighted by the angle there.
+    """For each vertex of a cell, add the face normal, weighted by the angle at the vertex, to `total` (V, 3).
 
     `cell` is part, row and column; `points` (4, 3) is overwritten.
     """
@@ -207,7 +208,7 @@ def _add_face(cell, n, half_widths, height, points, total):
 
 @njit()
 def _write_normals(n, half_widths, height, vertices):
-    """Write x and y of the unit vertex normals as Blender's: means of the faces' normals, weighted by the angles."""
+    """Write x and y of the unit vertex normals, computed as in Blender: means of face normals, weighted by angles."""
     total, points = np.zeros((len(height), 3)), np.empty((4, 3))
     for j in range(2 * n):
         for i in range(2 * n):

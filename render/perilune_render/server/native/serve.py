@@ -1,4 +1,4 @@
-"""Serve our own interface: read each message whole, then answer it."""
+"""Serve perilune's native interface: read each message completely, then answer it."""
 
 import asyncio
 import json
@@ -12,32 +12,32 @@ from perilune_render.server.native.answers import ANSWERED_BY_CONNECTIONS, answe
 from perilune_render.server.serve import Interface, answers
 
 MOST_WITHOUT_PLACE = 256
-"""Largest number of clients that are connected without a place, to learn that the server is busy."""
+"""Largest number of clients connected beyond the limit, only to be told that the server is busy."""
 HEALTH = b'{"request": "health"}'
-"""The request for which no place is needed, as `perilune_shared.client` sends it."""
+"""The health request of `perilune_shared.client`, which is also answered beyond the limit of clients."""
 _HEALTH_S = 5.0
 """Time within which each interface must greet, seconds."""
 
 
 def native_address(host: str, port: int) -> str:
-    """The address for ZeroMQ; one of IPv6 is in brackets."""
+    """The address for ZeroMQ; an IPv6 address is in brackets."""
     return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
 
 @dataclass
 class Native:
-    """Our own interface of a server."""
+    """The native interface of a server."""
 
     grounds: Grounds
     """The scenes."""
     limits: Limits
-    """What each client may ask for. Clients above their number are answered that the server is busy."""
+    """Limits on the clients. Clients above the largest number are told that the server is busy."""
     note: Callable[[str], object]
-    """Called with a line on each error that is not the client's."""
+    """Called with one line for each error that is not caused by a client."""
     interfaces: list[Interface] = field(default_factory=list)
-    """All interfaces of the server, for the request of its health."""
+    """All interfaces of the server, for the health request."""
     _places: set[Connection] = field(default_factory=set)
-    """Clients that have a place: at most `limits.clients`, from their first request until they are disconnected."""
+    """Admitted clients: at most `limits.clients`, each from its first request until it disconnects."""
 
     def interface(self, host: str, port: int) -> Interface:
         """The interface at an address."""
@@ -47,7 +47,7 @@ class Native:
         return made
 
     async def _serve(self, connection: Connection) -> None:
-        """One client, until it leaves."""
+        """Serve one client until it leaves."""
         if connection.is_extra:
             return
         await zmtp.greet(connection)
@@ -61,7 +61,7 @@ class Native:
             self._places.discard(connection)
 
     def _has_place(self, connection: Connection) -> bool:
-        """Whether a client has a place; it gets one if there is one."""
+        """Whether a client is admitted; admits it if fewer than the largest number are."""
         if connection not in self._places and len(self._places) < self.limits.clients:
             self._places.add(connection)
         return connection in self._places
@@ -69,7 +69,7 @@ class Native:
     async def _reply(self, connection: Connection, message: zmtp.Message, n_empty: int) -> list[bytes]:
         if message.n_parts != 1 + n_empty:
             return refusal(f"message: got {message.n_parts} parts, expected an empty one and JSON")
-        # Also a server without a free place says whether it is well.
+        # A server with the largest number of clients still answers health requests.
         if not message.is_whole or (message.kept[-1] != HEALTH and not self._has_place(connection)):
             return refusal(f"{self.limits.clients} clients are connected; try again", busy=True)
         try:
@@ -83,7 +83,7 @@ class Native:
         return await self._health() if reply is ANSWERED_BY_CONNECTIONS else reply
 
     async def _health(self) -> list[bytes]:
-        """The interfaces with their addresses, or an error that names the one that does not answer."""
+        """The interfaces with their addresses, or an error that names the interface that does not answer."""
         for each in self.interfaces:
             where = f"{each.name} at {each.host}:{each.port}"
             try:

@@ -1,7 +1,7 @@
 """Frames of ZeroMQ's wire protocol, ZMTP 3.0 without encryption (https://rfc.zeromq.org/spec/23).
 
-ZeroMQ's library gathers all parts of a message before a program sees them, in any number, so one client can fill the
-memory. Here a part beyond the first two is read and discarded, and no part is larger than LARGEST_REQUEST_BYTES.
+ZeroMQ's library collects any number of parts of a message before a program sees them, so one client can fill the
+memory. This module reads and discards all parts after the first two, and accepts no part above LARGEST_REQUEST_BYTES.
 """
 
 import asyncio
@@ -41,7 +41,7 @@ async def greet(connection: Connection) -> None:
     signature += await connection.rest(len(_SIGNATURE) - 1)
     if signature[-1] & 1 == 0:
         raise Dropped("not a client of ZeroMQ 4")
-    # The other side waits for it before it sends the rest of its own.
+    # The other side waits for our greeting before it sends the rest of its greeting.
     await connection.send(_GREETING)
     rest = await connection.rest(len(_GREETING) - len(_SIGNATURE))
     if rest[0] < 3 or rest[2:22] != _GREETING[12:32]:
@@ -54,9 +54,9 @@ async def greet(connection: Connection) -> None:
 
 
 async def receive(connection: Connection, may_keep: Callable[[], bool]) -> Message:
-    """The next message. Raises Dropped if a part is too large; TimeoutError as `Connection.first` and `rest`.
+    """The next message. Raises Dropped if a part is too large; TimeoutError like `Connection.first` and `rest`.
 
-    `may_keep` is asked before a part of more than 64 kB is kept.
+    `may_keep` decides whether a part of more than 64 kB is kept.
     """
     kept: list[bytes] = []
     n_parts, is_whole = 0, True
@@ -85,7 +85,7 @@ async def send(connection: Connection, parts: Sequence[bytes]) -> None:
 
 
 async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
-    """Whether the other end of a new connection greets as a server of ZMTP 3."""
+    """Whether the other end of a new connection sends the greeting of a ZMTP 3 server."""
     writer.write(_GREETING)
     return await reader.readexactly(len(_GREETING)) == _GREETING
 
@@ -102,7 +102,7 @@ async def _head(connection: Connection, first: bytes) -> tuple[int, int]:
 
 
 async def _obey(connection: Connection, command: bytes) -> None:
-    """Answer a ping. It holds the client's time limit in two bytes and a text of at most 16, which is sent back."""
+    """Answer a ping, which holds the client's time limit (2 bytes) and a text (at most 16 bytes) that is sent back."""
     if command.startswith(b"\x04PING"):
         await connection.send(_frame(_COMMAND, b"\x04PONG" + command[7:23]))
 

@@ -1,6 +1,6 @@
 """The answer to each message of PANGU's protocol.
 
-`answer` is called in the thread that renders. Errors are answers too.
+`answer` is called in the thread that renders. Errors are also returned as answers.
 """
 
 from collections.abc import Callable
@@ -189,4 +189,4 @@ _ANSWERS: dict[int, Callable] = {
     296: _projection,
     299: _motion,
 }
-"""What is done for each message that has an effect, by its number."""
+"""Function for each message that has an effect, by message number."""

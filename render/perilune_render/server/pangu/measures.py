@@ -1,6 +1,6 @@
 """Measurements of PANGU's protocol: heights, points, ranges.
 
-A ray that begins under the surface, and one that hits the back of a facet, hits nothing.
+A ray that begins below the surface or meets the back of a facet counts as a miss.
 """
 
 import numpy as np
@@ -20,16 +20,16 @@ _MOST_HEIGHTS = 1_000_000
 def seen(
     simulated: SimulatedScene, origins_m: Array, directions: Array, *, boulders: bool = True
 ) -> tuple[Array, Array]:
-    """Distances (N,) and cosines of incidence (N,) of rays from places (1 or N, 3) along directions (N, 3).
+    """Distances (N,) and cosines of incidence (N,) of rays from positions (1 or N, 3) along directions (N, 3).
 
-    Distances are in lengths of the directions; infinite, with cosine 0, where a ray hits nothing. Raises ValueError
-    for a direction of length 0.
+    Distances are in lengths of the directions; a miss has infinite distance and cosine 0. Raises ValueError for a
+    direction of length 0.
     """
     length = np.linalg.norm(directions, axis=1)
     if (length == 0).any():
         raise ValueError("a direction of length 0")
     surface_m = simulated.heights_m(origins_m[:, 0], origins_m[:, 1], boulders=boulders)
-    under = origins_m[:, 2] < surface_m  # beside the ground the surface is NaN: not under it
+    under = origins_m[:, 2] < surface_m  # off the ground the surface is NaN, so not below it
     origins = np.broadcast_to(origins_m, directions.shape)
     distance, normal = simulated.hits(origins, directions, boulders=boulders)
     cosine = -np.einsum("ij,ij->i", normal, directions) / length
@@ -38,7 +38,7 @@ def seen(
 
 
 def elevations(session: Session, places_m: Array) -> Array:
-    """Heights (N,) of places (N, 3) above the surface below them; infinite without a surface below."""
+    """Heights (N,) of positions (N, 3) above the surface below them; infinite without a surface below."""
     distance, _ = seen(session.simulated, places_m, np.tile([0.0, 0.0, -1.0], (len(places_m), 1)))
     return distance
 
@@ -51,7 +51,7 @@ def points(session: Session, directions: Array) -> Array:
 
 
 def looked_up(session: Session, places: Array) -> Array:
-    """Points (N, 3) in places (N, 2) of the image: (0, 0) is its bottom left corner, (1, 1) the top right one."""
+    """Points (N, 3) seen at image positions (N, 2): (0, 0) is the bottom left corner, (1, 1) the top right corner."""
     view = session.view()
     pixels = np.stack([places[:, 0] * session.width_px, (1 - places[:, 1]) * session.height_px], axis=1)
     hits = points(session, view.camera.rays(pixels) @ view.rotation_camera_from_site)
@@ -68,12 +68,12 @@ def pulse(session: Session, values: list, items: object) -> bytes:
 
 
 def surface(session: Session, boulders: bool, places_m: Array) -> Array:
-    """Heights (N,) of the surface in places (N, 2); NaN off the ground."""
+    """Heights (N,) of the surface at positions (N, 2); NaN off the ground."""
     return session.simulated.heights_m(places_m[:, 0], places_m[:, 1], boulders=boulders)
 
 
 def _grid(nx: int, ny: int, dx: float, dy: float) -> tuple[Array, Array]:
-    """Places (ny, nx) on a grid about 0. Raises ValueError if there are none or too many."""
+    """Positions (ny, nx) on a grid around 0. Raises ValueError if the grid is empty or too large."""
     if not 1 <= nx * ny <= _MOST_HEIGHTS:
         raise ValueError(f"{nx} x {ny} heights, expected 1 to {_MOST_HEIGHTS}")
     x, y = np.meshgrid((np.arange(nx) - (nx - 1) / 2) * dx, (np.arange(ny) - (ny - 1) / 2) * dy)

@@ -1,7 +1,7 @@
-"""The messages of PANGU's wire protocol 1.20: number, name, layout of the payload, and what this server does with it.
+"""The messages of PANGU's wire protocol 1.20: number, name, layout of the payload, and this server's response.
 
-A layout has a letter for each field: u unsigned integer, b bool, f float, d double; a number before it repeats it. An
-array has the fields of one item; its count is the last u of the fields before it. Source: the facts that are listed in
+A layout has a letter for each field: u unsigned integer, b bool, f float, d double; a number before a letter repeats
+it. An array has the fields of one item; the item count is the last u of the fixed fields. Source: the facts listed in
 docs/reference/pangu.md.
 """
 
@@ -11,9 +11,9 @@ from typing import Literal
 VERSION = 0x0114
 """Version 1.20 as on the wire: major x 256 + minor."""
 PORT = 10363
-"""Port that PANGU's clients use."""
+"""Port that clients of PANGU use."""
 Effect = Literal["answered", "read", "refused"]
-"""answered: with an effect or a value; read: acknowledged without effect; refused: with an error."""
+"""answered: has an effect or returns a value; read: acknowledged without effect; refused: returns an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class Message:
     item: str = ""
     """Layout of one item of the array that follows; empty if there is none."""
     effect: Effect = "answered"
-    """What the server does."""
+    """How the server responds."""
     note: str = ""
-    """What it does here, for the documentation."""
+    """Effect of the message on this server, for the documentation."""
 
 
 OKAY, ERROR, IMAGE, FLOAT, FLOAT_ARRAY, POINT, POINT_ARRAY = range(7)
@@ -130,7 +130,7 @@ _ALL = (
 MESSAGES = {message.number: message for message in _ALL}
 """All messages of a client, by number."""
 COUNTED_FIRST = (266, 272, 295, 298)
-"""Messages whose count is not the last of their integers: reflectors, joints and scans."""
+"""Numbers of messages whose item count is not the last of their integers: reflectors, joints and scans."""
 
 
 def count_of(message: Message, values: list) -> int:

@@ -1,4 +1,4 @@
-"""Serve PANGU's protocol: read each message of a client whole, then answer it."""
+"""Serve PANGU's protocol: read each message of a client completely, then answer it."""
 
 import asyncio
 import socket
@@ -27,7 +27,7 @@ _MAJOR, _LARGEST_MINOR = divmod(m.VERSION, 256)
 
 
 async def serve_pangu(connection: Connection, new_session: Callable[[], Session], quit_server: Callable) -> None:
-    """One session, until the client says Goodbye or leaves."""
+    """Serve one session until the client sends Goodbye or disconnects."""
     _set_no_delay(connection)
     major, minor = divmod(int.from_bytes(await connection.hello(4), "big"), 256)
     if connection.is_extra:
@@ -43,7 +43,7 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
         number = int.from_bytes(await connection.first(4), "big")
         message = m.MESSAGES.get(number)
         if message is None:
-            # A message has no length, so the next one cannot be found.
+            # Messages do not state their length, so the next message cannot be found.
             await connection.send(error(FAULTY, f"message {number} is not one of protocol 1.20; the session ends"))
             return
         values = read_fields(message.fields, await connection.rest(size_of(message.fields)))
@@ -70,7 +70,7 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
 
 
 async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
-    """Whether the other end of a new connection greets as a server of this protocol."""
+    """Whether the other end of a new connection sends the greeting of a server of this protocol."""
     writer.write(unsigned(m.VERSION))
     greeting = await reader.readexactly(4)
     writer.write(unsigned(m.GOODBYE))
@@ -78,7 +78,7 @@ async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 
 
 def items_of(message: m.Message, data: bytes) -> np.ndarray | bytes:
-    """The array of a message: numbers (N, k), or bytes if its items are bytes or it is not used."""
+    """The array of a message: numbers (N, k), or bytes if the items are bytes or the array is not used."""
     kinds = set(expanded(message.item))
     if kinds == {"f"}:
         return floats_from(data).reshape(-1, len(expanded(message.item)))

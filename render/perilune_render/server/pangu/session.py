@@ -1,4 +1,4 @@
-"""State of one client of PANGU's protocol: its camera and Sun, and the images that it gets."""
+"""State of one client of PANGU's protocol: camera, Sun and images."""
 
 from dataclasses import dataclass, field
 
@@ -11,20 +11,20 @@ from perilune_render.server.simulation import SimulatedScene, View
 from perilune_shared.geometry.frames import Array
 
 CAMERAS = (0, 1)
-"""Numbers of the one camera of a session."""
+"""Numbers by which the single camera of a session can be addressed."""
 _START_M = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Conventions:
-    """What is not known of PANGU, with our defaults."""
+    """Conventions of PANGU that are not documented, with our defaults."""
 
     sun_zero: SunZero = "clockwise-from-y"
     """Direction of the Sun's azimuth 0."""
     roll_sense: RollSense = "left"
     """Side to which positive roll leans the top of the camera."""
     may_quit: bool = False
-    """Whether a client may end the server."""
+    """Whether a client may stop the server."""
 
 
 @dataclass
@@ -42,11 +42,11 @@ class Session:
     sun: Array
     """Unit vector towards the Sun (3,)."""
     seed: int
-    """Random seed of the noise of this client's images."""
+    """Random seed of the noise in this client's images."""
     conventions: Conventions = Conventions()
     """Options."""
     aspect: float = 1.0
-    """Height of a pixel over its width."""
+    """Height of a pixel divided by its width."""
     position_m: Array = field(default_factory=lambda: np.array([0.0, 0.0, _START_M]))
     """Position of the camera, O_L, metres (3,); at first above the site."""
     rotation_camera_from_site: Array = field(default_factory=lambda: rotation_from_angles(0.0, -np.pi / 2, 0.0))
@@ -54,7 +54,7 @@ class Session:
     velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
     """Velocity of the camera, O_L, metres per second (3,); blurs images."""
     n_images: int = 0
-    """Number of images so far: the index of the next one's noise."""
+    """Number of images so far, which is the noise index of the next image."""
     asked_us: float = 0.0
     """Time at which the current message arrived, microseconds since 1970."""
     time_tag_us: float | None = None
@@ -75,7 +75,7 @@ class Session:
 
 
 def check_camera(number: int) -> None:
-    """Raise ValueError if there is no camera of this number."""
+    """Raise ValueError if no camera has this number."""
     if number not in CAMERAS:
         raise ValueError(f"camera {number}, expected 0 or 1")
 

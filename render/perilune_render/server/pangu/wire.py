@@ -1,8 +1,8 @@
 """Bytes of PANGU's protocol 1.20: numbers, texts, errors, and numbers that may be invalid.
 
-The formats are neither those of IEEE 754 nor those of C. Integers have 32 bits, most significant byte first. A float is
-the word of IEEE 754 rotated left by 9 bits: the fraction is on top, then the sign, then the exponent. A double is
-rotated by 12 bits and sent with its low half first.
+The formats differ from IEEE 754 and from C. Integers have 32 bits, most significant byte first. A float is the IEEE 754
+word rotated left by 9 bits, so that the fraction is on top, followed by sign and exponent. A double is rotated by 12
+bits and sent with its low half first.
 """
 
 import struct
@@ -18,7 +18,7 @@ SIZES = {"u": 4, "i": 4, "b": 1, "f": 4, "d": 8}
 
 
 def float_bytes(values: Sequence[float] | np.ndarray) -> bytes:
-    """Floats (N,) as on the wire. Values beyond the range of a float become its largest; NaN is refused."""
+    """Encode floats (N,). Values beyond the range of a float are clipped to its largest value; NaN is rejected."""
     array = np.asarray(values, np.float64)
     if np.isnan(array).any():
         raise ValueError("NaN cannot be sent")
@@ -28,7 +28,7 @@ def float_bytes(values: Sequence[float] | np.ndarray) -> bytes:
 
 
 def double_bytes(values: Sequence[float] | np.ndarray) -> bytes:
-    """Doubles (N,) as on the wire. Raises ValueError for values that are not finite."""
+    """Encode doubles (N,). Raises ValueError for values that are not finite."""
     array = np.asarray(values, np.float64)
     if not np.isfinite(array).all():
         raise ValueError("values that are not finite cannot be sent")
@@ -39,33 +39,33 @@ def double_bytes(values: Sequence[float] | np.ndarray) -> bytes:
 
 
 def floats_from(data: bytes) -> np.ndarray:
-    """Floats (N,) float64 from the wire; they may be infinite or NaN."""
+    """Decode floats (N,) to float64; they may be infinite or NaN."""
     word = np.frombuffer(data, ">u4").astype(np.uint32)
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return ((word >> 9) | (word << 23)).view(np.float32).astype(np.float64)
 
 
 def doubles_from(data: bytes) -> np.ndarray:
-    """Doubles (N,) from the wire; they may be infinite or NaN."""
+    """Decode doubles (N,); they may be infinite or NaN."""
     halves = np.frombuffer(data, ">u4").astype(np.uint64).reshape(-1, 2)
     word = (halves[:, 1] << np.uint64(32)) | halves[:, 0]
     return ((word >> np.uint64(12)) | (word << np.uint64(52))).view(np.float64)
 
 
 def unsigned(*values: int) -> bytes:
-    """Unsigned integers as on the wire."""
+    """Encode unsigned integers."""
     return struct.pack(f">{len(values)}I", *values)
 
 
 def text_bytes(text: str) -> bytes:
-    """A text as on the wire: its length, the bytes, a zero, and a second one if the length would be odd."""
+    """Encode a text: length, bytes, a zero, and a second zero if the total would be odd."""
     data = text.encode("ascii", "replace") + b"\0"
     data += b"\0" * (len(data) % 2)
     return struct.pack(">H", len(data)) + data
 
 
 def read_fields(layout: str, data: bytes) -> list[float | int | bool]:
-    """Values of the types of a layout, such as "u3f": a number before a type repeats it."""
+    """Decode the values of a layout such as "u3f", in which a number before a type repeats it."""
     values: list[float | int | bool] = []
     at = 0
     for kind in expanded(layout):
@@ -82,7 +82,7 @@ def read_fields(layout: str, data: bytes) -> list[float | int | bool]:
 
 
 def expanded(layout: str) -> str:
-    """A layout with each type written out, "u3f" as "ufff"."""
+    """A layout with each type written out: "u3f" becomes "ufff"."""
     letters, digits = "", ""
     for letter in layout:
         if letter.isdigit():
@@ -98,7 +98,7 @@ def size_of(layout: str) -> int:
 
 
 REFUSED, FAULTY = 1, 2
-"""Codes of errors: a request that this server does not serve, and one with impossible values."""
+"""Error codes: a request that this server does not support, and a request with impossible values."""
 
 
 def error(code: int, text: str) -> bytes:
@@ -121,11 +121,11 @@ def valid_points(points: Array) -> bytes:
 
 
 def doubles(values: Array, *, valid: bool) -> bytes:
-    """Doubles (N,), each with a bool that says whether it is valid: `valid` for all."""
+    """Doubles (N,), each followed by the bool `valid`."""
     words = double_bytes(values)
     return b"".join(words[8 * k : 8 * k + 8] + (b"\1" if valid else b"\0") for k in range(len(values)))
 
 
 def float_array(values: Array) -> bytes:
-    """Floats (N,) as a message; those that are not finite are invalid."""
+    """Floats (N,) as a message; values that are not finite are marked invalid."""
     return unsigned(m.FLOAT_ARRAY, len(values)) + valid_floats(values)

@@ -9,14 +9,14 @@ from perilune_render.terrain.craters.profile import REACH
 from perilune_shared.geometry.frames import Array
 
 _PLANE_REACH = 1.3
-"""Radius of the ground that the plane is fitted to, fresh crater radii."""
+"""Radius of the ground to which the plane is fitted, fresh crater radii."""
 
 
 class Window(NamedTuple):
     """The vertices around a crater."""
 
     lines: Array
-    """Lines of vertices, as `perilune_render.terrain.grid.lines_in` writes them (at least `n_lines`, 7)."""
+    """Lines of vertices in the format of `perilune_render.terrain.grid.lines_in` (at least `n_lines`, 7)."""
     n_lines: int
     """Number of lines that are used."""
 
@@ -38,7 +38,7 @@ class _Plane(NamedTuple):
 
 @njit(inline="always")
 def _fit_plane(height, x, y, radius, window):
-    """Least-squares plane of the ground around (x, y); returns whether it has enough vertices, and the plane."""
+    """Fit a least-squares plane to the ground around (x, y); return whether it has enough vertices, and the plane."""
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
     square_r = radius**2
@@ -69,7 +69,8 @@ def _fit_plane(height, x, y, radius, window):
     cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
     determinant = cxx * cyy - cxy * cxy
     slope_x = slope_y = 0.0
-    # A few nearly collinear vertices do not determine the slope across them: the plane would become a spike.
+    # A few nearly collinear vertices do not determine the slope across their line, and the plane could become extremely
+    # steep.
     if s0 >= 6 and determinant > 0.05 * cxx * cyy:
         slope_x = (cxh * cyy - cyh * cxy) / determinant
         slope_y = (cyh * cxx - cxh * cxy) / determinant
@@ -90,8 +91,8 @@ def _sag(plane, removed):
 def _chord(lines, line, x, y, reach):
     """The part of a line within `reach` of (x, y).
 
-    Returns the line's start relative to (x, y), its steps in x and y, the index of its first vertex, and the range of
-    positions on the line (start, stop).
+    Returns the line's start relative to (x, y), the line's steps in x and y, the index of its first vertex, and the
+    range of positions on the line (start, stop).
     """
     dx, dy = lines[line, 0] - x, lines[line, 1] - y
     step_x, step_y = lines[line, 2], lines[line, 3]

@@ -1,13 +1,13 @@
 """The crater population of a scene: places, sizes, ages and wear, as plain data without heights.
 
-A crater's age is drawn uniformly from 0 to the time in which production reaches the equilibrium density of its size,
-so that fresh, worn and nearly erased craters occur together, as in real images. If production has not reached
-equilibrium, the age is drawn from 0 to the age of the surface (our simplification: production fell fast before 3 Gyr
-ago). Equilibrium densities are counts of craters that are still visible, so no crater in equilibrium is drawn with more
-wear than `_LARGEST_VISIBLE_WEAR`.
+A crater's age is drawn uniformly between 0 and the time in which production reaches the equilibrium density of its
+size, so that fresh, worn and nearly erased craters occur together, as in real images. If production has not reached
+equilibrium, the age is drawn between 0 and the age of the surface (our simplification: before 3 Gyr ago, production
+fell rapidly). Equilibrium densities are counts of craters that are still visible, so no crater in equilibrium is drawn
+with more wear than `_LARGEST_VISIBLE_WEAR`.
 
-Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so an order by wear could place a large
-young crater before a small old one that it has removed.
+Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so in order of wear a large young crater
+could come before a small old one that it has removed.
 """
 
 import dataclasses
@@ -34,18 +34,18 @@ from perilune_shared.geometry.frames import Array
 ORIGINS = ("primary", "secondary", "elevation model")
 """Values of `Craters.origin`: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
 MOST_CRATERS = 5_000_000
-"""Largest mean number of craters in a scene; each needs about 1 kB while it is stamped and measured."""
+"""Largest mean number of craters in a scene; each needs about 1 kB of memory during stamping and measurement."""
 _LARGEST_VISIBLE_WEAR = 0.11
 """Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
 _LARGEST_SECONDARY_M = 30.0
-"""Diameter below which craters are moved into clusters, metres."""
+"""Diameter below which craters can be moved into clusters, metres."""
 _PER_CLUSTER = 40
 """Mean number of craters in a cluster."""
 
 
 @dataclass(frozen=True, slots=True)
 class Craters:
-    """N craters, oldest first: the order in which they are stamped on the ground."""
+    """N craters, oldest first, in the order in which they are stamped on the ground."""
 
     x_m: Array
     """x of the centres, O_L, metres (N,)."""
@@ -70,11 +70,12 @@ class Craters:
     origin: np.ndarray
     """Index into ORIGINS (N,)."""
     listed_diameter_m: Array
-    """Diameters in the catalogue where rims were measured in its elevation model, metres (N,); otherwise NaN."""
+    """Diameters in the catalogue, for craters whose rims were measured in its elevation model, metres (N,); otherwise
+    NaN."""
     rim_rms_share: Array
-    """R.m.s. distance of such a rim from its ellipse, divided by its radius (N,); NaN where it was not measured."""
+    """R.m.s. distance of a measured rim from the fitted ellipse, divided by the radius (N,); NaN if not measured."""
     rim_axis_ratio: Array
-    """Minor axis of this ellipse divided by the major axis (N,); NaN where it was not measured."""
+    """Minor axis of this ellipse divided by the major axis (N,); NaN if not measured."""
 
     def __len__(self) -> int:
         return len(self.x_m)
@@ -98,9 +99,9 @@ class Craters:
         age_myr: Array,
         wear_m2: Array,
     ) -> "Craters":
-        """Circular primary craters with bowl-shaped floors and rims of Fassett & Thomson, in the given order.
+        """Circular primary craters, in the given order, with bowl-shaped floors and the rims of Fassett & Thomson.
 
-        The arrays (N,) are the fields of these names.
+        The arrays (N,) are the fields of the same names.
         """
         n = len(x_m)
         rim = fresh_rim_height_m(diameter_m, fresh_depth_m)
@@ -116,7 +117,7 @@ class Craters:
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:
     """Topographic diffusivity at the scale of a crater, m^2/Myr.
 
-    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698). It depends on size as D^0.9.
+    It is 5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698) and grows with size as D^0.9.
     """
     return 5.5 * (np.asarray(diameter_m) / 1000) ** 0.9
 
@@ -150,7 +151,7 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     single = _Single(x, y, diameter, age, oldest, reach)
     x, y, age, clustered = _clustered(single, config.secondary_share, rng)
     flat_floor = rng.random(n) < config.flat_floor_share
-    # Secondaries (slow impacts) and craters with floors of rock are shallower; the factor is our choice.
+    # Secondaries (slow impacts) and craters with rock floors are shallower; the factor is our choice.
     depth = np.where(clustered | flat_floor, 0.75 * depth, depth)
     craters = Craters(
         x,
@@ -176,13 +177,13 @@ def _sizes(config: CratersConfig, grid: Grid, max_diameter_m: float | None = Non
 
 
 def _bins(config: CratersConfig, grid: Grid, smallest: float, largest: float) -> tuple[Array, Array]:
-    """Edges of the bins (B + 1,) and half width (B,) of the ground that is fine enough for each, metres."""
+    """The edges of the size bins (B + 1,) and the half-width (B,) of the ground fine enough for each bin, metres."""
     edges = log_bins(smallest, max(largest, 1.001 * smallest))
     return edges, np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
 
 
 def check_craters(config: CratersConfig, grid: Grid) -> None:
-    """Raise UserError if a scene has more craters than memory, before any is drawn."""
+    """Raise UserError if the craters of a scene would not fit in memory, before any is drawn."""
     equilibrium = EQUILIBRIA[config.equilibrium](share=config.equilibrium_share.high)
     law = Minimum(NeukumProduction(age_gyr=config.surface_age_gyr), equilibrium)
     edges, half_m = _bins(config, grid, *_sizes(config, grid))
@@ -207,15 +208,15 @@ class _Single:
     oldest_myr: Array
     """Largest age at which a crater of this size is visible, Myr (N,)."""
     reach_m: Array
-    """Half-width of the ground that is fine enough for each crater, metres (N,)."""
+    """Half-width of the ground with a vertex spacing fine enough for each crater, metres (N,)."""
 
 
 def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple[Array, Array, Array, np.ndarray]:
-    """Move a share of the small craters into elongated clusters, as secondaries form them, each of a single age.
+    """Move a share of the small craters into elongated clusters, as secondaries form, each of a single age.
 
-    Returns x, y, age and whether each crater was moved (N,). The size-frequency law does not change. We chose sizes and
-    shapes of the clusters by eye, by comparison with NAC images. A crater that would leave the part of the grid that is
-    fine enough for it is not moved.
+    Returns x, y, age and whether each crater was moved (N,). The size-frequency law does not change. We chose the sizes
+    and shapes of the clusters by eye, in comparison with NAC images. A crater is not moved if it would leave the part
+    of the grid that is fine enough for it.
     """
     x, y, age, diameter = single.x_m, single.y_m, single.age_myr, single.diameter_m
     chosen = np.flatnonzero((rng.random(len(x)) < share) & (diameter < _LARGEST_SECONDARY_M))
@@ -223,7 +224,7 @@ def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple
     if not len(chosen):
         return x, y, age, clustered
     n_clusters = max(len(chosen) // _PER_CLUSTER, 1)
-    # A cluster is made of craters of similar (randomised) size, since its extent is proportional to their size.
+    # Each cluster consists of craters of similar (randomised) size, since its extent is proportional to their size.
     chosen = chosen[np.argsort(diameter[chosen] * rng.uniform(0.5, 2, len(chosen)), kind="stable")]
     cluster = np.minimum(np.arange(len(chosen)) * n_clusters // len(chosen), n_clusters - 1)
     first = np.searchsorted(cluster, np.arange(n_clusters))
@@ -237,7 +238,7 @@ def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple
     moved = chosen[inside]
     x, y, age = x.copy(), y.copy(), age.copy()
     x[moved], y[moved] = new_x[inside], new_y[inside]
-    # All craters of a cluster have one age, at which each of them is still visible.
+    # All craters of a cluster have one age, at which all of them are still visible.
     youngest = np.minimum.reduceat(single.oldest_myr[chosen], first) * rng.random(n_clusters)
     age[moved] = youngest[cluster][inside]
     clustered[moved] = True
@@ -245,5 +246,5 @@ def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple
 
 
 def _in_bin(law: SizeFrequency, diameter_m: Array) -> Array:
-    """Number per square metre in a bin of a tenth of a decade above a diameter."""
+    """Number of craters per square metre in a bin that extends a tenth of a decade upwards from a diameter."""
     return law.csfd(diameter_m) - law.csfd(diameter_m * 10**0.1)

@@ -1,24 +1,24 @@
 """Crater profiles, fresh and worn, as tables over distance and wear.
 
-With x = r/R a fresh profile is h = h_rim rim(x) + d bowl(x). `rim` holds rim and ejecta, of height 1 at the crest;
-`bowl` is a bowl of depth 1 below the crest. Both have continuous slopes everywhere, since a kink at the crest or at the
-end of the ejecta blanket would render as a ring.
+With x = r/R, a fresh profile is h = h_rim rim(x) + d bowl(x). `rim` describes rim and ejecta, with height 1 at the
+crest; `bowl` is a bowl of depth 1 below the crest. Both have continuous slopes everywhere, since a kink at the crest or
+at the end of the ejecta blanket would render as a ring.
 
 - `fassett_thomson`: Fassett & Thomson 2014, eq. 4 (doi 10.1002/2014JE004698). Deviations: the outer polynomial is
-  scaled by 13 % to meet the crest (as printed it leaves a step of 0.004 D). The crest and the end of the
+  scaled by 13 % to meet the crest (as printed, it leaves a step of 0.004 D). The crest and the end of the
   blanket are rounded by cubics; in the source the crest is flat, and the blanket ends at x = 1.5 with a slope. The bowl
-  is scaled to the given depth, and a soft minimum rounds its floor, which is cut flat in the source. With `flat` the
-  floor is flat, with a soft edge.
+  is scaled to the given depth, and a soft minimum rounds its floor, which is cut flat in the source. With `flat`, the
+  floor is flat and has a soft edge.
 - `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as in the simulator PANGU (Martin, Parkes &
   Dunstan 2014, doi 10.1109/TAES.2014.120282). Deviations: its printed constants beta and h3 are not used, since they
   give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
 
-Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid. With x = r/R
-it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so one table for
-each part serves all craters. Another table holds the share of the older ground that the crater has removed. It is
-diffused too, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its flank, so wear
-moves the crest outwards. The table `crest` has the crest's radius, so that stamping can put the current crest on the
-label's circle.
+Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid. In x = r/R
+the solution depends only on K/R^2, where K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so
+one table for each part serves all craters. Another table gives the share of the older ground that the crater has
+removed. This share diffuses too, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its
+flank, so wear moves the crest outwards. The table `crest` gives the radius of the crest, so that stamping can place the
+current crest on the circle of the label.
 """
 
 import functools
@@ -39,9 +39,9 @@ _FARTHEST_CREST = 1.5
 _DOMAIN, _N_RADIAL = 6.0, 600
 """Radius of the grid on which diffusion is solved, crater radii, and its number of cells."""
 _CREST = 0.036822
-"""Height of the inner polynomial of Fassett & Thomson at x = 0.98, where the crest begins, over the diameter."""
+"""Height of Fassett & Thomson's inner polynomial at x = 0.98, where the crest begins, divided by the diameter."""
 LEAST_WEAR, MOST_WEAR, N_WEAR = 2e-4, 0.6, 56
-"""Smallest and largest wear K/R^2 in the tables, and their number of rows."""
+"""Smallest and largest wear K/R^2 in the tables, and the number of rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +57,11 @@ class ProfileTables:
     removed: Array
     """Share of the older ground that is removed (N_WEAR, n_x)."""
     crest: Array
-    """Radius of the crest relative to the fresh one, for each DEPTH_OVER_RIM (N_WEAR, len(DEPTH_OVER_RIM))."""
+    """Radius of the worn crest divided by the fresh radius, for each DEPTH_OVER_RIM (N_WEAR, len(DEPTH_OVER_RIM))."""
 
 
 def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
-    """Fresh rim and ejecta at x = r/R, relative to the crest's height; 1 inside the crest."""
+    """Height of the fresh rim and ejecta at x = r/R, relative to the crest; 1 inside the crest."""
     x = np.asarray(x, np.float64)
     if profile == "pangu":
         flank = _cubic(x, _End(1.0, 1.0, 0.0), _End(1.5, 1.5**-3, -3 * 1.5**-4))
@@ -74,7 +74,7 @@ def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
 
 
 def fresh_bowl(x: Array, profile: str = "fassett_thomson", *, flat: bool = False) -> Array:
-    """Fresh bowl at x = r/R, relative to the depth: -1 at the centre, 0 from the crest outwards."""
+    """Height of the fresh bowl at x = r/R, relative to the depth: -1 at the centre, 0 from the crest outwards."""
     x = np.asarray(x, np.float64)
     deepest = _depth_below_crest(np.zeros(1), profile, flat)
     inside = -_depth_below_crest(x, profile, flat) / deepest
@@ -101,9 +101,9 @@ class _End(NamedTuple):
     x: float
     """Distance from the crater's centre, radii."""
     value: float
-    """Value there."""
+    """Value at x."""
     slope: float
-    """Slope there."""
+    """Slope at x."""
 
 
 def _cubic(x: Array, low: _End, high: _End) -> Array:
@@ -119,7 +119,7 @@ def _cubic(x: Array, low: _End, high: _End) -> Array:
 
 
 def _depth_below_crest(x: Array, profile: str, flat: bool) -> Array:
-    """Depth below the crest, before scaling to 1 at the centre."""
+    """Depth below the crest, before it is scaled to 1 at the centre."""
     inner = np.clip(x, 0, 0.98)
     if profile == "pangu":
         shape = 1 - inner**2
@@ -137,7 +137,7 @@ def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
 
     `stopar`: Stopar et al. 2017. Their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m; extrapolated to 0.11
     and 0.10 below) are interpolated linearly in log D between the middles of their ranges.
-    `pike`: Pike 1977, 0.196 D^1.01 km with D in km; derived for larger craters.
+    `pike`: Pike 1977, 0.196 D^1.01 km with D in km; derived from larger craters.
     """
     d = np.asarray(diameter_m, np.float64)
     if law == "pike":
@@ -148,8 +148,8 @@ def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
 def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fassett_thomson") -> Array:
     """Height of the crest above the plain around a newly formed crater, metres.
 
-    `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this is 0.0368 D, the
-    source's value for craters of 1 km. At all sizes, a rim of 0.0368 D would be too high for small, shallow craters.
+    `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this gives 0.0368 D,
+    as in the source. A rim of 0.0368 D at all sizes would be too high for small, shallow craters.
     `pangu`: the smaller of the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and Pike's rim
     height, 0.036 D^1.014 km with D in km.
     """
@@ -210,9 +210,9 @@ def _crests(x: Array, rim: Array, bowl: Array) -> Array:
 
 
 def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_thomson") -> Array:
-    """Radius (N,) of the crest of craters over their fresh radius, from wear K/R^2 and fresh depth over rim height.
+    """Crest radius of craters divided by their fresh radius (N,), from wear K/R^2 and the ratio of depth to rim height.
 
-    At most 1.5: with more wear hardly any crest is left.
+    Limited to 1.5: at larger values hardly any crest is left.
     """
     tables = profile_tables(profile)
     row = wear_row(wear)
@@ -221,6 +221,6 @@ def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_tho
 
 
 def wear_row(wear: Array) -> Array:
-    """Fractional row in the tables of wears K/R^2."""
+    """Fractional row of wear K/R^2 in the tables."""
     within = np.clip(wear, LEAST_WEAR, MOST_WEAR)
     return np.log(within / LEAST_WEAR) / np.log(MOST_WEAR / LEAST_WEAR) * (N_WEAR - 1)

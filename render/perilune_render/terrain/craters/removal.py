@@ -10,13 +10,14 @@ from perilune_shared.geometry.frames import Array
 
 REACH_RADII = 4.0
 """Distance from a removed crater beyond which no height changes, crater radii. Profiles end at 3 radii. Younger craters
-lie on the changed ground and pass on less than a millimetre of the change, which is cut off here."""
+on the changed ground carry less than a millimetre of the change farther; this is neglected."""
 
 
 def indices_of(crater_ids: Sequence[int], n_real: int, n_craters: int, seed: int) -> np.ndarray:
     """Indices, ascending and unique, of the craters to remove from a scene with `n_craters`.
 
-    The first `n_real` are part of an elevation model. Raises UserError if one of the ids is theirs or unknown.
+    The first `n_real` craters are part of an elevation model. Raises UserError if an id is unknown or belongs to one of
+    these craters.
     """
     for crater_id in crater_ids:
         if not n_real <= crater_id < n_craters:
@@ -26,7 +27,7 @@ def indices_of(crater_ids: Sequence[int], n_real: int, n_craters: int, seed: int
 
 
 def near(x_m: Array | float, y_m: Array | float, removed: Craters) -> np.ndarray:
-    """Whether places (N,) on O_L's plane, metres, are within REACH_RADII of one of the removed craters."""
+    """Whether positions (N,) on O_L's plane, metres, are within REACH_RADII of a removed crater."""
     within = np.zeros(np.shape(x_m), bool)
     for x, y, diameter in zip(removed.x_m, removed.y_m, removed.diameter_m, strict=True):
         within |= np.square(x_m - x) + np.square(y_m - y) <= (REACH_RADII * diameter / 2) ** 2

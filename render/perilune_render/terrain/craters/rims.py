@@ -21,13 +21,14 @@ class Rims:
     normal: Array
     """Unit normal of the plane through the rim, O_L (N, 3)."""
     depth_m: Array
-    """Mean height of the rim, minus mean height of the inner fifth, minus `Stamped.sag_m`; at least 0, metres (N,)."""
+    """Mean height of the rim minus the mean height of the inner fifth, minus `Stamped.sag_m`, at least 0, metres
+    (N,)."""
 
 
 def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:
     """Fit a plane to 16 points of each rim by least squares, and measure the depth below it.
 
-    `sag_m` (N,) is subtracted from the depth: the bowl of a large old crater does not count as depth of a worn small
+    `sag_m` (N,) is subtracted from the depth: the bowl of a large old crater must not count as depth of a small worn
     crater on its floor.
     """
     angle = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
@@ -35,7 +36,7 @@ def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | f
     radius = craters.diameter_m[:, None] / 2
     x, y = craters.x_m[:, None], craters.y_m[:, None]
     rim = value_at(height_m, grid, x + radius * cos, y + radius * sin)
-    # On a full circle the three unknowns of a plane decouple into Fourier sums.
+    # For points evenly spaced on a circle, the plane's three unknowns decouple into Fourier sums.
     level = rim.mean(axis=1)
     slope_x = 2 * (rim * cos).mean(axis=1) / radius[:, 0]
     slope_y = 2 * (rim * sin).mean(axis=1) / radius[:, 0]

@@ -21,22 +21,22 @@ class Stamped:
     """Results of stamping N craters."""
 
     sag_m: Array
-    """Height difference from rim to centre of the older ground that remains under each crater, metres (N,). It is not
-    depth of the crater itself."""
+    """Height difference from rim to centre of the older ground that remains under each crater, metres (N,). The
+    crater's own depth is not part of it."""
     rim_left: Array
     """Share of each crater's rim that younger craters have not removed (N,)."""
 
 
 class _Ground(NamedTuple):
-    """Fields on the vertices, changed in place."""
+    """Fields on the vertices, modified in place."""
 
     height: Array
     """Heights, metres (n_vertices,)."""
     albedo: Array
     """Factor on the reflectance (n_vertices,)."""
     log_left: Array
-    """Logarithm of the share of the initial ground that is left (n_vertices,). Its change since a rim was stamped is
-    the loss of that rim."""
+    """Logarithm of the share of the initial ground that is left (n_vertices,). Its change since a rim was stamped gives
+    how much of the rim is lost."""
     n_half: int
     """`Grid.n_half`."""
     half_widths: Array
@@ -44,7 +44,7 @@ class _Ground(NamedTuple):
 
 
 class _Shapes(NamedTuple):
-    """Craters as the kernels need them, oldest first."""
+    """Crater data for the compiled functions, oldest first."""
 
     x: Array
     """x of the centres, O_L, metres (N,)."""
@@ -61,7 +61,7 @@ class _Shapes(NamedTuple):
     wear_row: Array
     """Fractional rows in the profile tables (N,)."""
     flat_floor: np.ndarray
-    """Whether a floor is flat (N,)."""
+    """Whether the crater has a flat floor (N,)."""
     outline: Array
     """`Craters.outline` (N, 6)."""
     crest: Array
@@ -102,7 +102,7 @@ class _RimSamples(NamedTuple):
     vertex: np.ndarray
     """Nearest vertex, -1 outside the grid (N, _N_RIM)."""
     before: Array
-    """`_Ground.log_left` there when the rim was new (N, _N_RIM)."""
+    """`_Ground.log_left` at this vertex when the rim was new (N, _N_RIM)."""
 
 
 def stamp_craters(
@@ -110,13 +110,12 @@ def stamp_craters(
 ) -> Stamped:
     """Stamp `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
-    A crater first replaces the ground below it by a plane fitted to that ground, and then adds its own profile. The
-    more worn a crater is, the less of the older ground it replaces. `brightness` (N,) is the relative brightening
-    within the rim.
+    A crater first replaces the ground below it by a fitted plane and then adds its profile. The more worn a crater is,
+    the less of the older ground it replaces. `brightness` (N,) is the relative brightening within the rim.
     """
     tables = profile_tables(profile)
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
-    # The label's circle is the current crest; the profile is scaled by the fresh crest's radius.
+    # The label marks the current crest, but the profile is scaled by the radius of the fresh crest.
     grown = crest_radius(wear, craters.fresh_depth_m / craters.rim_height_m, profile)
     shapes = _Shapes(
         craters.x_m,
@@ -240,7 +239,7 @@ def _sample_rim(ground, shapes, k, rims):
 
 @njit()
 def _rims_left(log_left, rims):
-    """`Stamped.rim_left` from the sampled rims; 1 for a rim outside the grid."""
+    """Compute `Stamped.rim_left` from the sampled rims; 1 for a rim outside the grid."""
     rim_left = np.ones(len(rims.vertex))
     for k in range(len(rims.vertex)):
         total = on_grid = 0.0

@@ -1,4 +1,4 @@
-"""Craters of a real elevation model, read from a catalogue; they become labels like generated craters."""
+"""Craters of a real elevation model, read from a catalogue; they become labels, as generated craters do."""
 
 import functools
 from dataclasses import dataclass, replace
@@ -18,25 +18,25 @@ from perilune_shared.storage.tables.catalogues import SurfaceCraters, duplicates
 
 _SETTING = "dataset.terrain.elevation.catalogue_columns"
 _LIKELY_KM = 10.0
-"""Diameter in metres below which all craters of a catalogue are probably in kilometres."""
+"""If all diameters of a catalogue are below this value in metres, they are probably in kilometres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What becomes of the craters of a catalogue."""
+    """How many craters of a catalogue are used, and why the others are not."""
 
     used: int
-    """They become labels."""
+    """Number of craters that become labels."""
     measured: int
-    """Number of these whose rims are measured in the model; the others have the catalogue's rims."""
+    """Number of used craters whose rims are measured in the model; the others keep the catalogue's rims."""
     outside: int
-    """Their centre or rim is outside the ground."""
+    """Number of craters whose centre or rim is outside the ground."""
     unmeasured: int
-    """Their centre or rim is outside the model or in one of its holes."""
+    """Number of craters whose centre or rim is outside the model or in one of its holes."""
     too_small: int
-    """They are inside, but too small for the model to show."""
+    """Number of craters inside the model that are too small for it to show."""
     duplicate: int
-    """They repeat another crater."""
+    """Number of craters that repeat another crater."""
 
     def __str__(self) -> str:
         """Return the counts as text; counts of unused craters are omitted if they are 0."""
@@ -57,20 +57,20 @@ class RealCraters:
     """The craters of a catalogue that the model shows."""
 
     craters: Craters
-    """Largest first, with origin 'elevation model'."""
+    """The craters, largest first, with origin 'elevation model'."""
     counts: Counts
-    """Numbers of craters that are used and that are not."""
+    """Numbers of used and unused craters."""
 
 
 def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: TerrainConfig) -> RealCraters:
-    """The catalogue's craters that the model shows.
+    """Read the craters of a catalogue that the model shows.
 
-    These are the craters larger than `resolved_m` with centre and rim on the grid and on measured pixels of the model;
-    smaller craters are generated. The crest in the model gives place and diameter where it is found, unless the
-    configuration prefers the catalogue. Age and fresh depth are unknown (NaN), wear is 0.
+    These are the craters larger than `resolved_m` whose centre and rim are on the grid and on measured pixels of the
+    model; smaller craters are generated. Position and diameter come from the crest in the model where it is found,
+    unless the configuration prefers the catalogue. Age and fresh depth are unknown (NaN); wear is 0.
 
     The columns are recognised (`perilune_shared.storage.tables.catalogues`) or stated in the configuration. Raises
-    UserError with the line of an error, and if no crater can be used.
+    UserError, with the line number, for a faulty row, and if no crater can be used.
     """
     listed = _listed(path, config.elevation.catalogue_columns)
     smallest_m = resolved_m(model)
@@ -94,7 +94,7 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
             for measured, given in ((crests.x_m, x), (crests.y_m, y), (crests.diameter_m, listed_m))
         )
         rms, ratio = crests.rms_share, crests.axis_ratio
-    # A rim that lies farther out than the catalogue says may leave the ground or the model.
+    # A measured rim larger than the catalogued one may extend beyond the ground or the model.
     on_grid = _inside(grid, x, y, diameter)
     kept = on_grid.copy()
     kept[on_grid] = _measured(model, x[on_grid], y[on_grid], diameter[on_grid])
@@ -123,12 +123,12 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
 
 
 def remark(path: Path, real: RealCraters) -> str:
-    """Message to the user about a catalogue, shown before its ground is generated."""
+    """A message for the user about a catalogue, shown before its ground is generated."""
     return f"{path.name}: {real.counts}"
 
 
 def _listed(path: Path, columns: CatalogueColumnsConfig) -> SurfaceCraters:
-    """Read a catalogue once for all scenes: a global one takes seconds."""
+    """Read a catalogue once for all scenes, since a global catalogue takes seconds to read."""
     try:
         state = path.stat()
     except (OSError, ValueError):
@@ -150,7 +150,7 @@ def _nothing_used(path: Path, listed: SurfaceCraters, counts: Counts, smallest_m
 
 
 def _inside(grid: Grid, x_m: Array, y_m: Array, diameter_m: Array) -> np.ndarray:
-    """Whether each crater (N,) is on the grid with its rim."""
+    """Whether the whole rim of each crater (N,) is on the grid."""
     return np.maximum(np.abs(x_m), np.abs(y_m)) + diameter_m / 2 < grid.extent_m / 2
 
 

@@ -1,9 +1,9 @@
 """Smooth continuation of the ground beyond the edge of an elevation model.
 
-Each scale of the model's relief continues by point reflection, which keeps height and slope at the edge. It fades
-within about a third of its wavelength, so that the model's features do not repeat. The model's mean slope fades over
-a distance of the model's size. The result is smooth; `perilune_render.terrain.elevation.surroundings` adds relief and
-craters where each scale fades.
+Each scale of the model's relief continues by point reflection, which keeps height and slope at the edge. The reflection
+fades within about a third of the wavelength, so that the model's features do not repeat. The model's mean slope fades
+over a distance equal to the model's size. The result is smooth; `perilune_render.terrain.elevation.surroundings` adds
+relief and craters at each scale where the model's relief fades.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from perilune_shared.geometry.frames import Array
 _COARSEST = 1 / 8
 """Standard deviation of the widest low-pass filter, relative to the model's shorter side."""
 _FADE = 1.5
-"""Distance over which a band fades, in standard deviations of its low-pass filter."""
+"""Distance over which a wavelength band fades, in standard deviations of its low-pass filter."""
 _WAVES = 5.0
 """Main wavelength of a band, in standard deviations of its low-pass filter."""
 _GONE = 2.5
@@ -22,7 +22,7 @@ _GONE = 2.5
 
 
 def margin_m(sides_m: tuple[float, float]) -> float:
-    """Distance, metres, from a model of these sides beyond which only its mean slope remains."""
+    """Distance beyond which only the mean slope of a model with these sides remains, metres."""
     return _GONE * _FADE * _COARSEST * min(sides_m)
 
 
@@ -35,10 +35,10 @@ def fade(distance_m: Array, wavelength_m: float) -> Array:
 
 
 def continued(height_m: Array, beyond_m: Array, margin: int, pixel_m: tuple[float, float]) -> Array:
-    """Heights (rows, columns), extended by `margin` pixels on each side, minus their mean slope (`mean_slope`).
+    """Heights (rows, columns) minus their mean slope (`mean_slope`), extended by `margin` pixels on each side.
 
-    beyond_m (rows + 2 margin, columns + 2 margin) is the distance from known ground, metres; where it is 0 the heights
-    do not fade. pixel_m is the size of a pixel from row to row and from column to column, metres.
+    beyond_m (rows + 2 margin, columns + 2 margin) is the distance from known ground, metres; where it is 0, the heights
+    do not fade. pixel_m is the pixel size between rows and between columns, metres.
     """
     row, column = (np.arange(n, dtype=np.float64) for n in height_m.shape)
     rest = height_m - plane(height_m, row[:, None], column)
@@ -67,7 +67,7 @@ def plane(height_m: Array, row: Array, column: Array) -> Array:
 
 
 def mean_slope(height_m: Array, row: Array, column: Array, beyond_m: Array, side_m: float) -> Array:
-    """The mean height plus the model's mean slope (`plane`), metres; beyond the model the slope's part fades.
+    """The mean height plus the model's mean slope (`plane`), metres; beyond the model, the slope fades.
 
     It fades as 1 / (1 + (d / side)^2), where `side_m` is the model's shorter side.
     """

@@ -1,6 +1,6 @@
 """Measure the rim crests of catalogued craters in an elevation model.
 
-A catalogue's diameter is often the one at formation, or was marked by hand on an image; worn rims lie farther out. The
+A catalogue often gives the diameter at formation, or one marked by hand on an image; worn rims lie farther out. The
 crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane that
 is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
 """
@@ -13,24 +13,24 @@ from perilune_render.terrain.elevation.model import ElevationModel, raster_place
 from perilune_shared.geometry.frames import Array
 
 LEAST_PIXELS = 8.0
-"""Diameter from which a crest is measured, pixels of the model."""
+"""Smallest diameter for which a crest is measured, pixels of the model."""
 _N_AZIMUTHS, _N_RADII = 36, 64
 _NEAR, _FAR = 0.5, 2.0
-"""Reach of the profiles, radii of the crater."""
+"""Inner and outer end of the profiles, radii of the crater."""
 _SEARCH = 0.3
-"""A crest is searched within this share of the radius at which the median profile is highest."""
+"""Half-width of the search for a crest, as a share of the radius at which the median profile is highest."""
 _PLANE_FROM = 1.5
-"""Radius from which the plane is fitted, radii of the crater."""
+"""Inner radius of the ground to which the plane is fitted, radii of the crater."""
 _LEAST_SHARE = 0.7
-"""Least share of the directions with a crest."""
+"""Smallest share of directions in which a crest must be found."""
 _LARGEST_RMS = 0.1
 """Largest r.m.s. distance of the crest from the ellipse, radii."""
 _LEAST_RATIO = 0.7
-"""Least ratio of the ellipse's axes."""
+"""Smallest ratio of the ellipse's axes."""
 _LARGEST_SHIFT = 0.4
-"""Largest distance between the centres of catalogue and crest, radii of the crater."""
+"""Largest distance between the catalogued and the measured centre, radii of the crater."""
 _LEAST_DEPTH = 0.02
-"""Least depth of the centre below the crest, diameters."""
+"""Smallest depth of the centre below the crest, diameters."""
 _OUTLIER = 2.5
 _CHUNK = 256
 
@@ -57,14 +57,14 @@ class Crests:
 
 
 def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> Crests:
-    """Measure the crests of craters at places (N,) of O_L with catalogued diameters (N,)."""
+    """Measure the crests of craters at positions (N,) in O_L with catalogued diameters (N,), metres."""
     measured = np.full((5, len(x_m)), np.nan)
     large = np.flatnonzero(diameter_m >= LEAST_PIXELS * model.pixel_m)
     for start in range(0, len(large), _CHUNK):
         chunk = large[start : start + _CHUNK]
         radius = diameter_m[chunk] / 2
         x, y, scale = x_m[chunk], y_m[chunk], radius
-        # The second pass is centred on the first's ellipse, and sized by it.
+        # The second pass takes centre and size from the ellipse of the first pass.
         for _ in range(2):
             fit = _fit(model, x, y, scale)
             x, y, scale = fit.x_m, fit.y_m, fit.radius_m
@@ -78,7 +78,7 @@ def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Ar
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Ellipses of N craters; where no crest was found, the craters as they were given."""
+    """Ellipses of N craters; where no crest was found, the input craters."""
 
     x_m: Array
     y_m: Array
@@ -117,10 +117,10 @@ def _fit(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array) -> _Fit
 
 
 def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
-    """Radius of the crest in each direction (N, A), shares of the radius, and whether there is one (N, A).
+    """Radius of the crest in each direction (N, A), shares of the crater's radius, and whether one exists (N, A).
 
-    A crest is a maximum of the profile (N, A, R) inside the range about the highest place of the median profile, not at
-    the end of this range.
+    A crest is a maximum of the profile (N, A, R) inside a range around the highest point of the median profile; a
+    maximum at the end of this range is no crest.
     """
     step = share[1] - share[0]
     around = share[np.median(height_m, axis=1).argmax(axis=1)]
@@ -135,7 +135,7 @@ def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
 
 
 def _plane(height_m: Array, unit_x: Array, unit_y: Array, share: Array) -> Array:
-    """Heights (N, A, R) of the planes that are fitted by least squares to the ground around each crater."""
+    """Heights (N, A, R) of the least-squares planes through the ground around each crater."""
     outside = share >= _PLANE_FROM
     basis = np.stack([np.ones_like(unit_x), unit_x, unit_y], axis=-1)
     solver = np.linalg.pinv(basis[:, outside].reshape(-1, 3))
@@ -144,27 +144,27 @@ def _plane(height_m: Array, unit_x: Array, unit_y: Array, share: Array) -> Array
 
 
 def _rim_level(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array, crest: Array, angle: Array) -> Array:
-    """Mean height (N,) of the model along a crest (N, A), in shares of the radius."""
+    """Mean height (N,) of the model along a crest (N, A) given in shares of the radius (N,)."""
     reach = crest * radius_m[:, None]
     return _at(model, x_m[:, None] + reach * np.cos(angle), y_m[:, None] + reach * np.sin(angle)).mean(axis=1)
 
 
 def _heights(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array, unit_x: Array, unit_y: Array) -> Array:
-    """Heights (N, A, R) of the model at places about centres (N,), in radii."""
+    """Heights (N, A, R) of the model at positions around centres (N,), given in radii."""
     scale = radius_m[:, None, None]
     return _at(model, x_m[:, None, None] + scale * unit_x, y_m[:, None, None] + scale * unit_y)
 
 
 def _at(model: ElevationModel, x_m: Array, y_m: Array) -> Array:
-    """Heights of the model at places of O_L of any shape, metres, by cubic convolution."""
+    """Heights of the model at positions in O_L (arrays of any shape), metres, by cubic convolution."""
     column, row = raster_places(model, x_m, y_m)
     return _cubic(model.height_m, row - 0.5, column - 0.5)
 
 
 def _cubic(height_m: Array, row: Array, column: Array) -> Array:
-    """Heights at rows and columns of pixel centres, of any shape.
+    """Heights at fractional rows and columns (arrays of any shape), which are integers at pixel centres.
 
-    Catmull-Rom weights of 4 x 4 pixels: without the filter that a spline would run over the whole model.
+    Uses Catmull-Rom weights of 4 x 4 pixels, which need no prefilter over the whole model as a spline does.
     """
     n_rows, n_columns = height_m.shape
     row, column = np.clip(row, 0, n_rows - 1), np.clip(column, 0, n_columns - 1)
@@ -178,7 +178,7 @@ def _cubic(height_m: Array, row: Array, column: Array) -> Array:
 
 
 def _weights(t: Array) -> list[Array]:
-    """Weights of the four nearest pixels along an axis for a point `t` pixels after the second of them."""
+    """Weights of the four nearest pixels along an axis, for a point `t` pixels beyond the second pixel."""
     return [
         0.5 * t * (-1 + t * (2 - t)),
         1 + t * t * (-2.5 + 1.5 * t),

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 _AT_THE_MIDDLE = ElevationConfig()
 _FIELD = "dataset.terrain.elevation"
 _LARGEST_PIXELS = 100_000_000
-"""Number of pixels of a model with the ground beyond its edge."""
+"""Largest number of pixels of a model, including the ground added beyond its edge."""
 _RESOLVED_PIXELS = 4.0
-"""Diameter from which a model shows a crater, pixels."""
+"""Smallest diameter of a crater that a model shows, pixels."""
 _SWELL_M = 120.0
 """Standard deviation of the low-pass filter for a mirrored model, metres; long waves exceed about 4 times this."""
 _SEAM_M = 100.0
@@ -48,21 +48,22 @@ class ElevationModel:
     known: np.ndarray
     """Whether a pixel has a height in the raster (rows, columns)."""
     raster: RasterMap
-    """Where the columns and rows are on the Moon."""
+    """Mapping between columns and rows and positions on the Moon."""
     latitude_deg: float
     """Latitude of the site, degrees."""
     longitude_deg: float
     """Longitude of the site, degrees."""
     pixel_m: float
-    """Ground size of a pixel at the site, the mean of both directions, metres."""
+    """Ground size of a pixel at the site, mean of both directions, metres."""
     pixel_sides_m: tuple[float, float]
-    """Ground size of a pixel from row to row and from column to column, metres."""
+    """Ground size of a pixel between rows and between columns, metres."""
     step_m: float
-    """Quantisation step of the raster's heights if it makes terraces, metres; otherwise 0."""
+    """Quantisation step of the raster's heights if it is large enough to make terraces, metres; otherwise 0."""
     read_step: int
-    """Pixels of the raster along a side of one of these, more than 1 if the raster is too large for the ground."""
+    """Number of raster pixels along the side of one pixel of the model; above 1 if the raster is too large for the
+    ground."""
     hole_m: Array | None
-    """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
+    """Distance of each pixel (rows, columns) from the nearest known pixel, metres; None without holes."""
     source: str
     """File name (without folder and special characters) and SHA-256."""
 
@@ -70,14 +71,14 @@ class ElevationModel:
 def read_elevation(
     path: Path, config: ElevationConfig = _AT_THE_MIDDLE, ground_m: float | None = None
 ) -> ElevationModel:
-    """Read an elevation model; its site is the one of `config`, or the raster's middle.
+    """Read an elevation model; its site is the site of `config`, or the middle of the raster.
 
-    `ground_m` is the side of the ground around the site for which the model is needed, metres: of a raster of more than
-    LARGEST_PIXELS only this part is read, at a lower resolution if it has as many pixels; None reads a part of a usual
-    size. Where the raster's map is cut within this ground, its columns are rearranged, or it is resampled.
+    `ground_m` is the side of the ground around the site for which the model is needed, metres. If the raster has more
+    than LARGEST_PIXELS, only this part is read, at a lower resolution if the part is that large too; None reads a part
+    of a usual size. If an edge of the raster's map crosses this ground, the columns are rearranged or resampled.
 
-    Raises UserError if the model is missing, unreadable, empty, or has no pixel size or no projection of the Moon,
-    if the site is outside it or in a hole, and if its values cannot be heights (`elevation.height_band`).
+    Raises UserError if the model is missing, unreadable or empty, if it lacks a pixel size or a projection of the Moon,
+    if the site is outside the model or in a hole, and if the values cannot be heights (`elevation.height_band`).
     Holes (nodata, NaN) are filled with the nearest known height. Heights may be elevations or radii: only differences
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
@@ -120,7 +121,7 @@ def read_elevation(
 
 
 def read_site(path: Path, config: ElevationConfig = _AT_THE_MIDDLE) -> Site:
-    """The site of an elevation model, without its heights. Raises UserError as `read_elevation`."""
+    """The site of an elevation model, without its heights. Raises the errors of `read_elevation`."""
     with opened_raster(raster_files(path, field="dem", tiles=config.vrt_files), "dem") as file:
         return site_in(path, map_of(path, file, config), config)
 
@@ -128,7 +129,7 @@ def read_site(path: Path, config: ElevationConfig = _AT_THE_MIDDLE) -> Site:
 def _source_of(files: RasterFiles, used: set[str]) -> str:
     """File name (without folder and special characters) and SHA-256 of a raster.
 
-    Of several files it is the hash of their hashes. A world file counts only if it was used.
+    For several files, the hash is the hash of their hashes. A world file counts only if it was used.
     """
     path = files.paths[0]
     plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
@@ -138,7 +139,7 @@ def _source_of(files: RasterFiles, used: set[str]) -> str:
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Column and row, 0 at the raster's top left corner, of places (...) of O_L's plane, metres."""
+    """Column and row of positions (...) on O_L's plane, metres; both are 0 at the raster's top left corner."""
     lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
     column, row = model.raster.places(np.ravel(lat), np.ravel(lon))
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
@@ -147,7 +148,7 @@ def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array,
 def height_of_site_m(model: ElevationModel) -> float:
     """Height of the site above the sphere of MOON_RADIUS_M in the model, metres.
 
-    Heights of more than half this radius are read as radii.
+    Heights above half this radius are taken to be distances from the Moon's centre.
     """
     column, row = raster_places(model, np.zeros(1), np.zeros(1))
     height = float(ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")[0])
@@ -155,12 +156,12 @@ def height_of_site_m(model: ElevationModel) -> float:
 
 
 def resolved_m(model: ElevationModel) -> float:
-    """Diameter, metres, from which an elevation model shows a crater: four pixels. Smaller craters are generated."""
+    """Smallest diameter of a crater that a model shows, metres: four pixels. Smaller craters are generated."""
     return _RESOLVED_PIXELS * model.pixel_m
 
 
 def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
-    """Distance, metres, of raster places (...) from the model's known ground: 0 on it, above 0 in holes and outside."""
+    """Distance, metres, of raster coordinates (...) from the model's known ground; above 0 in holes and outside."""
     rows, columns = model.height_m.shape
     down = np.maximum(np.maximum(-row, row - rows), 0) * model.pixel_sides_m[0]
     across = np.maximum(np.maximum(-column, column - columns), 0) * model.pixel_sides_m[1]
@@ -203,13 +204,13 @@ def refuse_unseen(model: ElevationModel, grid: Grid, config: ElevationConfig) ->
 
 
 def _real_share(model: ElevationModel, grid: Grid) -> float:
-    """Share of the ground, a square around the site, that is known in the model."""
+    """Share of the square ground around the site where the model has heights."""
     net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 129)
     return float((beyond_m(model, *raster_places(model, *np.meshgrid(net, net))) == 0).mean())
 
 
 def _percent(share: float) -> str:
-    """A share in percent, with as many decimals as it takes to differ from 0 and 100 %."""
+    """A share in percent, with enough decimals to differ from 0 and 100 %."""
     text = f"{share:.0%}"
     if 0 < share < 1 and text in ("0%", "100%"):
         text = f"{min(max(share, 0.0001), 0.9999):.2%}"
@@ -217,7 +218,7 @@ def _percent(share: float) -> str:
 
 
 def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
-    """Messages to the user about a model, one per line, shown before its ground is generated."""
+    """Messages for the user about a model, one per line, shown before its ground is generated."""
     lines = []
     name = model.source.split(" sha256:")[0]
     if model.read_step > 1:
@@ -240,14 +241,14 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
 
     The site is at height 0. Heights are interpolated bicubically. Beyond the model the ground continues smoothly
     (`perilune_render.terrain.elevation.continuation`), and relief and craters are added later; with `outside` "mirror"
-    it is the model's mirror image. Raises UserError if the ground extends beyond the model and `outside` is "refuse".
+    the model is mirrored. Raises UserError if the ground extends beyond the model and `outside` is "refuse".
     """
     rows, columns = model.height_m.shape
-    # Pixel coordinates vary slowly over a site: project a coarse lattice and interpolate.
+    # Pixel coordinates vary slowly over a site, so project only a coarse lattice and interpolate.
     net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
     column, row = raster_places(model, *np.meshgrid(net, net))
     x, y = grid.vertices_xy()
-    from scipy.interpolate import RectBivariateSpline  # here, since it takes 0.2 s and only elevation models need it
+    from scipy.interpolate import RectBivariateSpline  # imported here: it takes 0.2 s, only for elevation models
 
     column, row = (RectBivariateSpline(net, net, values).ev(y, x) for values in (column, row))
     beyond = beyond_m(model, column, row)
@@ -280,7 +281,7 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
 
 
 def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:
-    """Heights extended by `margin` pixels on each side, without a crease at the model's edge.
+    """Heights extended by `margin` pixels on each side, without a crease at the edge of the model.
 
     Long waves continue by point reflection, which keeps the slope across the edge. Short waves are mirrored, so that
     craters remain craters; in a narrow band along the edge they continue by point reflection too.
@@ -299,11 +300,11 @@ def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:
 
 
 def _pixel_sides_m(raster: RasterMap, site: Site) -> tuple[float, float]:
-    """Ground size of a pixel at the site from row to row and from column to column, from great-circle distances.
+    """Ground size of a pixel at the site between rows and between columns, from great-circle distances.
 
-    Approximation: small differences of latitude and longitude; wrong within two pixels of a pole.
+    Approximation for small differences of latitude and longitude; wrong within two pixels of a pole.
     """
-    # Inwards at the last row or column, since latitudes may end there.
+    # At the last row or column, step inwards, since latitudes may end there.
     down, across = (-1 if index + 1 > n else 1 for index, n in zip((site.row, site.column), raster.shape, strict=True))
     lats, lons = raster.selenographic(
         np.array([site.column, site.column + across]), np.array([site.row + down, site.row])

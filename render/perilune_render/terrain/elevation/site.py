@@ -1,4 +1,4 @@
-"""The map of an elevation model, and the landing site in it: its middle, or a chosen place.
+"""The map of an elevation model, and the landing site in it: the middle, or a chosen position.
 
 Raster coordinates are column and row, 0 at the raster's top left corner; the first pixel's centre is at 0.5, 0.5.
 """
@@ -28,7 +28,7 @@ _FIELD = f"{_ELEVATION}.site"
 
 @dataclass(frozen=True, slots=True)
 class RasterMap:
-    """The map of a raster: what its columns and rows are on the Moon."""
+    """The map of a raster: how its columns and rows correspond to positions on the Moon."""
 
     transform: rasterio.Affine
     """Projected coordinates from (column, row)."""
@@ -37,11 +37,12 @@ class RasterMap:
     shape: tuple[int, int]
     """Numbers of rows and columns."""
     circle: float | None = None
-    """Width of 360 degrees of longitude in projected coordinates; None if the map does not repeat (`circle_of`)."""
+    """Width of 360 degrees of longitude in projected coordinates; None if the map does not repeat along its rows
+    (`circle_of`)."""
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Column and row of the raster's middle."""
+        """Column and row of the middle of the raster."""
         return self.shape[1] / 2, self.shape[0] / 2
 
     def selenographic(self, column: ArrayLike, row: ArrayLike) -> tuple[Array, Array]:
@@ -58,7 +59,7 @@ class RasterMap:
 
         east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, self.crs, longitude_deg, latitude_deg))
         if self.circle is not None:
-            # A raster may count longitudes from 0 or from -180, and may extend across either.
+            # A raster may count longitudes from 0 or from -180, and may extend across either limit.
             middle = (self.transform @ self.middle)[0]
             east += self.circle * np.round((middle - east) / self.circle)
         column, row = ~self.transform @ (east, north)
@@ -66,12 +67,12 @@ class RasterMap:
 
     @property
     def circle_px(self) -> float | None:
-        """Columns of 360 degrees of longitude; None if the map does not repeat along its rows."""
+        """Number of columns in 360 degrees of longitude; None if the map does not repeat along its rows."""
         turned = self.transform.b != 0 or self.transform.d != 0
         return None if self.circle is None or turned else self.circle / abs(self.transform.a)
 
     def part(self, top: int, left: int, shape: tuple[int, int], step: int = 1) -> RasterMap:
-        """The map of a raster of which each pixel is step x step of this one, from a row and a column on."""
+        """The map of a part of this raster from `top` and `left` on, with pixels of step x step of its pixels."""
         import rasterio
 
         transform = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(step)
@@ -97,7 +98,7 @@ class Site:
 
 
 def map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
-    """The map of an open raster. Raises UserError if it has no pixel size or is not one of the Moon."""
+    """The map of an open raster. Raises UserError if it has no pixel size or is not a map of the Moon."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
@@ -123,7 +124,7 @@ def map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
     """Raise UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
 
-    PROJ refuses to transform between bodies, but its error message states neither body.
+    PROJ refuses to transform between bodies, but its error message names neither body.
     """
     ellipsoid = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
     radius = float(ellipsoid[2]) if ellipsoid else 0.0
@@ -135,7 +136,7 @@ def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
 
 
 def circle_of(crs: rasterio.crs.CRS) -> float | None:
-    """Width of 360 degrees of longitude in a system's coordinates; None unless meridians are even vertical lines."""
+    """Width of 360 degrees in a system's coordinates; None unless meridians are vertical lines at even distances."""
     import rasterio.warp
 
     if crs.is_geographic:
@@ -147,16 +148,16 @@ def circle_of(crs: rasterio.crs.CRS) -> float | None:
     steps = np.diff(x, axis=1)
     circle = 36 * float(np.median(steps))
     tolerance = 1e-6 * abs(circle)
-    # One step may lead from one edge of the map to the other.
+    # One step may jump from one edge of the map to the other.
     jumps = np.abs(steps - circle / 36) > tolerance
     even = (jumps.sum(axis=1) <= 1).all() and np.allclose(x, x[0], rtol=0, atol=tolerance)
     return abs(circle) if circle and even and np.allclose(y, y[:, :1], rtol=0, atol=tolerance) else None
 
 
 def site_in(path: Path, raster: RasterMap, config: ElevationConfig) -> Site:
-    """The site that a configuration states, or the raster's middle.
+    """The site that a configuration states, or the middle of the raster.
 
-    Raises UserError if a stated site is outside the raster, and if the raster's map is not one of the Moon.
+    Raises UserError if a stated site is outside the raster, and if the raster's map is not a map of the Moon.
     """
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import RasterioError
@@ -177,7 +178,7 @@ def site_in(path: Path, raster: RasterMap, config: ElevationConfig) -> Site:
 
 
 def _place_of(raster: RasterMap, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-    """Raster coordinates of a place, NaN if the raster's projection does not reach it."""
+    """Raster coordinates of a position, NaN if the raster's projection does not extend to it."""
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import RasterioError
 
@@ -195,7 +196,7 @@ def _refuse_outside(path: Path, raster: RasterMap, column: float, row: float, fo
     if unit == "px":
         expected = f"column 0 to {columns}, row 0 to {rows}"
     else:
-        # A lattice, since a raster about a pole has its extreme latitude inside.
+        # A lattice, not only the border: a raster around a pole has its extreme latitude inside.
         lattice = np.meshgrid(np.linspace(0, columns, 65), np.linspace(0, rows, 65))
         latitude, longitude = raster.selenographic(*(each.ravel() for each in lattice))
         middle = raster.selenographic([raster.middle[0]], [raster.middle[1]])[1][0]
@@ -208,9 +209,10 @@ def _refuse_outside(path: Path, raster: RasterMap, column: float, row: float, fo
 
 
 def refuse_hole(path: Path, raster: RasterMap, part: RasterMap, known: np.ndarray, site: Site) -> None:
-    """Raise UserError if the site, with column and row of a part of the raster, has no height.
+    """Raise UserError if the site has no height.
 
-    `known` (rows, columns) tells which pixels of the part have one.
+    `site` has the column and row in `part` of the raster. `known` (rows, columns) says which pixels of the part have a
+    height.
     """
     i, j = min(int(site.row), part.shape[0] - 1), min(int(site.column), part.shape[1] - 1)
     if known[i, j]:
@@ -230,13 +232,13 @@ def refuse_hole(path: Path, raster: RasterMap, part: RasterMap, known: np.ndarra
 
 
 def site_within(raster: RasterMap, part: RasterMap, site: Site) -> Site:
-    """The site with column and row of a part of the raster."""
+    """The site, with its column and row in a part of the raster."""
     column, row = _between(raster, part, site.column, site.row)
     return Site(column, row, site.latitude_deg, site.longitude_deg)
 
 
 def _between(raster: RasterMap, other: RasterMap, column: float, row: float) -> tuple[float, float]:
-    """Raster coordinates in `other`, of the same projection."""
+    """Raster coordinates in `other`, a raster of the same projection."""
     if raster.transform == other.transform:
         return column, row
     column, row = ~other.transform @ (raster.transform @ (column, row))

@@ -1,7 +1,7 @@
-"""The part of a raster that a scene needs: small rasters whole, of large ones a window at the scene's resolution.
+"""The part of a raster that a scene needs: all of a small raster, or a window of a large one at the scene's resolution.
 
-A raster of the whole Moon is cut at another meridian where the scene's ground lies across its left or right edge,
-since its columns repeat.
+The columns of a raster of the whole Moon repeat. If the scene's ground crosses the left or right edge, the raster is
+cut at another meridian.
 """
 
 from __future__ import annotations
@@ -15,36 +15,36 @@ from perilune_render.terrain.elevation.site import RasterMap, Site
 from perilune_shared.geometry.frames import Array, selenographic_from_site
 
 LARGEST_PIXELS = 2**24
-"""Number of pixels up to which a raster is read whole, and of the largest window."""
+"""Largest number of pixels of a raster that is read whole, and of a window."""
 UNSTATED_GROUND_M = 20_000.0
-"""Side of the ground for which a large model is read if the caller does not need a certain one, metres."""
+"""Side of the ground for which a large model is read if the caller does not state one, metres."""
 _AROUND = 1.25
-"""Half-width of a window as a multiple of the ground's, so that statistics and interpolation have more than it."""
+"""Half-width of a window divided by the ground's half-width; the margin serves statistics and interpolation."""
 _LEAST_PX = 64
-"""Least number of pixels around the ground in a window."""
+"""Smallest number of pixels around the ground in a window."""
 _NET = 65
 _ROUGH_PX = 0.5
-"""Deviation from smooth coordinates from which a map is cut or resampled, pixels."""
+"""Deviation of a map from smooth coordinates above which the map is cut or resampled, pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A part of a raster; a pixel of it is a mean over step x step pixels of the raster."""
+    """A part of a raster; each of its pixels is the mean of step x step pixels of the raster."""
 
     top: int
     """First row."""
     left: int
-    """First column; below 0 or beyond the last column where the columns of the raster repeat."""
+    """First column; below 0 or beyond the last column if the raster's columns repeat."""
     shape: tuple[int, int]
-    """Rows and columns of the part."""
+    """Numbers of rows and columns of the part."""
     step: int
-    """Rows, and columns, of the raster for one of the part."""
+    """Number of raster rows, and of raster columns, in one pixel of the part."""
     cut: bool
-    """Whether the part is not the whole raster."""
+    """Whether the part is smaller than the raster."""
 
 
 def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Window:
-    """The part of a raster to read for square ground around a site, metres; None for ground of any usual size."""
+    """The part of a raster to read for square ground of a side around a site, metres; None reads a usual size."""
     rows, columns = raster.shape
     net = np.linspace(-0.5, 0.5, 9) * (UNSTATED_GROUND_M if ground_m is None else ground_m) * _AROUND
     column, row = _places_about(raster, site, *np.meshgrid(net, net))
@@ -62,7 +62,7 @@ def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Wind
         left, right = round(site.column - around / 2), round(site.column - around / 2) + around
     step = int(np.ceil(np.sqrt(max((bottom - top) * (right - left), 1) / LARGEST_PIXELS)))
     if across:
-        # A pixel of the part must not have columns from both sides of the edge.
+        # No pixel of the part may include columns from both sides of the edge.
         edge = 0 if left < 0 else around
         left = edge - step * -(-(edge - left) // step)
     return Window(top, left, (max((bottom - top) // step, 1), max((right - left) // step, 1)), step, True)
@@ -79,7 +79,7 @@ def repeat_px(raster: RasterMap) -> int:
 
 
 def read_window(band: HeightBand, raster: RasterMap, window: Window) -> Array:
-    """Heights (rows, columns) of a window in the file's unit, NaN where the raster has none."""
+    """Heights (rows, columns) of a window in the file's unit, NaN where the raster has no height."""
     from rasterio.windows import Window as Part
 
     rows, step = window.shape[0], window.step
@@ -95,7 +95,7 @@ def read_window(band: HeightBand, raster: RasterMap, window: Window) -> Array:
 def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
     """Whether a raster's coordinates vary smoothly over square ground around a site, so that they can be interpolated.
 
-    They do not where the map is cut, as at longitude 180, and around a pole of a cylindrical map.
+    They do not vary smoothly across a cut of the map, as at longitude 180, or around a pole of a cylindrical map.
     """
     from scipy.interpolate import RectBivariateSpline
 
@@ -112,14 +112,14 @@ def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
 
 
 def places_of(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Column and row of places (...) of O_L's plane, metres."""
+    """Column and row of positions (...) on O_L's plane, metres."""
     latitude, longitude = selenographic_from_site(x_m, y_m, site.latitude_deg, site.longitude_deg)
     column, row = raster.places(np.ravel(latitude), np.ravel(longitude))
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
 
 
 def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Finite columns and rows of places (N,); columns are the nearest to the site's where the map repeats."""
+    """Finite columns and rows of positions (N,); if the map repeats, the columns nearest to the site's column."""
     column, row = places_of(raster, site, x_m, y_m)
     good = np.isfinite(column) & np.isfinite(row)
     column, row = column[good], row[good]
@@ -130,7 +130,7 @@ def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tupl
 
 
 def _runs(raster: RasterMap, window: Window) -> list[tuple[int | None, int]]:
-    """First column in the raster, None where it has none, and number of the window's columns, of its parts."""
+    """First column in the raster (None without one) and number of columns of each part of a window."""
     columns, step, around = raster.shape[1], window.step, repeat_px(raster)
     runs: list[tuple[int | None, int]] = []
     column, left = window.left, window.shape[1]
