@@ -14,6 +14,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+import perilune_train
 from perilune_render.cli.main import main as render
 from perilune_shared.cli.main import main as manifest
 from perilune_train.cli.main import main as train
@@ -23,7 +24,7 @@ from tests.helpers.drawn_dataset import build_dataset
 from tests.helpers.pages import shown
 from tests.hostile.measured import Outcome, accepted, outcome, refused
 
-SHIPPED = Path(train.__code__.co_filename).parent / "shipped"
+SHIPPED = Path(perilune_train.__path__[0]) / "shipped"
 EVIL = "<script>alert(1)<script>![x](http:evil) `|`**b** [y](javascript:z)"
 """A file name that is markup; without a slash, which no file name has."""
 NAMES = {
