@@ -32,14 +32,14 @@ PROGRAMS = {
     "perilune-render plan": ("perilune_render.cli", "plan", "--preset", "tiny", "--out", "plan"),
     "perilune-render dataset": ("perilune_render.cli", "dataset", "--preset", "tiny", "--out", "data"),
     "perilune-train detect train": (
-        "perilune_train", "detect", "train", "--preset", "tiny", "--dataset", "drawn/detect",
+        "perilune_train.cli", "detect", "train", "--preset", "tiny", "--dataset", "drawn/detect",
         "--set", "detect.epochs=500",
     ),
     "perilune-train detect evaluate": (
-        "perilune_train", "detect", "evaluate", "--dataset", "drawn/detect", "--out", "evaluated",
+        "perilune_train.cli", "detect", "evaluate", "--dataset", "drawn/detect", "--out", "evaluated",
     ),
     "perilune-train navigate train": (
-        "perilune_train", "navigate", "train", "--preset", "tiny", "--dataset", "drawn/nav",
+        "perilune_train.cli", "navigate", "train", "--preset", "tiny", "--dataset", "drawn/nav",
     ),
 }  # fmt: skip
 SCRIPTS = sorted(path.name for path in (ROOT / "scripts").glob("*.py") if "__main__" in path.read_text())
@@ -84,7 +84,7 @@ def check(code: int, error: str, seconds: float) -> None:
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_a_program_ends_with_one_line(name, after_s, folder):
     package, *words = PROGRAMS[name]
-    check(*interrupted(f"from {package}.program import main\nmain()", tuple(words), folder, after_s))
+    check(*interrupted(f"from {package} import main\nmain()", tuple(words), folder, after_s))
 
 
 @pytest.mark.parametrize("after_s", DELAYS_S[:4])
