@@ -67,4 +67,6 @@ def unfit(packages: list[dict[str, str]], version: str) -> list[str]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4 or sys.argv[1] not in ("write", "check"):
+        sys.exit(__doc__)
     {"write": write, "check": check}[sys.argv[1]](sys.argv[2], Path(sys.argv[3]))
