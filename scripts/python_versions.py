@@ -12,6 +12,11 @@ import sys
 import tomllib
 from pathlib import Path
 
+from perilune_shared.console.interrupts import end_at_interrupt
+
+if __name__ == "__main__":
+    end_at_interrupt()
+
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 

@@ -336,7 +336,7 @@ def predict(
     n_images = len(list(out.glob("*.overlay.png")))
     places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
     written = f"detections.parquet, detections.csv{places}, *.overlay.png"
-    say(f"{out}: {count} craters in {n_images} images; {written}")
+    say(f"{out}: {count} craters in {n_images} {'image' if n_images == 1 else 'images'}; {written}")
 
 
 @app.command("deploy")

@@ -104,3 +104,12 @@ def test_too_many_pixels_are_refused(tmp_path, monkeypatch):
     first.save(tmp_path / "a.tif", save_all=True, append_images=others)
     with pytest.raises(UserError, match="got more than 10000"):
         frames_of(tmp_path / "a.tif", tmp_path)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("width", [10_000, 20_000])
+def test_a_large_tiff_of_one_page_is_one_picture(tmp_path, width):
+    """Pillow warns of 10^8 pixels and refuses twice as many; the reader of pictures has its own limits."""
+    path = tmp_path / "large.tif"
+    Image.new("1", (width, 10_000)).save(path, compression="group4")
+    assert frames_of(path, tmp_path) is None

@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -69,7 +71,7 @@ def _pages(path: Path) -> list[int]:
     Returns [] for an unreadable file; `read_grey` later reports the error.
     """
     pages: list[int] = []
-    with contextlib.suppress(OSError, ValueError, SyntaxError, EOFError), Image.open(path, formats=("TIFF",)) as image:
+    with contextlib.suppress(OSError, ValueError, SyntaxError, EOFError), _opened(path) as image:
         for number in range(_MOST_PAGES):
             image.seek(number)
             # Bit 0 marks a smaller copy of another page, such as a GeoTIFF overview; bit 2 marks a mask.
@@ -78,9 +80,20 @@ def _pages(path: Path) -> list[int]:
     return pages
 
 
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """Open a TIFF without Pillow's own limit on its size: this file and `read_grey` check sizes."""
+    with warnings.catch_warnings():
+        # Serious errors raise an exception; warnings concern metadata only.
+        warnings.simplefilter("ignore")
+        Image.MAX_IMAGE_PIXELS = None
+        with Image.open(path, formats=("TIFF",)) as image:
+            yield image
+
+
 def _of_tiff(path: Path, pages: list[int], folder: Path) -> list[Path]:
     paths, pixels = [], 0
-    with Image.open(path) as image:
+    with _opened(path) as image:
         for number, page in enumerate(pages):
             try:
                 image.seek(page)
