@@ -71,7 +71,7 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def used():
-    """Numbers of the uses that this process has run: a use reads what earlier ones wrote, whichever process ran them."""
+    """Numbers of the uses that this process has run: a use reads what earlier ones wrote, in any process."""
     return set()
 
 
