@@ -30,9 +30,7 @@ def commit_by(path: Path) -> str:
 def checkout(tmp_path) -> Path:
     """A repository with shared/perilune_shared, like this one."""
     target = tmp_path / "checkout/shared/perilune_shared"
-    target.mkdir(parents=True)
-    (target / "run_record.py").write_bytes(Path(module.__file__).read_bytes())
-    (target / "__init__.py").touch()
+    shutil.copytree(Path(module.__file__).parent, target, ignore=shutil.ignore_patterns("__pycache__"))
     root = tmp_path / "checkout"
     git(root, "init", "-q")
     git(root, "add", ".")

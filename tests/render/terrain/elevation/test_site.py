@@ -123,7 +123,7 @@ def test_a_site_outside_or_in_a_hole_is_refused(path, site, message):
         (["site_latitude_deg=-85"], "site_latitude_deg and site_longitude_deg, or site_column_px and site_row_px"),
         (["site_latitude_deg=-85", "site_row_px=3"], "or none of them"),
         (["site_column_px=-1", "site_row_px=3"], "site_column_px: got -1"),
-        (["site_column_px=1", "site_row_px=3"], "site_column_px: got 1.0, expected --dem"),
+        (["site_column_px=1", "site_row_px=3"], "site_column_px: got 1.0, expected to be set only with --dem"),
         (["site_column_px=1", "site_row_px=a"], "site_row_px: got 'a'"),
     ],
 )

@@ -124,7 +124,7 @@ def test_a_distorted_camera_ignores_craters_where_it_sees_them():
 
 def test_frames_that_do_not_divide_by_32_are_refused(tmp_path, make_dataset):
     root = make_dataset(tmp_path / "odd", "detect", side_px=100, n_frames=1, craters=20)
-    with pytest.raises(UserError, match=r"width_px: got 100, expected a multiple of 32.* develop the frames with 96"):
+    with pytest.raises(UserError, match=r"width_px: got 100, expected a multiple of 32.* develop the frames at 96 px"):
         load_split(open_dataset(root), "train", LabelSettings())
 
 
