@@ -169,19 +169,19 @@ def test_the_first_paragraph(runs, dataset):
 
     text = paragraph()
     assert text == write_page(runs, str(dataset)).read_text().splitlines()[2]
-    assert "The headline ground has `equilibrium_share` 0.4: a ground of the paper's difficulty" in text
+    assert "The headline ground has `equilibrium_share` 0.4: ground as difficult as the paper's" in text
     assert "Of 4 grounds it has the validation AP (0.895) nearest to the paper's 0.893." in text
-    assert "By the strict scoring rule it would be 0.1 (0.870)." in text
+    assert "By the strict scoring rule, the nearest share would be 0.1 (0.870)." in text
     assert "(precision 0.840 at recall 0.926; here 0.800 usual and 0.700 strict at recall 0.800)" in text
-    assert "At half width there are 3 trainings of each network." in text
-    assert "It was given; on the curve 0.4 is nearer to 0.893." in paragraph("0.8")
+    assert "At half width, there are 3 training runs of each network." in text
+    assert "The share was set by the user; on the curve 0.4 is nearer to 0.893." in paragraph("0.8")
     for path in (runs / "detect").glob("*-half-*"):
         shutil.rmtree(path)
-    assert "Every figure rests on one training of each network." in paragraph()
+    assert "Every figure comes from one training run of each network." in paragraph()
     for path in (runs / "detect").glob("curve-*"):
         shutil.rmtree(path)
     assert "The curve that chooses it was not run." in paragraph()
-    assert "It was given; the curve was not run." in paragraph("0.3")
+    assert "The share was set by the user; the curve was not run." in paragraph("0.3")
 
 
 def write_motion_only(root):

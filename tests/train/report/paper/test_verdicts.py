@@ -71,7 +71,7 @@ def test_one_training(tmp_path, attended, spread, answer):
     write_detector(tmp_path, "yolov3", 0.80, spread)
     write_detector(tmp_path, "attention-yolov3", attended, spread)
     found = verdict(tmp_path, AP)
-    assert (found.answer, found.trainings) == (answer, "one training each")
+    assert (found.answer, found.trainings) == (answer, "one training run each")
     assert verdict(tmp_path, "attention raises AP (gates").answer == "not measured"
     # The strict precision has no interval.
     assert verdict(tmp_path, "attention raises precision, strict scoring (plain").answer == "open"

@@ -85,7 +85,7 @@ def _judged(
     listed = ", ".join(f"{gate} {value:.2f}" for gate, value in values.items())
     nulls = f"; nulls: {_nulls(explained, null, values)}" if null and _nulls(explained, null, values) else ""
     counted = f"{scenes if isinstance(scenes, int) else 'unknown number of'} scene{'s' * (scenes != 1)}"
-    return Verdict(*claim, f"{fit} of {len(values)}: {listed}{nulls}; {counted}", "one training", answer)
+    return Verdict(*claim, f"{fit} of {len(values)}: {listed}{nulls}; {counted}", "one training run", answer)
 
 
 def gate_table(explained: Metrics) -> list[str]:

@@ -122,7 +122,7 @@ def _claims(answered: list[Verdict]) -> list[str]:
         [verdict.claim, verdict.claimed, verdict.measured, verdict.trainings, f"**{verdict.answer}**"]
         for verdict in answered
     ]
-    head = ["claim", "the paper", "measured here, with against without attention", "trainings", "verdict"]
+    head = ["claim", "the paper", "measured here, with against without attention", "training runs", "verdict"]
     return [f"{len(answered)} claims of the paper: {counted}.", "", *table(head, rows), "", verdict_note()]
 
 
@@ -132,8 +132,8 @@ def _table_2(runs: PaperRuns) -> list[str]:
     ):
         return [NOT_RUN]
     note = (
-        "*In brackets: 95 % intervals over trajectories for one training, the range of the trainings for several. Test "
-        "frames are frames of the training trajectories' terrain, as in the paper; the locked benchmark has other "
+        "*In brackets: for one training run, the 95 % interval over trajectories; for several, the range of the runs. "
+        "Test frames show the terrain of the training frames, as in the paper; the locked benchmark has other "
         f"terrain.{_starts(runs)}*"
     )
     return [note, "", *table_2(runs)]
@@ -182,7 +182,7 @@ def _detections(root: Path, detected: dict[str, Detected]) -> list[str]:
     if not detected:
         return [NOT_RUN]
     draw_detections(root / "detections.png", {NAMES[network]: detections for network, detections in detected.items()})
-    return ["![Detections on the headline ground](detections.png)", "", "*Truth red, detections cyan.*"]
+    return ["![Detections on the headline ground](detections.png)", "", "*Red: ground truth. Cyan: detections.*"]
 
 
 def _table_3(runs: PaperRuns) -> list[str]:
@@ -200,8 +200,8 @@ def _table_3(runs: PaperRuns) -> list[str]:
         lines += ["![Errors along a test trajectory](trajectory.png)", ""]
     if any(runs.scored(name) for name in NAVIGATORS.values()):
         lines += [
-            "*The locked benchmark has 40 frames a descent. Where the experiment has more, steps of the benchmark are "
-            "longer than in training, so the error there is not that of new ground alone.*",
+            "*The locked benchmark has 40 frames per descent. If the experiment has more, steps of the benchmark are "
+            "longer than in training, so the error there is not caused by new ground alone.*",
             "",
         ]
     return lines[:-1]

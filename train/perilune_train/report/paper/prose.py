@@ -7,44 +7,47 @@ from perilune_train.report.paper.runs import PaperRuns, nearest_share
 from perilune_train.report.paper.tables import numbers
 
 CAUSES = {
-    "loss": "**Loss.** In common YOLO implementations, 0.05 and 1 weight means over boxes and cells. With plain "
-    "sums, cells far outnumber boxes, and the boxes are hardly trained.",
-    "gates": "**Gates.** A plain CBAM module scales its input by about 0.25 at the start, and there are 23 of them. "
+    "loss": "**Loss.** In common YOLO implementations, the weights 0.05 and 1 apply to means over boxes and cells. "
+    "With plain sums, cells far outnumber boxes, and the boxes are hardly trained.",
+    "gates": "**Gates.** At the start of training, each of the 23 plain CBAM modules scales its input by about 0.25. "
     "In a frozen backbone that was trained without gates, they leave almost no signal for the later layers. Gates "
     "from identity start at 1.",
-    "ground": "**Ground.** perilune's usual ground has many craters, many of them too faint to see, and the paper's "
-    "rule labels them all. The curve above shows the network on sparser ground.",
+    "ground": "**Ground.** perilune's usual ground has many craters, and many of them are too faint to see. The "
+    "paper's rule labels them all. The curve above shows the network on sparser ground.",
 }
 """Text on each cause, by the first part of the keys of paper-causes.json."""
 
 DEVIATIONS = (
-    "Frames are rendered by perilune in place of PANGU. The paper does not publish its data, camera or Sun. The "
-    "headline ground is chosen by its difficulty for YOLOv3 only.",
+    "Frames are rendered by perilune instead of PANGU. The paper does not publish its data, camera or Sun. The "
+    "headline ground is chosen only by its difficulty for YOLOv3 without attention.",
     "The grey frame is repeated in three channels, as in PANGU's images of grey ground.",
-    "Loss: `detect.loss.reduction=means` in place of the paper's sums over cells and boxes. Sums are an ablation.",
-    "YOLOv3 ignores predictors that overlap a label by an IoU above 0.5 without being its best one. Here they are "
+    "Loss: `detect.loss.reduction=means` instead of the paper's sums over cells and boxes. Sums are tested in an "
+    "ablation.",
+    "YOLOv3 ignores predictors that overlap a label by an IoU above 0.5 but are not its best predictor. Here they are "
     "negative.",
     "COCO is not used. In the rows after transfer, one of perilune's networks replaces YOLOv3 trained on COCO.",
-    "Gates: plain CBAM is the paper's. Gates from identity are CBAM with twice the sigmoid, and their last weights "
+    "Gates: the paper uses plain CBAM. Gates from identity are CBAM with twice the sigmoid, and their last weights "
     "start at zero.",
     "Optimiser (AdamW with warm-up and one cosine for detection), learning rate, batch and epochs of detection, and "
     "the weight of empty cells in the objectness loss (1) are perilune's choices; the paper does not state them.",
     "Craters with a radius just outside 2 to 50 px, or with their centre off the frame, are neither positive nor "
     "negative in training. The usual scoring rule ignores detections on them; the strict rule counts these as false "
     "positives.",
-    "A cell can place a centre up to half a cell outside itself. There is no class output. The initial objectness is "
-    "0.01 in every cell.",
-    "Navigation: in the paper the network gives the pose in the landing frame; motion between frames is a second "
-    "reading. The backbone starts from the detector. It is frozen in the coarse stage, and its features are stored.",
+    "A cell can predict a centre up to half a cell outside the cell. There is no class output. The initial objectness "
+    "is 0.01 in every cell.",
+    "Navigation: in the paper, the network estimates the pose in the landing frame; motion between frames is another "
+    "possible reading of the paper. The backbone starts from the weights of the detector. It is frozen in the coarse "
+    "stage, and its features are stored.",
     "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, so "
-    "the orientation error carries no information. Descents with attitude noise (ATTITUDE=1) measure it.",
+    "the orientation error carries no information. With ATTITUDE=1, it is measured on descents with attitude noise.",
     "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
-    "pose, the axes are weighted between metres and spreads. The coarse stage has a higher learning rate. In the fine "
-    "stage the learning rate of the backbone is a hundredth of the paper's 1e-4. Training sequences include further "
-    "views, warped over the ground plane.",
-    "Features of the backbone are standardised before the LSTM, and its batch statistics stay as in the detector. "
-    "Poses are evaluated in causal windows of the training's length, without a state carried over the descent.",
-    "The epoch that is best on validation is tested.",
+    "pose, the weight of each axis lies between the weight for errors in metres and the weight for standardised "
+    "errors. The coarse stage has a higher learning rate. In the fine stage, the learning rate of the backbone is a "
+    "hundredth of the paper's 1e-4. Training sequences include further views, warped over the ground plane.",
+    "Features of the backbone are standardised before the LSTM, and the backbone keeps the batch statistics of the "
+    "detector. Poses are evaluated in causal windows as long as the training sequences; the LSTM's state is not "
+    "carried over the descent.",
+    "The weights of the epoch with the best validation result are tested.",
 )
 
 
@@ -59,19 +62,20 @@ def lead(runs: PaperRuns, share: str | None, *, given: bool) -> str:
 def verdict_note() -> str:
     """The rule for verdicts, in words."""
     return (
-        f"The rule is the same for both signs. With {MIN_TRAININGS} trainings or more of each network a claim *holds* "
-        "if every training with attention is better than every one without, and *does not hold* if every one is worse. "
-        "With one training of each, it holds or does not hold only if the 95 % intervals over trajectories are "
-        "separated; these intervals say nothing about another training. Otherwise it is *open*. Times count as equal "
-        f"within {100 * (AS_FAST - 1):.0f} % in either direction. A claim on gates holds if it is true for all of its "
-        "gates, does not hold if it is true for none, and is open over fewer than five scenes; the experiment has one."
+        f"Better and worse are treated alike. With at least {MIN_TRAININGS} training runs of each network, a claim "
+        "*holds* if every run with attention is better than every run without it, and *does not hold* if every run "
+        "with attention is worse. With one training run of each network, a claim holds or does not hold only if the "
+        "95 % intervals over trajectories do not overlap; these intervals do not cover differences between training "
+        "runs. Otherwise the claim is *open*. Times that differ by at most "
+        f"{100 * (AS_FAST - 1):.0f} % count as equal. A claim on gates holds if it is true for all of its gates, and "
+        "does not hold if it is true for none. It is open over fewer than five scenes; the experiment has one scene."
     )
 
 
 def _ground(runs: PaperRuns, share: str | None, given: bool) -> str:
     curve = runs.curve(share)
     reason = (
-        "a ground of the paper's difficulty, chosen by YOLOv3 without attention alone, so that it favours neither "
+        "ground as difficult as the paper's, chosen only by YOLOv3 without attention, so that it favours neither "
         "network"
     )
     if share is None:
@@ -83,11 +87,11 @@ def _ground(runs: PaperRuns, share: str | None, given: bool) -> str:
         text += f" Of {len(curve)} grounds it has the validation AP ({ap}) nearest to the paper's {TARGET_AP:.3f}."
     elif given:
         better = "the curve was not run" if nearest is None else f"on the curve {nearest} is nearer to {TARGET_AP:.3f}"
-        text += f" It was given; {better}."
+        text += f" The share was set by the user; {better}."
     strict = nearest_share(curve, "strict/")
     if strict is not None and strict != share:
         ap = number(curve[strict].get("val/strict/ap50_paper"))
-        text += f" By the strict scoring rule it would be {strict} ({ap})."
+        text += f" By the strict scoring rule, the nearest share would be {strict} ({ap})."
     return text
 
 
@@ -96,7 +100,7 @@ def _scoring(runs: PaperRuns) -> str:
     text = (
         "**Scoring.** Labels follow the paper's rule, radii of 2 to 50 px. Headline figures use the usual scoring "
         "rule, which ignores detections that the labels cannot decide. The strict rule counts a detected crater just "
-        "below 2 px as a false positive. The paper must have used the strict rule, since it names no ignored detections"
+        "below 2 px as a false positive. The paper mentions no ignored detections, so it must have used the strict rule"
     )
     trainings = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
     usual, strict, recall = (numbers(trainings, f"test/{key}") for key in ("precision", "strict/precision", "recall"))
@@ -105,15 +109,15 @@ def _scoring(runs: PaperRuns) -> str:
             f" (precision {paper['precision']:.3f} at recall {paper['recall']:.3f}; here {usual[0]:.3f} usual and "
             f"{strict[0]:.3f} strict at recall {recall[0]:.3f})"
         )
-    return f"{text}. The usual rule is the headline here, since a crater just below 2 px is not a false detection."
+    return f"{text}. Headline figures use the usual rule because a crater just below 2 px is not a false detection."
 
 
 def _trainings(runs: PaperRuns) -> str:
     halves = [len(trainings) for trainings in runs.halves().values() if trainings]
     if max(halves, default=0) < 2:
-        return "**Trainings.** Every figure rests on one training of each network."
+        return "**Training runs.** Every figure comes from one training run of each network."
     counted = f"{min(halves)}" if len(set(halves)) == 1 else f"{min(halves)} to {max(halves)}"
     return (
-        f"**Trainings.** At half width there are {counted} trainings of each network. All other figures, full width "
-        "and navigation included, rest on one training of each network."
+        f"**Training runs.** At half width, there are {counted} training runs of each network. All other figures, "
+        "including full width and navigation, come from one training run of each network."
     )

@@ -94,7 +94,7 @@ def table_2(runs: PaperRuns) -> list[str]:
         if metrics is not None:
             cells = [values([metrics], f"paper/{key}") for key in _DETECTION]
             rows.append(["locked benchmark", NAMES[network], "1", "-", *cells, labels_a_frame(metrics, "paper")])
-    lines = table(["ground", "network", "trainings", "epochs", *_DETECTION.values(), "labels a frame"], rows)
+    lines = table(["ground", "network", "training runs", "epochs", *_DETECTION.values(), "labels per frame"], rows)
     return [*lines, "", f"Not run: {', '.join(missing)}."] if missing else lines
 
 
@@ -106,7 +106,7 @@ def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]
         keys = ("val/ap50_paper", "test/ap50_paper", "test/strict/ap50_paper", "test/precision", "test/recall")
         cells = [values([metrics], key) for key in keys]
         rows.append([f"**{name}, headline**" if share == headline else name, labels_a_frame(metrics), *cells])
-    head = ["equilibrium_share", "labels a frame", "AP, validation", "AP, test", "AP, test, strict"]
+    head = ["equilibrium_share", "labels per frame", "AP, validation", "AP, test", "AP, test, strict"]
     return table([*head, "precision", "recall"], rows)
 
 

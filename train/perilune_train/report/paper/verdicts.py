@@ -11,7 +11,7 @@ from perilune_train.report.paper.rule import AS_FAST, Answer, Verdict, by_order,
 from perilune_train.report.paper.runs import NAVIGATORS, READINGS, PaperRuns
 from perilune_train.report.paper.tables import FLOORS, lost_to, numbers, values
 
-ONE = "one training each"
+ONE = "one training run each"
 _CONSTANT_DEG = 1e-4
 """The orientation counts as constant if its mean has an error below this limit, degrees (no attitude noise)."""
 GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from identity"}
@@ -60,7 +60,7 @@ def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) 
         answer = "open"
     measured = _measured(key, half[gates], half["yolov3"])
     if alone != "not measured":
-        measured += f"; full width, one training each: {_measured(key, *pair)}, {alone}"
+        measured += f"; full width, one training run each: {_measured(key, *pair)}, {alone}"
     each = f"{counts[0]}" if counts[0] == counts[1] else " and ".join(map(str, counts))
     return Verdict(claim, claimed, measured, f"{each} each, half width", answer)
 
@@ -85,7 +85,9 @@ def _large_craters(ratio: WidthRatio | None) -> Verdict:
         return Verdict(claim, "no figure", "-", "-", "not measured")
     limits = f" ({ratio.interval[0]:.3f} to {ratio.interval[1]:.3f})" if ratio.interval else ""
     answer = by_order(ratio.interval, (1.0, 1.0), higher=False)
-    return Verdict(claim, "no figure", f"median width {ratio.median:.3f}{limits} of it", "one training", answer)
+    return Verdict(
+        claim, "no figure", f"median width {ratio.median:.3f}{limits} of the true width", "one training run", answer
+    )
 
 
 def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
