@@ -1,7 +1,7 @@
 # perilune: datasets, networks and their explanation. `make help` lists the targets.
 SHELL := /bin/bash
 PYTHON ?= python3.11
-# `make demo` has a preset of its own.
+# `make demo` has its own default preset.
 PRESET ?= $(if $(filter demo,$(MAKECMDGOALS)),demo,small)
 KIND ?= both
 NAME ?= $(PRESET)
@@ -48,7 +48,7 @@ help: ## list these targets
 	@echo 'PRESET=tiny|demo|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  NAME=run  OVERWRITE=1'
 	@echo 'DEM=file.tif  CATALOGUE=file.csv  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port'
 	@echo
-	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
+	@echo "SET takes settings as shell words; quote a setting that contains spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
 
 ##@ Start
@@ -72,7 +72,7 @@ $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
 	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e "train[export,geo]" -r requirements-dev.txt
 	@touch $@
 
-demo: setup ## all steps on small data: frames, detection, navigation, explanation, report (PRESET=demo; tiny shows that all steps work)
+demo: setup ## run all steps on small data: frames, detection, navigation, explanation, report (PRESET=demo; PRESET=tiny only tests that all steps run)
 	@$(BIN)/python scripts/demo.py --preset $(PRESET) --name $(NAME) --data $(call quoted,$(DATA)) --runs $(call quoted,$(RUNS)) \
 	  $(if $(DEM),--dem $(call quoted,$(DEM))) $(if $(CATALOGUE),--catalogue $(call quoted,$(CATALOGUE))) $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $(SETTINGS)
 	@echo
@@ -84,7 +84,7 @@ demo: setup ## all steps on small data: frames, detection, navigation, explanati
 	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
 
 ##@ Datasets and training
-dataset: setup ## render the preset's datasets (KIND=detect|nav for one); run again to resume
+dataset: setup ## render the preset's datasets (KIND=detect|nav for only one); run again to resume
 	@$(RENDER) --kind $(KIND)
 
 # An interrupted rendering has a dataset.json too; the command then resumes it.
@@ -109,7 +109,7 @@ train-detect-baseline: detect-frames # the same network without attention, into 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam identity:attention=cbam_identity unguided:loss.lambda_guide=0 strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
 ABLATED = "$(RUNS)/detect/$(NAME)" $(foreach one,$(ABLATION),"$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))")
-ablate-detect: train-detect ## train detection with one change each (attention, guidance, strides, widths) and compare
+ablate-detect: train-detect ## train variants of the detector (attention, guidance, strides, widths), and compare them
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" $(OVER) &&) true
 	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
@@ -135,7 +135,7 @@ $(BIN)/perilune-render survey --manifest "$(3)-plan" --out "$(3)" && \
 { test -e "$(4)/map.json" || $(BIN)/perilune-train navigate map --dataset "$(3)" --out "$(4)"; }
 endef
 
-navigate: nav-frames ## fly all methods over the test descents; writes runs/navigate/<name>-methods
+navigate: nav-frames ## run all navigation methods over the test descents; writes runs/navigate/<name>-methods
 	@if test -z "$(OVER)" -a -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \
 	  $(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(METHODS)" \
 	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)") $(if $(wildcard $(MAP)/map.json),--map "$(MAP)") $(OVER); fi
@@ -146,7 +146,7 @@ navigate-map: nav-frames ## map the test scenes from orbit; make navigate then u
 DRAWS ?= 200
 SCENARIO ?= nominal
 MONTE_CARLO := $(RUNS)/navigate/$(NAME)-monte-carlo-$(SCENARIO)
-navigate-monte-carlo: nav-frames ## fly the filter over 200 draws of each test descent (DRAWS=number SCENARIO=nominal|outage|wrong-prior|false-detections)
+navigate-monte-carlo: nav-frames ## run the filter over 200 random draws of each test descent (DRAWS=number SCENARIO=nominal|outage|wrong-prior|false-detections)
 	@if test -z "$(OVER)" -a -f "$(MONTE_CARLO)/monte_carlo.md"; then echo "$(MONTE_CARLO): finished, left unchanged; OVERWRITE=1 replaces it"; else \
 	  $(BIN)/perilune-train navigate monte-carlo --dataset "$(DATA)/nav" --draws $(call quoted,$(DRAWS)) \
 	  --scenario $(call quoted,$(SCENARIO)) --out "$(MONTE_CARLO)" $(OVER); fi
@@ -155,7 +155,7 @@ closed-loop: setup ## fly a descent in closed loop: guidance, filter, and images
 	@$(BIN)/python examples/closed_loop.py --out "$(RUNS)/closed-loop"
 
 ##@ Explanation and report
-explain: ## attention masks and correlations of the trained networks
+explain: ## compute attention masks and correlations of the trained networks
 	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
 	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
 
@@ -169,14 +169,14 @@ explain-causal: detect-frames ## remove single craters from the test scenes, and
 	@$(BIN)/perilune-train causal $(COMMON) --runs $(call quoted,$(RUNS)) --name $(NAME) --dataset "$(DATA)/detect" --counterfactual "$(DATA)/causal" \
 	  --turned "$(DATA)/turned" $(if $(wildcard $(STACK)/metrics.json),--nav-dataset "$(DATA)/nav" --nav-counterfactual "$(DATA)/causal-nav") $(OVER)
 
-# The experiment and the benchmark have folders of their own.
+# The experiment and the benchmark write to separate folders.
 REPORT ?= demo
 REPORTED = $(if $(filter demo,$(REPORT)),--name $(NAME) --dataset "$(DATA)" --runs "$(RUNS)" --out "$(RUNS)/report/$(NAME)")
-report: setup ## one HTML page of datasets, runs and frames (REPORT=demo|paper|benchmark); writes runs/report/
+report: setup ## write one HTML page on datasets, runs and frames (REPORT=demo|paper|benchmark); writes runs/report/
 	@$(BIN)/perilune-train report --kind $(call quoted,$(REPORT)) $(REPORTED)
 
 ##@ Benchmarks and the paper's experiment
-# A part of the benchmark is in a folder of its own.
+# A part of the benchmark is rendered into a separate folder.
 BENCHMARK := data/benchmark$(if $(SCENES),-$(SCENES)-scenes)
 benchmark-frames: setup # render the locked benchmark (KIND=nav for navigation, SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
 	@scripts/render-benchmark $(if $(filter nav,$(KIND)),nav,detect) $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
@@ -201,13 +201,13 @@ benchmark-landing: setup ## score craters and the filter (DETECTOR=folder, MAPS=
 	@$(BIN)/perilune-train navigate benchmark-landing $(if $(DETECTOR),--detector $(call quoted,$(DETECTOR))) \
 	  $(if $(MAPS),--maps $(call quoted,$(MAPS))) --data $(BENCHMARK)
 
-# The experiment has presets of its own: PRESET=paper unless one is given.
-paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=whole, gpu or full, GROUND=lunar, CALIBRATE=1, ATTITUDE=1, MINUTES=number, DARKNET=yolov3.weights)
+# The experiment has its own default: PRESET=paper.
+paper: setup ## repeat the paper's experiment; writes tables, figures and verdicts into runs/paper (PART=whole, gpu or full, GROUND=lunar, CALIBRATE=1, ATTITUDE=1, MINUTES=number, DARKNET=yolov3.weights)
 	@$(BIN)/python scripts/paper.py --preset $(if $(filter file,$(origin PRESET)),paper,$(PRESET)) $(if $(PART),--part $(PART)) \
 	  $(if $(GROUND),--ground $(GROUND)) $(if $(CALIBRATE),--calibrate) $(if $(ATTITUDE),--attitude) \
 	  $(if $(MINUTES),--minutes $(MINUTES)) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
 
-bench: ## run one measurement (NAME=labels); without NAME list them
+bench: ## run one measurement (NAME=labels); without NAME, list all measurements
 ifneq ($(origin NAME),command line)
 	@awk -F ':[^#]*# ' '/^bench-[a-z-]+:[^#]*# / { printf "  %-22s%s\n", substr($$1, 7), $$2 }' $(MAKEFILE_LIST)
 else
@@ -218,10 +218,10 @@ endif
 ##@ Development
 JOBS ?= 2
 # A test marked `slow` kills processes, starts Ray or a browser, or renders the shared manifests again.
-test: setup-dev ## run the tests, in JOBS=2 processes (SLOW=1 also runs those marked slow, as .ci/run does)
+test: setup-dev ## run the tests in JOBS=2 processes (SLOW=1 also runs the tests marked slow, as .ci/run does)
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 -m "$(if $(SLOW),not hostile,not slow and not hostile)"
 
-test-hostile: setup-dev ## run hostile and broken input through every command
+test-hostile: setup-dev ## run hostile and damaged input through every command
 	@log=$$(mktemp) && trap 'rm -f "$$log"' EXIT && PERILUNE_HOSTILE_LOG="$$log" OMP_NUM_THREADS=1 \
 	  $(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 -m hostile tests/hostile
 
@@ -249,7 +249,7 @@ bench-kill: setup-dev # renderings disturbed at random moments (SIGKILL, Ctrl-C,
 bench-scale: setup-dev # frames per second by executor, number of processes and threads; writes runs/bench/scale.json
 	@$(BIN)/python -m benchmarks.dataset.scale
 
-bench-requests: setup-dev # requests of a frame, trajectory, scene and dataset in an S3 store; writes runs/bench/requests.json
+bench-requests: setup-dev # number of requests to an S3 store for a frame, trajectory, scene and dataset; writes runs/bench/requests.json
 	@$(BIN)/python -m benchmarks.dataset.requests
 
 bench-scaling: setup-dev # core hours and bytes of up to 100 million frames, estimated; writes runs/bench/scaling.json
@@ -278,7 +278,7 @@ bench-plan: setup-dev # time and memory of planning 10 million frames; writes ru
 bench-memory: setup-dev # resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
 	@$(BIN)/python -m benchmarks.dataset.memory
 
-bench-profile: setup-dev # processor time of each step of a frame with the engine heightfield; writes runs/bench/profile_frames.json
+bench-profile: setup-dev # processor time of each step of rendering a frame with the engine heightfield; writes runs/bench/profile_frames.json
 	@$(BIN)/python -m benchmarks.dataset.profile_frames
 
 bench-develop: setup-dev # frames developed per second on one core; writes runs/bench/develop.json
@@ -299,7 +299,7 @@ bench-truth: setup-dev # depth and normals of EXRs, compared with cast rays; wri
 bench-other-ground: setup-dev # rims and the installed detector over ground of another generator (.venv/bin/pip install terraingenpy); writes runs/bench/other_ground.json
 	@$(BIN)/python -m benchmarks.scene.other_ground
 
-bench-engines: setup-dev # frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json
+bench-engines: setup-dev # speed of both engines, and agreement of their radiance, depth and labels; writes runs/bench/engines.json
 	@$(BIN)/python -m benchmarks.scene.engines
 
 bench-serve: setup-dev # frames per second of the image server, and its memory over 20,000 frames; writes runs/bench/serve.json
@@ -315,19 +315,19 @@ bench-gates: detect-frames # AP and variation of attention masks of detect runs 
 bench-infer: setup-dev # time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
 
-bench-paper-causes: setup-dev # why short trainings of the paper's detector failed: ground, loss and gates, about half an hour on two cores; writes runs/paper/paper-causes.json
+bench-paper-causes: setup-dev # causes of the failure of short training runs of the paper's detector (ground, loss, gates), about half an hour on two cores; writes runs/paper/paper-causes.json
 	@$(BIN)/python -m benchmarks.train.paper_causes
 
-bench-captured: setup-dev # training speed of both detectors with steps one operation at a time and captured, on a GPU; writes runs/bench/captured.json
+bench-captured: setup-dev # training speed of both detectors on a GPU, with and without CUDA graphs; writes runs/bench/captured.json
 	@$(BIN)/python -m benchmarks.train.captured
 
-bench-pose-limits: setup-dev # what limits the navigator of poses (steps, descents, views, features), on the experiment's runs; writes runs/bench/pose-limits.json
+bench-pose-limits: setup-dev # limits of the pose navigator (steps, descents, views, features), on the runs of the experiment; writes runs/bench/pose-limits.json
 	@$(BIN)/python -m benchmarks.train.pose_limits --detector $(RUNS)/paper/detect/yolov3-half-0 --dataset data/paper/headline/nav --hidden 256
 
 bench-shared: setup-dev # speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
 	@$(BIN)/python -m benchmarks.shared
 
-bench-latency: setup-dev # where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
+bench-latency: setup-dev # time of the detector by groups of operations, and the limit of the processor; writes runs/bench/latency.json
 	@$(BIN)/python -m benchmarks.train.latency
 
 bench-train: detect-frames # training speed, compared with training from memory and with a bare loop; writes runs/bench/train.json
@@ -349,13 +349,13 @@ bench-monte-carlo: setup-dev # time of 1200 flights of the navigation filter on 
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.train.monte_carlo data/shipped/nav
 
-bench-stream: setup-dev # navigation trained on rendered sequences against a dataset alone, at equal processor time; writes runs/bench/stream.json
+bench-stream: setup-dev # navigator trained on rendered sequences, compared with training on a dataset alone, at equal processor time; writes runs/bench/stream.json
 	@$(BIN)/python -m benchmarks.train.stream
 
-bench-one-light: setup-dev # agreement of the light on craters of lunar pictures and of others (MOON=folder OTHERS=folder)
+bench-one-light: setup-dev # agreement of the directions of light on craters, in lunar pictures and in other pictures (MOON=folder OTHERS=folder)
 	@$(BIN)/python -m benchmarks.train.one_light $(call quoted,$(MOON)) --others $(call quoted,$(OTHERS))
 
-bench-suppress: setup-dev # time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
+bench-suppress: setup-dev # time of non-maximum suppression of a batch, compared with OpenCV frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress
 
 # With RECORD=files, first copy these JSON files of runs or benchmarks into results/.

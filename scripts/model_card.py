@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Shipment:
-    """What a card is made from."""
+    """Inputs of a card."""
 
     name: str
     """crater-detector or lander-navigator."""
@@ -25,9 +25,9 @@ class Shipment:
     precision: str = "half precision"
     """How the weights are stored."""
     others: tuple[dict[str, Any], ...] = ()
-    """benchmark.json of trainings with other seeds, which are not installed."""
+    """benchmark.json of training runs with other random seeds, which are not installed."""
     notes: tuple[str, ...] = ()
-    """Caveats of this network or of its benchmark, a line each."""
+    """Caveats of this network or of its benchmark, one line for each."""
 
 
 def model_card(one: Shipment) -> str:
@@ -78,8 +78,8 @@ def _detector(one: Shipment) -> list[str]:
         and isinstance(value, float)
     ]
     return [
-        "Finds lunar craters in camera images seen from above. `perilune-train detect predict` loads it if `--run` is "
-        "not given.",
+        "This detector finds lunar craters in camera images taken from above. `perilune-train detect predict` uses it "
+        "if `--run` is not given.",
         "",
         *_facts(one, network, f"{figures.get('threshold', 0):.3f}, chosen on validation scenes"),
         "",
@@ -95,8 +95,8 @@ def _detector(one: Shipment) -> list[str]:
         "In brackets: 95 % intervals over scenes.",
         "",
         "- `visible`: craters above a threshold of contrast in the frame",
-        "- `paper`: all craters of 2 to 50 px radius, however faint",
-        "- usual: detections on other craters are ignored",
+        "- `paper`: all craters with a radius of 2 to 50 px, even if they are hardly visible",
+        "- usual: detections on craters that are not selected are ignored",
         "- edge: detections of 1.5 to 2 px that overlap no crater are false positives",
         "- strict: every unmatched detection is a false positive",
         "",
@@ -106,25 +106,26 @@ def _detector(one: Shipment) -> list[str]:
         "",
         "## Limits",
         "",
-        "- It was trained on rendered frames of 256 x 256 pixels over 50 degrees; real images differ.",
-        "- It looks for craters of about 2 to 80 pixels radius. Shrink images with larger ones (`--scale`).",
-        "- A view far from straight down was not trained.",
+        "- It was trained on rendered frames of 256 x 256 pixels over 50 degrees; real images differ from them.",
+        "- It finds craters with a radius of about 2 to 80 pixels. Reduce the size of images with larger craters "
+        "(`--scale`).",
+        "- The training data has no views far from straight down.",
         *_seeds(one),
     ]
 
 
 def _seeds(one: Shipment) -> list[str]:
-    """The same figures of trainings with other seeds, from the least favourable training on."""
+    """Lines with the AP of training runs with other random seeds, the smallest AP first."""
     if not one.others:
-        return ["- The figures are of one training."]
+        return ["- The figures are of one training run."]
     scoring_rules = {"paper/strict/": "labels `paper`, strict", "visible/edge/": "labels `visible`, edge"}
     found = []
     for prefix, title in scoring_rules.items():
         values = sorted(other[f"{prefix}ap50_paper"] for other in one.others)
         found.append(f"{', '.join(f'{value:.3f}' for value in values)} ({title})")
     count = len(one.others)
-    who = "another, with another seed, has" if count == 1 else f"{count} others, with other seeds, have"
-    return [f"- The figures are of one training; {who} AP {' and '.join(found)}."]
+    runs = "a run with another random seed" if count == 1 else f"{count} runs with other random seeds"
+    return [f"- The figures are of one training run. The AP of {runs}: {' and '.join(found)}."]
 
 
 def _bin_title(key: str) -> str:
@@ -143,7 +144,7 @@ def _navigator(one: Shipment) -> list[str]:
     names = {
         method: "this network",
         "klt": "tracked corners (KLT)",
-        "klt_gyroscope": "the same, with a gyroscope",
+        "klt_gyroscope": "tracked corners (KLT), with a gyroscope",
         "alignment": "direct alignment",
         "alignment_gyroscope": "direct alignment, with a gyroscope",
         "nominal": "nominal motion",
@@ -155,8 +156,8 @@ def _navigator(one: Shipment) -> list[str]:
         if f"{name}/{keys[0]}" in figures
     ]
     return [
-        "Estimates the motion of a camera between two frames of a landing, from the frames and the nominal motion. "
-        "`perilune-train navigate evaluate` and `benchmark` load it if `--run` is not given.",
+        "This network estimates the motion of a camera between two frames of a landing, from the frames and the "
+        "nominal motion. `perilune-train navigate evaluate` and `benchmark` use it if `--run` is not given.",
         "",
         *_facts(one, network, None),
         "",
@@ -170,7 +171,8 @@ def _navigator(one: Shipment) -> list[str]:
         "",
         "## Limits",
         "",
-        "- A method without training is better wherever its row says so; use it then.",
-        "- It needs the nominal motion and altitude, and was trained on errors of rendered descents only.",
-        "- The figures are of one training.",
+        "- Methods without training are more accurate if their row shows a smaller error; use them in this case.",
+        "- It needs the nominal motion and altitude. It was trained only on deviations of rendered descents from the "
+        "nominal motion.",
+        "- The figures are of one training run.",
     ]
