@@ -51,7 +51,7 @@ GATE_M, GATE_MPS = np.array([0.0, 0.0, 150.0]), np.array([0.0, 0.0, -3.0])
 DURATION_S, STEP_S, FRAME_S = 60.0, 0.02, 1.0
 PRIOR_M, PRIOR_MPS, PRIOR_DEG = 60.0, 0.5, 0.5
 """Standard deviations of the initial estimate, on each axis."""
-MOST_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
+MAX_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
 SHOWN_S = (0.0, 30.0, 60.0)
 """Times of the frames in the picture."""
 LAST_S = 4.0
@@ -118,7 +118,7 @@ def guidance(position_m: Array, velocity_mps: Array, left_s: float) -> Array:
     to_go = GATE_M - position_m - velocity_mps * left_s
     faster = GATE_MPS - velocity_mps
     thrust = 6 * to_go / left_s**2 - 2 * faster / left_s - gravity
-    return thrust * min(1.0, MOST_THRUST_MPS2 / float(np.linalg.norm(thrust)))
+    return thrust * min(1.0, MAX_THRUST_MPS2 / float(np.linalg.norm(thrust)))
 
 
 def sway(time_s: float) -> Array:

@@ -34,7 +34,7 @@ CRATER_COLUMNS = (
 """Columns of the craters, as in the table `craters` of a manifest."""
 _TYPES = ("|u1", "<u2", "<f4", "<f8", "<i8")
 """Types of arrays that a reply may have."""
-_MOST_BYTES = 2_000_000_000
+_MAX_BYTES = 2_000_000_000
 _GROUND = {
     "dataset": str,
     "sun_azimuth_deg": float,
@@ -278,6 +278,6 @@ def _array(stated: dict[str, Any], content: bytes) -> np.ndarray:
     shape = tuple(int(side) for side in stated["shape"])
     kind = np.dtype(stated["dtype"])
     n_bytes = kind.itemsize * int(np.prod(shape, dtype=np.float64)) if min(shape, default=0) >= 0 else -1
-    if n_bytes != len(content) or n_bytes > _MOST_BYTES:
+    if n_bytes != len(content) or n_bytes > _MAX_BYTES:
         raise ValueError(f"{len(content)} bytes for shape {shape}")
     return np.frombuffer(content, kind).reshape(shape)

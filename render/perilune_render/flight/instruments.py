@@ -22,7 +22,7 @@ from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_errors import drawn_errors
 from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 
-_MOST_STEPS = 50
+_MAX_STEPS = 50
 """Largest number of iterations to find a range."""
 _TOLERANCE_M = 1e-3
 """Change in one iteration below which a range has converged, metres."""
@@ -108,7 +108,7 @@ def range_to_ground_m(scene: Scene, position_m: Array, direction: Array) -> Arra
     x, y, z = position_m.T
     dx, dy, dz = direction.T
     distance, change = z / -dz, np.full(len(z), np.inf)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         ground = value_at(scene.height_m, scene.grid, x + distance * dx, y + distance * dy)
         following = (z - ground) / -dz
         change = np.abs(following - distance)

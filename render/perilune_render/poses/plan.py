@@ -24,7 +24,7 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 SAME_SUN_DEG = 0.05
 """Frames whose Suns differ by less than this share the Sun of the first such frame; a tenth of the Sun's diameter,
 degrees."""
-_MOST_SCENES = 1000
+_MAX_SCENES = 1000
 _N_VIEWS = 24
 _LOWER = 0.9
 """Lowest camera height that the views allow for, as a share of its height: the ground may rise towards the camera."""
@@ -184,7 +184,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
 
     Frames whose Suns differ by SAME_SUN_DEG or more are in different scenes over the same ground. A trajectory under
     several Suns has a part in the scene of each, with the indices and the times of the whole trajectory. Raises
-    UserError if the poses fit no ground, or for more than _MOST_SCENES Suns.
+    UserError if the poses fit no ground, or for more than _MAX_SCENES Suns.
     """
     scene = config.scene or SceneConfig()
     rig = rig_of(config)
@@ -192,9 +192,9 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     views = scene.views or (horizon_views_of(poses, rig, where) if scene.horizon else views_of(poses, rig, where))
     scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
     suns, lit_by = _suns(poses, scene)
-    if len(suns) > _MOST_SCENES:
-        found = f"more than {_MOST_SCENES} Suns that differ by {SAME_SUN_DEG} degrees"
-        raise UserError(where, "sun_azimuth_deg", found, f"at most {_MOST_SCENES}")
+    if len(suns) > _MAX_SCENES:
+        found = f"more than {_MAX_SCENES} Suns that differ by {SAME_SUN_DEG} degrees"
+        raise UserError(where, "sun_azimuth_deg", found, f"at most {_MAX_SCENES}")
     seed = scene_seed(config)
     scenes = tuple(ScenePlan(f"scene-{k:04d}", seed, *map(float, sun)) for k, sun in enumerate(suns))
     trajectories: list[TrajectoryPlan] = []
@@ -222,7 +222,7 @@ def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarra
             same = np.flatnonzero(_is_same_sun(sun, np.array(suns).reshape(-1, 2)))
             if not len(same):
                 suns.append(sun)
-            if len(suns) > _MOST_SCENES:
+            if len(suns) > _MAX_SCENES:
                 return suns, index
             index[n] = same[0] if len(same) else len(suns) - 1
         else:

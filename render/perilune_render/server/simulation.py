@@ -30,7 +30,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, sun_direction
 
-_MOST_SOURCES = 8
+_MAX_SOURCES = 8
 _PREPARED_AT_M = 500.0
 _DOWN = np.diag([1.0, -1.0, -1.0])
 
@@ -141,7 +141,7 @@ class SimulatedScene:
 
     def _opened(self, view: View) -> tuple[FrameSource, ExitStack]:
         cycles = self.config.render.engine == "cycles"
-        most = 1 if cycles else _MOST_SOURCES
+        most = 1 if cycles else _MAX_SOURCES
         while len(self._sources) >= most:
             self._sources.pop(next(iter(self._sources)))[1].close()
         if cycles:

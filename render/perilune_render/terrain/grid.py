@@ -19,7 +19,7 @@ from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
-_MOST_RINGS = 1_000_000
+_MAX_RINGS = 1_000_000
 """Largest number of rings; even the finest ground that fits in memory has fewer."""
 FAR_GROWTH = 0.07
 """Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: ground at a
@@ -149,8 +149,8 @@ def grid_of(
         distance = np.concatenate([distance, distance[-1] + far])
         allowed = np.concatenate([allowed, allowed[-1] + FAR_GROWTH * far])
     steps = np.concatenate([[0], np.cumsum(np.diff(distance) / allowed[:-1])])
-    if not steps[-1] <= _MOST_RINGS:
-        expected = f"at most {_MOST_RINGS}: raise dataset.terrain.spacing_px or the lowest altitude"
+    if not steps[-1] <= _MAX_RINGS:
+        expected = f"at most {_MAX_RINGS}: raise dataset.terrain.spacing_px or the lowest altitude"
         raise UserError("ground", "vertices along a line", f"about {steps[-1]:.3g}", expected)
     n_rings = int(np.ceil(steps[-1]))
     return Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance), *centre_m)

@@ -12,7 +12,7 @@ from perilune_render.terrain.interpolation import corners
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
-_MOST_SAMPLES = 8
+_MAX_SAMPLES = 8
 """Largest number of points along one side of a cell; more would be needed only out of view."""
 
 
@@ -97,8 +97,8 @@ def _averaged(field, mesh, cells):
             side_x, side_y = around[ring], across[ring]
         nearest = np.searchsorted(half_widths, max(abs(px), abs(py)))
         spacing = spacings[min(nearest, len(spacings) - 1)]
-        n_x = min(max(round(side_x / spacing), 1), _MOST_SAMPLES)
-        n_y = min(max(round(side_y / spacing), 1), _MOST_SAMPLES)
+        n_x = min(max(round(side_x / spacing), 1), _MAX_SAMPLES)
+        n_y = min(max(round(side_y / spacing), 1), _MAX_SAMPLES)
         total = 0.0
         for j in range(n_y):
             for i in range(n_x):

@@ -43,7 +43,7 @@ from perilune_shared.geometry.frames import Array
 
 _ROUGHNESS_M = 100.0
 """Wavelength below which relief is added on top of the craters, metres."""
-_LEAST_RIM = 0.3
+_MIN_RIM = 0.3
 """Share of a crater's rim that must remain; below it, the crater is no longer counted."""
 
 
@@ -122,7 +122,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     wanted = config.removed_from(seed)
     uncratered = soil.copy() if wanted else soil
     stamped = _stamp(config, soil, grid, drawn, seed)
-    visible = np.flatnonzero(stamped.rim_left >= _LEAST_RIM)
+    visible = np.flatnonzero(stamped.rim_left >= _MIN_RIM)
     craters, sag = drawn.chosen(visible), stamped.sag_m[visible]
     # 3. Craters of the catalogue come first. The elevation model shows them, so nothing is stamped.
     n_real = 0

@@ -22,7 +22,7 @@ from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SUFFIXE
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE
-from perilune_shared.validation.faults import MOST_OF_COLUMN, Fault, FaultList, more_faults
+from perilune_shared.validation.faults import MAX_PER_COLUMN, Fault, FaultList, more_faults
 
 EXTRA_NAMES = frozenset(
     {
@@ -100,10 +100,10 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
         rows = rows.filter(pc.invert(pc.is_in(rows["path"], frames["path"].combine_chunks())))
         by_format = pa.array({*_named_by_format(dataset), *of_scenes["path"].to_pylist()}, pa.string())
         odd = rows["path"].filter(pc.invert(pc.is_in(rows["path"], by_format)))
-        for path in odd[:MOST_OF_COLUMN].to_pylist():
+        for path in odd[:MAX_PER_COLUMN].to_pylist():
             yield Fault.of(path, None, "file", "an unexpected file", "only files of the dataset format")
-        if len(odd) > MOST_OF_COLUMN:
-            yield more_faults("file", len(odd) - MOST_OF_COLUMN)
+        if len(odd) > MAX_PER_COLUMN:
+            yield more_faults("file", len(odd) - MAX_PER_COLUMN)
     yield from _hash_faults(dataset, rows, sizes, progress)
 
 
@@ -214,7 +214,7 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
     for path, n_bytes, sha256 in _rows_of(rows):
         if path not in sizes:
             n_missing += 1
-            if n_missing > MOST_OF_COLUMN:
+            if n_missing > MAX_PER_COLUMN:
                 continue
             yield Fault.of(path, None, _HASH, "no such file", f"the file with SHA-256 {sha256}, {_IN_INDEX}")
             continue
@@ -227,8 +227,8 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
                 yield Fault.of(path, None, _HASH, "a different SHA-256", f"SHA-256 {sha256}, {_IN_INDEX}")
         except UserError as error:
             yield Fault.of(path, None, _HASH, error.found, error.expected)
-    if n_missing > MOST_OF_COLUMN:
-        yield more_faults(_HASH, n_missing - MOST_OF_COLUMN)
+    if n_missing > MAX_PER_COLUMN:
+        yield more_faults(_HASH, n_missing - MAX_PER_COLUMN)
     progress.update(task, completed=total)
 
 

@@ -32,7 +32,7 @@ from perilune_shared.threads import usable_cores
 _FAR_M = 1e9
 BAND_PX = 0.2
 """Largest image motion between two neighbouring bands of rows, which have one pose each, pixels."""
-_LEAST_FREE_BYTES = 16_000_000
+_MIN_FREE_BYTES = 16_000_000
 _LIT = 1e-4
 """Sunlight above which a pixel counts as sunlit; in shadow, sunlight is 0 and earthshine gives less than this."""
 
@@ -167,7 +167,7 @@ class Renderer:
                 yield path
         except (UserError, RuntimeError) as error:
             # Blender reports a failed write only in its log, and the file is then missing or truncated.
-            full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
+            full = shutil.disk_usage(path.parent).free < _MIN_FREE_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, f"no frame ({error})", str(path.parent)) from None
 
 

@@ -28,7 +28,7 @@ WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
 INLINED = WITHOUT_COUNTS | {"forceinline": True}
 """Options of kernels that are compiled into their callers: a call would pass `Ground` and `Rocks` as about 70
 numbers."""
-_MOST_LEVELS = 16
+_MAX_LEVELS = 16
 _MARGIN_M = 0.01
 """Margin between the surface and the heights where rays begin and end, so that each ray crosses the ground."""
 
@@ -79,7 +79,7 @@ def surface_of(scene: Scene) -> Surface:
     rocks, tops = rocks_of(scene)
     _raise_to_ground(height, n, *tops)
     pyramids = [_levels(tops[0][None]), _levels(tops[1])]
-    starts = np.zeros((2, _MOST_LEVELS + 1), np.int64)
+    starts = np.zeros((2, _MAX_LEVELS + 1), np.int64)
     for part, levels in enumerate(pyramids):
         before = 0 if part == 0 else sum(map(len, pyramids[0]))
         starts[part, 1 : len(levels) + 1] = before + np.cumsum([0, *map(len, levels)])[:-1]
@@ -108,7 +108,7 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
     """Levels from 1 of the largest values of `tops` (sides, rows, columns), each flat."""
     levels: list[np.ndarray] = []
     level = tops
-    while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MOST_LEVELS - 1):
+    while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MAX_LEVELS - 1):
         level = _coarser(level)
         levels.append(level.ravel())
     return levels

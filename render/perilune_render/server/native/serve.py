@@ -11,7 +11,7 @@ from perilune_render.server.native import zmtp
 from perilune_render.server.native.answers import ANSWERED_BY_CONNECTIONS, answer, refusal
 from perilune_render.server.serve import Interface, answers
 
-MOST_WITHOUT_PLACE = 256
+MAX_REFUSED = 256
 """Largest number of clients connected beyond the limit, only to be told that the server is busy."""
 HEALTH = b'{"request": "health"}'
 """The health request of `perilune_shared.client`, which is also answered beyond the limit of clients."""
@@ -41,7 +41,7 @@ class Native:
 
     def interface(self, host: str, port: int) -> Interface:
         """The interface at an address."""
-        connected = replace(self.limits, clients=self.limits.clients + MOST_WITHOUT_PLACE)
+        connected = replace(self.limits, clients=self.limits.clients + MAX_REFUSED)
         made = Interface("perilune_shared.client", host, port, self._serve, zmtp.greets, connected)
         self.interfaces.append(made)
         return made

@@ -13,7 +13,7 @@ from perilune_render.server.connection import Connection, Dropped
 LARGEST_REQUEST_BYTES = 4_000_000
 """Largest size of one part of a message, bytes."""
 _LARGEST_COMMAND_BYTES = 4096
-_MOST_KEPT = 2
+_MAX_KEPT = 2
 _CHUNK_BYTES = 65_536
 _MORE, _LONG, _COMMAND = 1, 2, 4
 _SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
@@ -65,7 +65,7 @@ async def receive(connection: Connection, may_keep: Callable[[], bool]) -> Messa
         if flags & _COMMAND:
             await _obey(connection, await connection.rest(size))
             continue
-        is_wanted = len(kept) < _MOST_KEPT
+        is_wanted = len(kept) < _MAX_KEPT
         is_kept = is_wanted and (size <= _CHUNK_BYTES or may_keep())
         is_whole = is_whole and (is_kept or not is_wanted)
         if is_kept:

@@ -27,13 +27,13 @@ _UNITS = {
 }
 _LOWEST_M, _HIGHEST_M = -9_900.0, 11_500.0
 """Heights that the Moon has, above and below its mean radius, with a margin: -9.1 to 10.8 km."""
-_LEAST_RELIEF = 7e-4
+_MIN_RELIEF = 7e-4
 """Range of heights, as a share of the ground's width, below which heights without a unit may be kilometres."""
 _WIDEST_RELIEF = 25.0
 """Range of heights of the whole Moon, in kilometres, with a margin: larger ones are not kilometres."""
-_FEWEST_M = 1000.0
+_MIN_EXTENT_M = 1000.0
 """Smallest width of the ground, metres, at which heights are tested for kilometres."""
-_LEAST_PLATEAU = 4
+_MIN_PLATEAU = 4
 """Smallest number of equal values that may be fill."""
 _ISIS_SPECIAL = 3.4e38
 """Smallest absolute value of pixels without data in an ISIS cube (Null, and saturated or out of range)."""
@@ -100,7 +100,7 @@ class HeightBand:
         self._refuse_beyond(known, low, high, metres)
         self._refuse_plateau(known)
         relief = float(known.max() - known.min()) * metres
-        flat = width_m >= _FEWEST_M and 0 < relief < min(_LEAST_RELIEF * width_m, _WIDEST_RELIEF)
+        flat = width_m >= _MIN_EXTENT_M and 0 < relief < min(_MIN_RELIEF * width_m, _WIDEST_RELIEF)
         if self.metres is None and zero == 0 and flat:
             raise UserError(
                 self.path,
@@ -127,7 +127,7 @@ class HeightBand:
     def _refuse_plateau(self, known: Array) -> None:
         for value, apart in ((float(known.min()), 1), (float(known.max()), -1)):
             count = int((known == value).sum())
-            if count < _LEAST_PLATEAU or count == len(known):
+            if count < _MIN_PLATEAU or count == len(known):
                 continue
             rest = known[known != value]
             gap = float((rest * apart).min() - value * apart)

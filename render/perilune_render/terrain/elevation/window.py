@@ -20,7 +20,7 @@ UNSTATED_GROUND_M = 20_000.0
 """Side of the ground for which a large model is read if the caller does not state one, metres."""
 _AROUND = 1.25
 """Half-width of a window divided by the ground's half-width; the margin serves statistics and interpolation."""
-_LEAST_PX = 64
+_MIN_PX = 64
 """Smallest number of pixels around the ground in a window."""
 _NET = 65
 _ROUGH_PX = 0.5
@@ -53,7 +53,7 @@ def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Wind
     if rows * columns <= LARGEST_PIXELS:
         left = round(site.column - around / 2) if across else 0
         return Window(0, left, (rows, around if across else columns), 1, bool(across))
-    margin = _LEAST_PX
+    margin = _MIN_PX
     top, bottom = (int(np.clip(edge, 0, rows)) for edge in (row.min() - margin, row.max() + margin + 1))
     left, right = (int(edge) for edge in (np.floor(column.min() - margin), np.ceil(column.max() + margin)))
     if not across:
