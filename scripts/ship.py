@@ -1,4 +1,4 @@
-"""Put a trained run into the package, as the network that is installed by default; then write its card.
+"""Put a trained network into the package, as the default of its commands; then write its card.
 
     python scripts/ship.py install runs/detect/shipped --name crater-detector
     make benchmark
@@ -18,7 +18,7 @@ from typing import Annotated
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer

@@ -54,8 +54,8 @@ class ServedFrame:
     image: np.ndarray
     """Grey values, DN (h, w) uint8, or uint16 above 8 bits."""
     depth_m: np.ndarray | None
-    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not requested. With a
-    distorting lens it is in the pixels of the pinhole that covers the view."""
+    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not requested. If the lens
+    distorts, the pixels are those of an undistorted camera that covers the view."""
     normal: np.ndarray | None
     """Unit normals, O_L (h, w, 3) float32, in the same pixels; None if not requested."""
     labels: dict[str, np.ndarray] | None
@@ -144,11 +144,11 @@ class SceneClient:
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
     def health(self) -> dict[str, str]:
-        """Names and addresses (host:port) of the server's interfaces.
+        """Check that the server answers at each interface; return names and addresses (host:port).
 
-        The server has just connected to each. Raises UserError, as other requests do; the error names an interface that
-        does not answer. The reply comes after earlier requests of other clients, so it also shows that frames are
-        rendered.
+        The server connects to each interface before it replies. Raises UserError, as other requests do; the error names
+        an interface that does not answer. The reply comes after earlier requests of other clients, so it also shows
+        that frames are rendered.
         """
         head, _ = self._ask({"request": "health"})
         try:

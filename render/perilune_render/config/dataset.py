@@ -125,7 +125,7 @@ class KindConfig(Section):
     val_share: Share = 0.1
     """Share of scenes, trajectories or frames (`split_by`) in the validation split."""
     test_share: Share = 0.1
-    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 makes a test set alone."""
+    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 assigns all to it."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()

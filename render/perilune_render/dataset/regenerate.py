@@ -196,7 +196,7 @@ def _check_cameras(dataset: Dataset, rows: list[dict], rig: Rig) -> None:
     where = dataset.store.at("dataset.json")
     for row in rows:
         if row["camera"] not in rig:
-            raise UserError(where, "cameras", row["camera"], f"one of its recipe, {', '.join(map(str, rig))}")
+            raise UserError(where, "cameras", row["camera"], f"a camera of its recipe: {', '.join(map(str, rig))}")
         recorded, expected = dataset.camera_of(row), rig[row["camera"]].camera
         if recorded != expected:
             raise UserError(where, "camera", recorded, f"the camera of its recipe, {expected}")

@@ -126,7 +126,7 @@ class FrameSource:
         if the engine's camera does not cover the view of `camera`.
         """
         if not engine.camera.covers(camera):
-            raise ValueError(f"camera of the engine: got {engine.camera}, expected one that covers {camera}")
+            raise ValueError(f"camera of the engine: got {engine.camera}, expected a camera that covers {camera}")
         pattern = FixedPattern.draw(config.sensor, camera, camera_seed(config.seed, name))
         return cls(engine, camera, circles, config.sensor, pattern, config.labels)
 
@@ -194,8 +194,8 @@ class FrameSource:
 
     def with_contrast(self, labels: Labels, frame: Frame) -> Labels:
         """The labels with their contrast, computed from the frame's exposure."""
-        shown = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
-        return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, shown)
+        grey = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
+        return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, grey)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
         """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32, -1 for none."""

@@ -94,7 +94,7 @@ def measure_ranges_of_frames(
     """Simulate one range at each frame of a flight, with its random seed; the beam is along the axis of the camera."""
     true_m = range_to_ground_m(scene, flight.position_m, flight.rotation_camera_from_site[:, 2])
     sigma_m = config.range_sigma_m + config.range_sigma_share * true_m
-    # Each frame has a random stream of its own, so that parts of one trajectory in several scenes have different noise.
+    # Each frame has a separate random stream, so that parts of one trajectory in several scenes have different noise.
     noise = np.array([stream(seed, "range", index).normal() for index in frame_index])
     return Ranges(flight.time_s, true_m + sigma_m * noise)
 

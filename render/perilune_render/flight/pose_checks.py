@@ -183,7 +183,7 @@ def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> No
         poses,
         where,
         lambda n: f"a horizon {farthest[n]:.0f} m from the site, beyond the terrain's edge",
-        lambda n: f"at most {half:.0f} m: a last view of dataset.scene.views as high as the camera, and as far",
+        lambda n: f"at most {half:.0f} m; raise height_m and reach_m of the last view in dataset.scene.views",
     )
 
 

@@ -20,7 +20,7 @@ _HILL_M = 64.0
 
 
 def view_of(config: DatasetConfig, rig: Rig, kind: str) -> ViewEnvelope:
-    """The views for which the ground of a configuration is generated: those of all cameras on the body.
+    """The views of all cameras on the body, for which the ground of a configuration is generated.
 
     Raises UserError if frames of the flights of `kind` could show the horizon, or if a given scene has no views.
     """

@@ -94,7 +94,7 @@ class RayActors:
         n_fitting = sum(each // self._n_threads for each in n_cores)
         if not n_fitting:
             ray.shutdown()
-            expected = f"a machine with {self._n_threads}, as many as a process has threads (--threads)"
+            expected = f"a machine with {self._n_threads} cores, one for each thread of a process (--threads)"
             raise UserError("--executor", "Ray", f"machines with {' and '.join(map(str, n_cores))} cores", expected)
         self._n_workers = self._n_workers or n_fitting
         self._remote_job = ray.put(self._job)

@@ -174,7 +174,7 @@ def finish(job: Job, out: Store, info: DatasetInfo) -> Dataset:
     left = unfinished(job, out)
     if left:
         found = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"
-        raise UserError(out, "trajectories", found, "all rendered: run the shards that hold them again")
+        raise UserError(out, "trajectories", found, "all rendered; run their shards again")
     scenes = (
         (scene.scene_id, [trajectory.trajectory_id for trajectory in job.plan.of_scene(scene.scene_id)])
         for scene in job.plan.scenes

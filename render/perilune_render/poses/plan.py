@@ -109,19 +109,19 @@ def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: boo
     if poses.attitudes is None or (position[:, 2] <= 0).any():
         return
     stated = replace(poses.attitudes, quaternion_wxyz=poses.attitudes.quaternion_wxyz[chosen])
-    shown = _is_ground_shown(position, stated.rotation_wxyz, rig, horizon=horizon)
-    if shown.all():
+    fits = _is_ground_shown(position, stated.rotation_wxyz, rig, horizon=horizon)
+    if fits.all():
         return
     single, double = stated.alternatives()
-    for readings in (single, [] if shown.any() else double):
+    for readings in (single, [] if fits.any() else double):
         fitting = [
             what
             for what, other in readings
             if _is_ground_shown(position, other.rotation_wxyz, rig, horizon=horizon).all()
         ]
         if fitting:
-            n = int(chosen[np.argmin(shown)])
-            share = "all frames" if not shown.any() else f"{(~shown).mean():.0%} of the frames"
+            n = int(chosen[np.argmin(fits)])
+            share = "all frames" if not fits.any() else f"{(~fits).mean():.0%} of the frames"
             view, ground, sky = (
                 ("a view of the sky alone", "some ground in view", "")
                 if horizon

@@ -56,7 +56,7 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
     """The scene with only the ground of a level, and the boulders that are large enough for its mesh."""
     height, albedo = (averaged(field, scene.grid, grid) for field in (scene.height_m, scene.albedo))
     real = averaged(scene.real, scene.grid, grid) > 0.5 if scene.real.any() else np.zeros(grid.n_vertices, bool)
-    shown = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
+    is_large = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
         scene.boulders.x_m, scene.boulders.y_m
     )
     return dataclasses.replace(
@@ -65,8 +65,8 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
         height_m=height,
         albedo=albedo,
         real=real,
-        boulders=scene.boulders.chosen(shown),
-        boulder_z_m=scene.boulder_z_m[shown],
+        boulders=scene.boulders.chosen(is_large),
+        boulder_z_m=scene.boulder_z_m[is_large],
     )
 
 

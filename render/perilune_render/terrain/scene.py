@@ -148,8 +148,8 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         height -= drop_m(*grid.vertices_xy())
     # 6. Boulders and rims on the finished ground. Boulders are drawn around all craters, including removed ones.
     boulders = draw_boulders(terrain.boulders, grid, craters, seed, removed)
-    kept = np.delete(np.arange(len(craters)), removed)
-    craters, sag = craters.chosen(kept), sag[kept]
+    remaining = np.delete(np.arange(len(craters)), removed)
+    craters, sag = craters.chosen(remaining), sag[remaining]
     return Scene(
         seed,
         *_site_deg(config, model),
@@ -171,8 +171,8 @@ def _stamp(
     config: DatasetConfig, soil: _Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
 ) -> Stamped:
     """Add rays and stamp craters except the `removed` ones (indices), in place; removed craters have 0 in `Stamped`."""
-    kept = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
-    variation, stays, law = config.light.albedo_variation, craters.chosen(kept), config.terrain.craters
+    remaining = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
+    variation, stays, law = config.light.albedo_variation, craters.chosen(remaining), config.terrain.craters
     if variation > 0:
         add_rays(soil.albedo, grid, craters, RayLaw(law.n_rayed, variation), seed, removed)
     brightening = variation * brightness(stays)
@@ -180,7 +180,7 @@ def _stamp(
     if removed is None:
         return stamped
     sag, rim_left = np.zeros(len(craters)), np.zeros(len(craters))
-    sag[kept], rim_left[kept] = stamped.sag_m, stamped.rim_left
+    sag[remaining], rim_left[remaining] = stamped.sag_m, stamped.rim_left
     return Stamped(sag, rim_left)
 
 

@@ -27,7 +27,7 @@ def _describe_threads(verbose: bool) -> None:
 Verbose = Annotated[
     bool,
     typer.Option(
-        "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the variables of threads."
+        "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the thread variables."
     ),
 ]
 """Option of every program; it precedes the command: `perilune-train -v detect train`."""
@@ -140,11 +140,11 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
 
 def _folders() -> dict[str, str]:
     """Return the variable that puts Matplotlib's font list into perilune's cache; empty without a home folder."""
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
     home = Path(os.environ.get("HOME", ""))
-    if not given.is_absolute() and not (home.is_absolute() and home.is_dir()):
+    if not configured.is_absolute() and not (home.is_absolute() and home.is_dir()):
         return {}
-    cache = given if given.is_absolute() else home / ".cache"
+    cache = configured if configured.is_absolute() else home / ".cache"
     return {"MPLCONFIGDIR": str(cache / "perilune" / "matplotlib")}
 
 

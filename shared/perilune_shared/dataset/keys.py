@@ -147,11 +147,11 @@ def _checked_ids_and_keys(
 def _check_known(
     dataset: Dataset, table: str, name: str, column: pa.ChunkedArray, place_of: Mapping[str, int]
 ) -> NDArray[np.int64]:
-    found = _looked_up(column, place_of)
-    if (found < 0).any():
-        missing = column[int(np.argmin(found))].as_py()
+    numbers = _looked_up(column, place_of)
+    if (numbers < 0).any():
+        missing = column[int(np.argmin(numbers))].as_py()
         raise UserError(dataset.store, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")
-    return found
+    return numbers
 
 
 def _check_unique(dataset: Dataset, table: str, rows: pd.DataFrame) -> None:

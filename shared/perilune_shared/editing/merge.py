@@ -183,7 +183,7 @@ def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tupl
     new = []
     for row in trajectories.to_pylist():
         content = {name: value for name, value in row.items() if name not in _FREE_IN_TRAJECTORIES}
-        matching_ids = [name for found, name in known if found == content and name not in names.values()]
+        matching_ids = [name for other, name in known if other == content and name not in names.values()]
         if not matching_ids:
             matching_ids = [free_name(row["trajectory_id"], {name for _, name in known})]
             known.append((content, matching_ids[0]))

@@ -29,10 +29,10 @@ _ADDED_IN_2 = {"craters": ("origin",)}
 
 
 def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]]) -> dict[str, pa.Schema]:
-    kept = {}
+    remaining = {}
     for name, schema in tables.items():
-        kept[name] = pa.schema([field for field in schema if field.name not in added.get(name, ())])
-    return kept
+        remaining[name] = pa.schema([field for field in schema if field.name not in added.get(name, ())])
+    return remaining
 
 
 def _with_float64(schema: pa.Schema) -> pa.Schema:

@@ -66,7 +66,7 @@ def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
     if _within(open_store(out), source.store):
-        raise UserError(out, "--out", f"a folder in {source.store}", "one outside the dataset")
+        raise UserError(out, "--out", f"a folder in {source.store}", "a folder outside the dataset")
     check_files(source, progress)
     check_keys(source)
 

@@ -75,7 +75,7 @@ def look_at(position_m: ArrayLike, target_m: ArrayLike = (0.0, 0.0, 0.0)) -> Pos
     west, south, up = (target - position).tolist()
     away = math.hypot(west, south)
     if away == 0 and up == 0:
-        raise UserError("look_at", "target_m", target.tolist(), "another place than position_m")
+        raise UserError("look_at", "target_m", target.tolist(), "a point other than position_m")
     azimuth = math.atan2(-west, -south) if away else 0.0
     return Pose(position, _rotation(math.atan2(away, -up), azimuth), np.zeros(3))
 

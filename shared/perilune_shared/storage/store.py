@@ -287,10 +287,10 @@ class ObjectStore(Store):
                 self._system.pipe_file(self._key(path), content, mode="create")
             except Exception:
                 # If the answer to a first request was lost, its repetition finds the object that the first one wrote.
-                found = self.size(path)
-                if found is None:
+                size = self.size(path)
+                if size is None:
                     raise
-                if found != len(content) or self.read(path) != content:
+                if size != len(content) or self.read(path) != content:
                     raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), self.at(path)) from None
 
     def replace(self, path: str, content: bytes, *, durable: bool = True) -> None:

@@ -125,9 +125,9 @@ class FaultList:
         key = fault.file, fault.column, fault.row is None
         if key in self._first:
             return
-        found = self._n_of_column.get(fault.column, 0)
-        self._n_of_column[fault.column] = found + fault.n_faults
-        if found < MAX_PER_COLUMN and fault.n_faults == 1:
+        n_earlier = self._n_of_column.get(fault.column, 0)
+        self._n_of_column[fault.column] = n_earlier + fault.n_faults
+        if n_earlier < MAX_PER_COLUMN and fault.n_faults == 1:
             self._first[key] = fault
 
     def add_made(self, column: str, make: Callable[[], Fault]) -> None:
@@ -156,7 +156,7 @@ class FaultList:
 
 def more_faults(column: str, n_faults: int) -> Fault:
     """Return a fault that summarises the faults of a column that are not listed."""
-    return Fault("...", None, column, f"{n_faults} more faults", "none; the first ones are listed", n_faults)
+    return Fault("...", None, column, f"{n_faults} more faults", "no faults; only the first ones are listed", n_faults)
 
 
 def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:

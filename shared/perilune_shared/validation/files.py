@@ -180,7 +180,9 @@ def _cure(path: str) -> str:
     if path in EXTRA_NAMES:
         return "a file in the index; `perilune-manifest card` on the dataset adds it, or delete it"
     if path.startswith(f"{index.FOLDER}/") or TEMPORARY_FILE.fullmatch(name):
-        return "none: a stopped command left it; `perilune-manifest card` on the dataset removes it, or delete it"
+        return (
+            "no such file: a stopped command left it; `perilune-manifest card` on the dataset removes it, or delete it"
+        )
     return "only files of the dataset format (docs/reference/validation.md)"
 
 

@@ -126,7 +126,7 @@ def _labels(
         wrong = np.flatnonzero(~np.asarray(pc.equal(labels[name], expected), bool) & (frame_of >= 0))
         if len(wrong):
             row = int(wrong[0])
-            yield Fault.of(where, row, name, labels[name][row].as_py(), f"{expected[row].as_py()}, as of its frame")
+            yield Fault.of(where, row, name, labels[name][row].as_py(), f"{expected[row].as_py()}, as in its frame")
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return

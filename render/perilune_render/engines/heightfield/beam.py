@@ -1,4 +1,4 @@
-"""Where the rays of a block of pixels begin: the height above which no ray hits anything, and the mesh part below.
+"""Find where the rays of a block of pixels may begin, and the part of the mesh below.
 
 A raster of squares stores the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays
 of a block of pixels fill a pyramid. The search follows it downwards, layer by layer: as long as the ground and the

@@ -7,7 +7,7 @@ fell rapidly). Equilibrium densities are counts of craters that are still visibl
 with more wear than `_LARGEST_VISIBLE_WEAR`.
 
 Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so in order of wear a large young crater
-could come before a small old one that it has removed.
+could come before a small old crater that it has removed.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """Measure the rim crests of catalogued craters in an elevation model.
 
-A catalogue often gives the diameter at formation, or one marked by hand on an image; worn rims lie farther out. The
-crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane that
-is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
+A catalogue often gives the diameter at formation, or a diameter marked by hand on an image; worn rims lie farther out.
+The crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane
+that is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
 """
 
 from dataclasses import dataclass
@@ -120,7 +120,7 @@ def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
     """Radius of the crest in each direction (N, A), shares of the crater's radius, and whether one exists (N, A).
 
     A crest is a maximum of the profile (N, A, R) inside a range around the highest point of the median profile; a
-    maximum at the end of this range is no crest.
+    maximum at the end of this range does not count.
     """
     step = share[1] - share[0]
     around = share[np.median(height_m, axis=1).argmax(axis=1)]

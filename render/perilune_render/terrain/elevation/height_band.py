@@ -106,7 +106,7 @@ class HeightBand:
                 self.path,
                 f"{_FIELD}.height_unit",
                 f"no unit, and heights that differ by {relief:.3g} over {width_m / 1000:.3g} km",
-                "the unit of the heights, km or another: --height-unit km (m if they are metres)",
+                "--height-unit km, or m if the heights are metres",
             )
         if metres != 1:
             height *= metres
@@ -160,7 +160,7 @@ def height_band(path: Path, files: RasterFiles, raster: Any, config: ElevationCo
         raise UserError(path, "heights", "complex numbers", "real numbers")
     eight_bits = raster.dtypes[index - 1] in ("uint8", "int8")
     if eight_bits and unit is None and config.band is None and raster.scales[index - 1] == 1:
-        expected = f"heights; if these are some, --set {_FIELD}.band={index}"
+        expected = f"a band of heights; if these are heights, --set {_FIELD}.band={index}"
         raise UserError(path, "heights", "an 8-bit picture, such as a hillshade", expected)
     metres = None if unit is None else METRES_PER_UNIT[unit]
     return HeightBand(path, raster, index, metres, config.nodata, files.driver == "ISIS3")

@@ -191,7 +191,7 @@ class _Counted:
         self._length += len(text)
         self.has_space = self.has_space or " " in text or "\t" in text or not text.isascii()
         if self._length > MAX_LINE_BYTES:
-            expected = "a row of a table; is a quote without its end?"
+            expected = "a row of a table; a closing quote may be missing"
             raise UserError(f"{self._path}:{self.first_line}", "row", f"more than {MAX_LINE_BYTES} bytes", expected)
         return text
 

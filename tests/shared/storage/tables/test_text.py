@@ -86,7 +86,7 @@ REFUSED = {
     "": "{path}: columns: got no a, b; columns none, expected a, b",
     "a,b\n1,\0\n": "{path}:2: text: got a zero byte, expected a text file with measurements",
     'a,b\n1,"2\n' + "3,4\n" * 40_000: "{path}:2: row: got more than 65536 bytes, expected a row of a table; "
-    "is a quote without its end?",
+    "a closing quote may be missing",
     "a,b\n1," + "2" * 70_000: "{path}:2: line: got more than 65536 bytes, expected a row of a table",
     "a,b\n" + "1,2\n" * 1001: "{path}: rows: got more than 1000, expected at most 1000 rows of measurements",
     ",".join(f"n{n}" for n in range(1001)): "{path}:1: columns: got 1001, expected at most 1000",
