@@ -54,8 +54,8 @@ def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, obj
         **settings,
     }
     pairs = [text for key, value in chosen.items() for text in ("--set", f"{key}={value}")]
-    program, place = Path(sys.executable).with_name("perilune-render"), out / f"benchmark-{kind}-{part}"
-    command = [program, "plan", "--preset", "large", "--kind", kind, *options, *pairs, "--out", place]
+    program, folder = Path(sys.executable).with_name("perilune-render"), out / f"benchmark-{kind}-{part}"
+    command = [program, "plan", "--preset", "large", "--kind", kind, *options, *pairs, "--out", folder]
     subprocess.run(list(map(str, command)), check=True)
 
 

@@ -61,18 +61,18 @@ class Demo:
     """Folder of the runs."""
     settings: tuple[str, ...]
     """Options of all commands: preset, configuration file, single settings."""
-    of_rendering: tuple[str, ...] = ()
+    render_options: tuple[str, ...] = ()
     """Options of rendering alone: elevation model and catalogue."""
 
     def render(self, kind: str, *options: str) -> list[str]:
         """Command that renders a dataset."""
-        options = ("--kind", kind, "--out", str(self.data), *self.of_rendering, *options)
+        options = ("--kind", kind, "--out", str(self.data), *self.render_options, *options)
         return ["perilune-render", "dataset", *self.settings, *options]
 
     def train(self, *words: str, dataset: Path) -> list[str]:
         """Command that trains on a dataset, or explains."""
-        place = ["--out", str(self.runs), "--name", self.name, "--dataset", str(dataset)]
-        return ["perilune-train", *words, *self.settings, *place]
+        folders = ["--out", str(self.runs), "--name", self.name, "--dataset", str(dataset)]
+        return ["perilune-train", *words, *self.settings, *folders]
 
     def rendered(self, kind: str) -> bool:
         """Whether a dataset is complete; an interrupted one has a dataset.json too."""
@@ -144,20 +144,20 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     processes.run("train the detector", demo.train("detect", "train", dataset=demo.data / "detect"))
     installed = demo.runs / "detect" / f"{demo.name}-installed"
     if not has_metrics(installed):
-        place = ["--dataset", str(demo.data / "detect"), "--out", str(installed)]
-        processes.run("evaluate the installed detector", ["perilune-train", "detect", "evaluate", *place])
+        folders = ["--dataset", str(demo.data / "detect"), "--out", str(installed)]
+        processes.run("evaluate the installed detector", ["perilune-train", "detect", "evaluate", *folders])
     if beside is not None:
         processes.end(beside, log)
     processes.run("train the navigators", demo.train("navigate", "train", dataset=demo.data / "nav"))
     landing = demo.runs / "navigate" / f"{demo.name}-landing"
     page = landing / "monte_carlo.md"
     if not (page.is_file() and page.stat().st_size > 0):
-        place = ["--draws", str(DRAWS), "--dataset", str(demo.data / "nav"), "--out", str(landing)]
-        processes.run("land with the filter", ["perilune-train", "navigate", "monte-carlo", *place])
+        folders = ["--draws", str(DRAWS), "--dataset", str(demo.data / "nav"), "--out", str(landing)]
+        processes.run("land with the filter", ["perilune-train", "navigate", "monte-carlo", *folders])
     processes.run("explain", demo.train("explain", dataset=demo.data))
     report = demo.runs / "report" / demo.name
-    place = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
-    processes.run("report", ["perilune-train", "report", *place])
+    folders = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
+    processes.run("report", ["perilune-train", "report", *folders])
     if FIRST_STEP in processes.started_s:
         # A resumed demo has timed only some of the steps.
         figures = {"seconds": round(processes.elapsed_s, 1), "started_s": processes.started_s}
@@ -184,11 +184,13 @@ def main(
     # Check the settings of all steps before the first step runs.
     for section, (model, package) in SECTIONS.items():
         resolve(model, section, package, preset, config, changes)
-    given = {"--dem": dem, "--catalogue": catalogue}
-    of_rendering = tuple(word for name, value in given.items() if value is not None for word in (name, value))
+    elevation_options = {"--dem": dem, "--catalogue": catalogue}
+    render_options = tuple(
+        word for name, value in elevation_options.items() if value is not None for word in (name, value)
+    )
     common = ["--preset", preset, *(["--config", str(config)] if config else [])]
     common += [word for change in changes for word in ("--set", change)]
-    demo = Demo(name, data, runs, tuple(common), of_rendering)
+    demo = Demo(name, data, runs, tuple(common), render_options)
     processes = Processes()
     try:
         run_steps(demo, processes)

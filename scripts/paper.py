@@ -567,12 +567,12 @@ def _transfer(experiment: Experiment) -> list[Step]:
         return []
     start = str(experiment.darknet or experiment.runs / "detect" / "lunar-yolov3" / "checkpoints" / "best.ckpt")
     more = {"detect__init_from": start, "detect__frozen_epochs": str(min(2, experiment.sizes.epochs - 1))}
-    ap_by_share = []
+    trainings = []
     for folder, attention in (("transfer-yolov3", "none"), ("transfer-attention-yolov3", "cbam")):
         step = _detector(experiment, "headline", folder, attention, width, **more)
         needs = step.needs if experiment.darknet is not None else (*step.needs, "train lunar-yolov3")
-        ap_by_share.append(replace(step, needs=needs))
-    return ap_by_share
+        trainings.append(replace(step, needs=needs))
+    return trainings
 
 
 def _benchmark_steps(experiment: Experiment) -> list[Step]:
@@ -581,14 +581,14 @@ def _benchmark_steps(experiment: Experiment) -> list[Step]:
         return []
     command = ["scripts/render-benchmark", "detect", str(experiment.scored), str(experiment.sizes.benchmark_scenes)]
     parts = [experiment.scored / f"benchmark-detect-{part}" for part in ("highland", "mare", "camera")]
-    ap_by_share = [Step("render the benchmark", command, _rendered(*parts), renders=True)]
+    benchmark_steps = [Step("render the benchmark", command, _rendered(*parts), renders=True)]
     for folder in ("yolov3", "attention-yolov3"):
         out = experiment.runs / "benchmark" / folder
         command = [*program("perilune-train"), "detect", "benchmark", "--run", str(experiment.runs / "detect" / folder)]
         command += ["--data", str(experiment.scored), "--out", str(out)]
         done = (out / "benchmark.json").is_file
-        ap_by_share.append(Step(f"benchmark {folder}", command, done, (f"train {folder}", "render the benchmark")))
-    return ap_by_share
+        benchmark_steps.append(Step(f"benchmark {folder}", command, done, (f"train {folder}", "render the benchmark")))
+    return benchmark_steps
 
 
 def _page(experiment: Experiment) -> Step:

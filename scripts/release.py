@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[1]
 VERSION = re.compile(r"\d+\.\d+\.\d+((a|b|rc)\d+)?")
 PLACES = {
     "*/perilune*/__init__.py": r'^__version__ = "(?P<version>[^"]+)"',
-    "*/pyproject.toml": r'"perilune(-\w+)?(\[[\w,]+\])?==(?P<version>[^"]+)"|^version = "(?P<own>[^"]+)"',
+    "*/pyproject.toml": r'"perilune(-\w+)?(\[[\w,]+\])?==(?P<version>[^"]+)"|^version = "(?P<package_version>[^"]+)"',
     "CITATION.cff": r"^version: (?P<version>\S+)$",
 }
 """Pattern of the version in each file. A pyproject.toml states the version or takes it from the package."""
@@ -104,7 +104,7 @@ def write_version(version: str, root: Path = ROOT) -> list[Path]:
         written = text
         # Replace from the end, so that the positions of earlier matches stay valid.
         for match in reversed(_matches(path, pattern)):
-            group = "own" if match.groupdict().get("own") else "version"
+            group = "package_version" if match.groupdict().get("package_version") else "version"
             written = written[: match.start(group)] + version + written[match.end(group) :]
         if written != text:
             write_text(path, written)

@@ -160,7 +160,7 @@ def dataset(
         warn_of_suns(resolved, kinds)
         for name in kinds:
             try:
-                finished = _made(Job.planned(resolved, name, preset), store.sub(name), options, early)
+                finished = _run_job(Job.planned(resolved, name, preset), store.sub(name), options, early)
             except RenderingFailed as error:
                 _print_failures(error)
                 failed = True
@@ -184,7 +184,7 @@ def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.Abst
     return early_worker(config.render.engine)
 
 
-def _made(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
+def _run_job(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
     """Estimate, render or finish; return a finished dataset. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
@@ -212,7 +212,7 @@ def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker
     from perilune_render.jobs.run import RenderingFailed
 
     try:
-        return _made(job, out, options, early)
+        return _run_job(job, out, options, early)
     except RenderingFailed as error:
         _print_failures(error)
         raise typer.Exit(1) from None

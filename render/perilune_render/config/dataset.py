@@ -30,7 +30,7 @@ MAX_TRAJECTORIES, MAX_FRAMES = 200_000, 10_000_000
 """Largest numbers of trajectories and frames of a dataset; all trajectories are planned before the first frame."""
 MAX_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
-_MIN_LIMIT = 3.0
+_MIN_LIMIT_SIGMAS = 3.0
 """Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis; about half of all draws
 stay below it."""
 
@@ -67,11 +67,11 @@ class FlightConfig(Section):
 
     @model_validator(mode="after")
     def _limit_can_be_kept(self) -> "FlightConfig":
-        least = _MIN_LIMIT * 3**0.5 * self.position_sigma_m / self.correlation_time_s**2
+        least = _MIN_LIMIT_SIGMAS * 3**0.5 * self.position_sigma_m / self.correlation_time_s**2
         if self.max_perturbation_mps2 is not None and self.max_perturbation_mps2 < least:
             raise ValueError(
-                f"max_perturbation_mps2 at least {least:.3g}, {_MIN_LIMIT:g} standard deviations of the acceleration "
-                f"on each axis, sqrt(3) position_sigma_m / correlation_time_s^2"
+                f"max_perturbation_mps2 at least {least:.3g}, {_MIN_LIMIT_SIGMAS:g} standard deviations of the "
+                f"acceleration on each axis, sqrt(3) position_sigma_m / correlation_time_s^2"
             )
         return self
 

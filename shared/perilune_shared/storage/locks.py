@@ -59,12 +59,12 @@ def remove_temporary_files(folder: Path) -> None:
 @contextlib.contextmanager
 def lock(path: Path, folder: Path) -> Iterator[None]:
     """Hold the lock file `path`, which protects `folder`. Raises UserError if another process holds it."""
-    held, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
+    file_lock, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
         try:
             # An interrupt within `acquire` would leave the lock file behind.
             with interrupts_held():
-                held.acquire(timeout=0)
+                file_lock.acquire(timeout=0)
         except Timeout:
             raise _locked_error(folder, _read(record), "a free folder: wait until that process ends") from None
         seconds_left = _seconds_left(record)
@@ -75,12 +75,12 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
         with unfinished(path, record), _recorded(record):
             yield
     finally:
-        if held.is_locked:
+        if file_lock.is_locked:
             # Remove the file before releasing the lock: later it may be the lock of another process.
             if not held_elsewhere:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
-            held.release()
+            file_lock.release()
 
 
 def _seconds_left(record: Path) -> float:
