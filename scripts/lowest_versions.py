@@ -9,9 +9,10 @@ _BOUND = re.compile(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?>=([0-9.]+)")
 
 
 def lowest(project: Path) -> dict[str, str]:
-    """Name and lowest version of each dependency of a project. Raises ValueError if one has no lower bound.
+    """Name and lowest version of each dependency of a project.
 
-    Build requirements are left out: torch itself requires a newer setuptools than the build.
+    Raises ValueError if one has no lower bound. Build requirements are left out: torch itself requires a newer
+    setuptools than the build.
     """
     content = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
     versions = {}

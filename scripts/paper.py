@@ -1,4 +1,6 @@
-"""The paper's experiment: render, train, evaluate, explain, and write its page. Run again to resume (`make paper`).
+"""The paper's experiment: render, train, evaluate, explain, and write its page.
+
+Run again to resume (`make paper`).
 
     python scripts/paper.py [--preset paper] [--part whole|gpu|full] [--ground pangu|lunar] [--attitude]
 

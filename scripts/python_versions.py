@@ -1,4 +1,6 @@
-"""Write the requirements for a Python version, and check what pip resolved. Used by scripts/test-resolves.
+"""Write the requirements for a Python version, and check what pip resolved.
+
+Used by scripts/test-resolves.
 
     python scripts/python_versions.py write 3.13 FOLDER    # requirements.txt of all packages, constraints.txt of pins
     python scripts/python_versions.py check 3.13 FOLDER    # report.json of pip

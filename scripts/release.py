@@ -213,7 +213,10 @@ def try_installed(version: str, wheels: list[Path]) -> None:
 
 
 def run(*command: str, cwd: str | Path = ROOT, **variables: str) -> None:
-    """Run a command of the release. The sources of this checkout are not on its path. Raises UserError if it fails."""
+    """Run a command of the release.
+
+    The sources of this checkout are not on its path. Raises UserError if it fails.
+    """
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | variables
     print(f"$ {' '.join(Path(word).name if word == command[0] else word for word in command)[:150]}", flush=True)
     code = subprocess.run(command, cwd=cwd, env=environment).returncode

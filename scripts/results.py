@@ -184,7 +184,10 @@ def record_name(file: Path) -> str:
 
 
 def _record_of(file: Path) -> Record:
-    """The record of a file. Raises UserError if it does not record how it was made, or was made by uncommitted code."""
+    """The record of a file.
+
+    Raises UserError if it does not record how it was made, or was made by uncommitted code.
+    """
     try:
         figures = json.loads(file.read_text(encoding="utf-8"))
         # Benchmarks write a table `run`, runs write keys that begin with run/.

@@ -50,7 +50,10 @@ def install(
     name: Name,
     eight_bits: Annotated[bool, typer.Option("--eight-bits", help="Store 8 bits per weight.")] = False,
 ) -> None:
-    """Write weights, configuration and metrics of a run into the package; a card of an earlier network is removed."""
+    """Write weights, configuration and metrics of a run into the package.
+
+    A card of an earlier network is removed.
+    """
     folder, source = _folder(name), RunFolder(run)
     content, metrics = load_weights(source.best), read_metrics(run)
     folder.mkdir(parents=True, exist_ok=True)

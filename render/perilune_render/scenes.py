@@ -200,7 +200,10 @@ class Scene:
 
 
 def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
-    """The settings of a terrain, a preset, a file of settings or an elevation model. Raises UserError otherwise."""
+    """The settings of a terrain, a preset, a file of settings or an elevation model.
+
+    Raises UserError otherwise.
+    """
     name, path = str(source), Path(source)
     preset, file, settings_of_name, dem = _BASE, None, TERRAINS.get(name, ()), None
     if name in PRESETS:

@@ -1,4 +1,6 @@
-"""A client of `perilune-render serve`: frames at any pose, as arrays. Needs the extra `client` (ZeroMQ).
+"""A client of `perilune-render serve`: frames at any pose, as arrays.
+
+Needs the extra `client` (ZeroMQ).
 
     from perilune_shared.client import SceneClient
 
@@ -233,7 +235,10 @@ class SceneClient:
             time.sleep(_POLL_S)
 
     def _ask_until_answered(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Send a request, repeatedly while the server is busy; returns the head of the reply and its arrays by name."""
+        """Send a request, repeatedly while the server is busy.
+
+        Returns the head of the reply and its arrays by name.
+        """
         end = time.monotonic() + self._timeout_ms / 1000
         while True:
             head, arrays = self._ask_once(request)

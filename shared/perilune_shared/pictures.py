@@ -20,7 +20,9 @@ _ANGLES = np.linspace(0, 2 * np.pi, 65)
 
 
 def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, int, int]] | None = None) -> "Image":
-    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits; `colours` has N colours, by default all cyan.
+    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits.
+
+    `colours` has N colours, by default all cyan.
 
     An ellipse has the columns of labels: centre x and y, semi-axes a and b, pixels, and the direction of a,
     radians. A 16-bit image is scaled so that its largest value is white.

@@ -17,9 +17,9 @@ _OUTLINE = (230, 190, 60)
 def real_ground_share(
     scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth_m: np.ndarray
 ) -> float:
-    """Share of a frame's ground pixels that show known ground of the elevation model; 0 without ground pixels.
+    """Share of a frame's ground pixels that show known ground of the elevation model.
 
-    depth_m (h, w) is along the camera's axis, infinite where no ground is hit.
+    Returns 0 without ground pixels. depth_m (h, w) is along the camera's axis, infinite where no ground is hit.
     """
     hit = np.isfinite(depth_m)
     if not hit.any() or not scene.real.any():

@@ -129,7 +129,10 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory; `files` holds each frame's file and measurement columns."""
+    """Part of the table `frames` for one trajectory.
+
+    `files` holds each frame's file and measurement columns.
+    """
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],

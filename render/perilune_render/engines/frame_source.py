@@ -27,7 +27,10 @@ from perilune_shared.geometry.rolling_shutter import Moving
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Pose, velocity and random seed of one frame. The pose refers to the middle of the exposure of the middle row."""
+    """Pose, velocity and random seed of one frame.
+
+    The pose refers to the middle of the exposure of the middle row.
+    """
 
     position_m: Array
     """Position of the camera, O_L, metres (3,)."""
@@ -166,7 +169,10 @@ class FrameSource:
         return RowPoses(sensor_rows(self.camera, self.engine.camera), times_s, lambda t: shot.pose_at(time_s + t))
 
     def places_m(self, frame: Frame) -> Array:
-        """Points (h, w, 3), O_L, metres, that the engine's camera sees, each from the pose of its row; NaN for sky."""
+        """Points (h, w, 3), O_L, metres, that the engine's camera sees, each from the pose of its row.
+
+        Returns NaN for sky.
+        """
         shot, camera, depth_m = frame.shot, self.engine.camera, frame.radiance.depth_m.astype(np.float64)
         depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan)[..., None]
         rays = camera.rays(camera.pixel_centres())

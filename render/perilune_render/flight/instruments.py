@@ -91,7 +91,10 @@ def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, dura
 def measure_ranges_of_frames(
     flight: Flight, frame_index: Sequence[int], scene: Scene, config: InstrumentsConfig, seed: int
 ) -> Ranges:
-    """Simulate one range at each frame of a flight, with its random seed; the beam is along the axis of the camera."""
+    """Simulate one range at each frame of a flight, with its random seed.
+
+    The beam is along the axis of the camera.
+    """
     true_m = range_to_ground_m(scene, flight.position_m, flight.rotation_camera_from_site[:, 2])
     sigma_m = config.range_sigma_m + config.range_sigma_share * true_m
     # Each frame has a separate random stream, so that parts of one trajectory in several scenes have different noise.

@@ -194,7 +194,10 @@ def _check_not_only_sky(poses: Poses, camera: Camera, matrices: Array, where: ob
 
 
 def ground_in_view(position_m: Array, matrices: Array, camera: Camera) -> np.ndarray:
-    """Whether each view (N,) shows ground, curved as the Moon; `matrices` are rotation_camera_from_site (N, 3, 3)."""
+    """Whether each view (N,) shows ground, curved as the Moon.
+
+    `matrices` are rotation_camera_from_site (N, 3, 3).
+    """
     share = (np.arange(2 * _POINTS_PER_SIDE) + 0.5) / (2 * _POINTS_PER_SIDE)
     u, v = share * camera.width_px, share * camera.height_px
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)

@@ -48,9 +48,10 @@ def local_exr(store: Store, path: str) -> Iterator[Path]:
 
 
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
-    """Channels (h, w) by name. Raises UserError if the file is missing, damaged or not of `size_px` (width, height).
+    """Channels (h, w) by name.
 
-    A small file may decompress to any size, so the header is checked before the pixels are read.
+    Raises UserError if the file is missing, damaged or not of `size_px` (width, height). A small file may decompress to
+    any size, so the header is checked before the pixels are read.
     """
     if not path.is_file():
         raise UserError(path, "exr", "no such file", "an EXR frame")

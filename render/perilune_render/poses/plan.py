@@ -56,10 +56,10 @@ def views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ..
 
 
 def horizon_views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
-    """Views with horizon that contain all poses, rounded to three digits; the last view is at the highest pose.
+    """Views with horizon that contain all poses, rounded to three digits.
 
-    The ground is taken to be at most a tenth of a camera's height above the plane z = 0. Raises UserError for a pose
-    that is not above the plane, or higher than HIGHEST_M.
+    The last view is at the highest pose. The ground is taken to be at most a tenth of a camera's height above the plane
+    z = 0. Raises UserError for a pose that is not above the plane, or higher than HIGHEST_M.
     """
     places = []
     for name, mounted in rig.items():
@@ -146,7 +146,10 @@ def _is_ground_shown(position_m: Array, rotation_wxyz: Array, rig: Rig, *, horiz
 
 
 def _corner_rays(camera: Camera, matrices: Array) -> Array:
-    """Rays (N, 4, 3), O_L, through the corners of the image; `matrices` are rotation_camera_from_site (N, 3, 3)."""
+    """Rays (N, 4, 3), O_L, through the corners of the image.
+
+    `matrices` are rotation_camera_from_site (N, 3, 3).
+    """
     corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
     return np.einsum("nji,sj->nsi", matrices, corners)
 
@@ -254,9 +257,10 @@ def _origin(poses: GivenPoses, rows: np.ndarray, index: int) -> str:
 
 
 def _flight(poses: GivenPoses, rows: np.ndarray, whole: np.ndarray) -> Flight:
-    """The flight through the poses `rows` of a trajectory; the first pose of the trajectory's poses `whole` has time 0.
+    """The flight through the poses `rows` of a trajectory.
 
-    The nominal trajectory is a straight line from the first to the last pose of the whole trajectory.
+    The first pose of the trajectory's poses `whole` has time 0. The nominal trajectory is a straight line from the
+    first to the last pose of the whole trajectory.
     """
     first, last = whole[0], whole[-1]
     duration = float(poses.time_s[last] - poses.time_s[first])

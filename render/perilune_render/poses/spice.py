@@ -185,7 +185,10 @@ def _read(
 
 
 def _angular_velocity_radps(spice: Any, fixed: str, camera_frame: str, et: float, axes: Array) -> Array | None:
-    """Angular velocity (3,) of a camera's axes relative to the fixed frame, in the camera's axes; None without data."""
+    """Angular velocity (3,) of a camera's axes relative to the fixed frame, in the camera's axes.
+
+    Returns None without data.
+    """
     try:
         rotation, turn = spice.xf2rav(spice.sxform(fixed, camera_frame, et))
     except spice.exceptions.SpiceyError:

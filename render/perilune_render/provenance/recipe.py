@@ -23,7 +23,10 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """The recipe of a dataset. With `planned`, the recipe of a plan, with only the versions that affect the ground."""
+    """The recipe of a dataset.
+
+    With `planned`, it is the recipe of a plan, with only the versions that affect the ground.
+    """
     with_dem = config.terrain.dem is not None
     versions = (
         ground_versions(with_dem=with_dem)

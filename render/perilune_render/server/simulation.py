@@ -99,7 +99,10 @@ class SimulatedScene:
         velocity_mps: Array | None = None,
         angular_velocity_radps: Array | None = None,
     ) -> Frame:
-        """Render and develop a frame. Raises UserError like `check_view`, and above LARGEST_MPS or LARGEST_RADPS."""
+        """Render and develop a frame.
+
+        Raises UserError like `check_view`, and above LARGEST_MPS or LARGEST_RADPS.
+        """
         self.check_view(view)
         velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
         turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")

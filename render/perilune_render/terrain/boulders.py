@@ -195,7 +195,10 @@ def largest_height_m(boulders: Boulders) -> float:
 
 
 def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_m: Array) -> Array:
-    """Heights (M,) of the highest boulder at positions (M,), O_L, metres; -inf without one. See `boulder_mesh`."""
+    """Heights (M,) of the highest boulder at positions (M,), O_L, metres; -inf without one.
+
+    See `boulder_mesh`.
+    """
     tops = np.full(len(x_m), -np.inf)
     widest = _FARTHEST * boulders.diameter_m.max(initial=0.0)
     if not len(x_m) or not len(boulders):

@@ -87,7 +87,10 @@ class Grid:
         return self.spacing_at(np.maximum(np.abs(x_m - self.centre_x_m), np.abs(y_m - self.centre_y_m)))
 
     def half_width_for(self, spacing_m: float) -> float:
-        """Half side, metres, of the square in which the spacing is at most `spacing_m`; 0 if no such square exists."""
+        """Half side, metres, of the square in which the spacing is at most `spacing_m`.
+
+        Returns 0 if no such square exists.
+        """
         fine = self.spacings_m <= spacing_m * (1 + 1e-9)
         return float(self.half_widths_m[fine].max()) if fine.any() else 0.0
 
@@ -165,11 +168,11 @@ def _put(lines, row, start, step, vertices, ring):
 
 @njit()
 def lines_in(window, n_half, half_widths, lines):
-    """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns the number of lines.
+    """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7).
 
-    `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the grid's centre. A line holds
-    x and y of its first vertex, the steps in x and y, the index of the first vertex, the number of vertices, and the
-    ring (0 is the inner square).
+    Returns the number of lines. `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the
+    grid's centre. A line holds x and y of its first vertex, the steps in x and y, the index of the first vertex, the
+    number of vertices, and the ring (0 is the inner square).
     """
     x_low, x_high, y_low, y_high = window
     count = 0

@@ -170,7 +170,10 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
 def _stamp(
     config: DatasetConfig, soil: _Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
 ) -> Stamped:
-    """Add rays and stamp craters except the `removed` ones (indices), in place; removed craters have 0 in `Stamped`."""
+    """Add rays and stamp craters except the `removed` ones (indices), in place.
+
+    Removed craters have 0 in `Stamped`.
+    """
     remaining = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
     variation, stays, law = config.light.albedo_variation, craters.chosen(remaining), config.terrain.craters
     if variation > 0:
@@ -190,9 +193,9 @@ def _at_site(height_m: Array, grid: Grid) -> Array:
 
 
 def check_ground(config: DatasetConfig, view: ViewEnvelope) -> Grid:
-    """Check grid, relief and input files before the ground is generated; return the grid. Raises UserError.
+    """Check grid, relief and input files before the ground is generated; return the grid.
 
-    Prints remarks on the elevation model.
+    Raises UserError. Prints remarks on the elevation model.
     """
     grid = checked_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)

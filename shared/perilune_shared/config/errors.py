@@ -126,7 +126,10 @@ def _contains(content: Any, location: list[str]) -> bool:
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
-    """Return the names of the settings at a location below `model`; empty if there is no section at the location."""
+    """Return the names of the settings at a location below `model`.
+
+    The result is empty if there is no section at the location.
+    """
     annotation: Any = model
     for key in location:
         section = next(iter(_sections_in(annotation)), None)

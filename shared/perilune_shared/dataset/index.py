@@ -94,7 +94,9 @@ def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
 
 
 def seal(store: Store, info: DatasetInfo, rows: pa.Table) -> DatasetInfo:
-    """Write the index, then dataset.json with it, then delete other indexes; return the content of dataset.json.
+    """Write the index, then dataset.json with it, then delete other indexes.
+
+    Returns the content of dataset.json.
 
     If the dataset has an index already and the files in it are unchanged, the dataset matches its index at every
     moment.

@@ -45,9 +45,9 @@ SCENE_FILE_KINDS: tuple[SceneFileKind, ...] = get_args(SceneFileKind)
 
 
 def frame_path(frame_id: str, kind: ImageKind) -> str:
-    """Return the path of a frame's file relative to the dataset, as written by this version; readers use the manifest.
+    """Return the path of a frame's file relative to the dataset, as written by this version.
 
-    The columns png_path, exr_path and lidar_path of other datasets may contain other paths.
+    Readers use the manifest. The columns png_path, exr_path and lidar_path of other datasets may contain other paths.
     """
     return f"frames/{frame_id}{SUFFIXES[kind]}"
 

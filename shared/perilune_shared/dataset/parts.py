@@ -65,7 +65,10 @@ class WrittenFile:
 
 
 def parquet_files(store: Store, folder: str) -> list[str]:
-    """Return the paths of the Parquet files directly in a folder, sorted by name; hidden files are omitted."""
+    """Return the paths of the Parquet files directly in a folder, sorted by name.
+
+    Hidden files are omitted.
+    """
     if store.folder is not None:
         local = store.folder / folder
         names = [entry.name for entry in os.scandir(local)] if local.is_dir() else []

@@ -89,7 +89,10 @@ def _checked_scene(source: Dataset, scenes: pa.Table, rehash: bool) -> pa.Table:
 
 
 def _file(source: Dataset, row: dict, kind: str, rehash: bool) -> dict[str, str | int | None]:
-    """Return path, bytes and sha256 of a row's file; None for a missing file. Raises UserError on a mismatch."""
+    """Return path, bytes and sha256 of a row's file; None for a missing file.
+
+    Raises UserError on a mismatch.
+    """
     path = row[f"{kind}_path"]
     size = source.store.size(path) if path is not None else None
     if size is None:

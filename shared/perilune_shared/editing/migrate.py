@@ -46,10 +46,11 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2, "3": _TABLE
 
 
 def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
-    """Convert a dataset of an older schema version to the current one; frames are copied, or hard-linked with `link`.
+    """Convert a dataset of an older schema version to the current one.
 
-    Versions 1 and 2 did not record the contrast of labels, so it becomes null. Raises UserError if the dataset has the
-    current version already, is damaged or incomplete, or has packed frames.
+    Frames are copied, or hard-linked with `link`. Versions 1 and 2 did not record the contrast of labels, so it becomes
+    null. Raises UserError if the dataset has the current version already, is damaged or incomplete, or has packed
+    frames.
     """
     store = open_store(address)
     content, path = read_object(store), store.at(INFO_NAME)

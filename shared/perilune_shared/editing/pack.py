@@ -1,4 +1,7 @@
-"""Pack a dataset into shards that can be streamed, and unpack it. A shard has frames with pose, image and labels."""
+"""Pack a dataset into shards that can be streamed, and unpack it.
+
+A shard has frames with pose, image and labels.
+"""
 
 from collections.abc import Iterator, Sequence
 
@@ -67,7 +70,10 @@ def pack(
 
 
 def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: list[list[int]]) -> Iterator[int]:
-    """Write the shards of one split with row groups of the given sizes; yield the size of each row group written."""
+    """Write the shards of one split with row groups of the given sizes.
+
+    Yields the size of each row group written.
+    """
     groups = _groups(source, split, [size for shard in shards for size in shard])
     for number, shard in enumerate(shards):
         text = [field.name for field in SHARDS if pa.types.is_string(field.type)]
@@ -115,7 +121,10 @@ def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Ta
 
 
 def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield frames and labels of each trajectory of a split; frames are in order and refer to no files but PNGs."""
+    """Yield frames and labels of each trajectory of a split.
+
+    Frames are in order and refer to no files but PNGs.
+    """
     columns = ["scene_id", "trajectory_id", "split"]
     for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
         if row["split"] in (split, None):

@@ -34,9 +34,9 @@ class Rewriting:
 
 
 def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progress = NO_PROGRESS) -> None:
-    """Change the scenes of `source` and write them into `out`; scenes and labels without frames are omitted.
+    """Change the scenes of `source` and write them into `out`.
 
-    The caller must have checked the source (`check_source`).
+    Scenes and labels without frames are omitted. The caller must have checked the source (`check_source`).
     """
     images = rewriting.images
     info = rewriting.info.model_copy(update={"images": state_of([source], images)})

@@ -112,7 +112,10 @@ class DatasetWriter:
         self._index.append(index_rows([WrittenFile.of(path, content)]))
 
     def finish(self, out: Address) -> None:
-        """Write buffered rows, the index, then dataset.json. Raises UserError about `out` if there are no frames."""
+        """Write buffered rows, the index, then dataset.json.
+
+        Raises UserError about `out` if there are no frames.
+        """
         counts = self._tables.counts
         if not counts.frames:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")

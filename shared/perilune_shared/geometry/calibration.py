@@ -157,7 +157,10 @@ def _coefficients(path: Path, content: dict[str, Any]) -> list[float]:
 def _camera(
     path: Path, size: Sequence[float], intrinsics: Sequence[float], model: str, coefficients: list[float]
 ) -> Camera:
-    """Return a pinhole camera with distortion; an unnamed distortion model follows from the number of coefficients."""
+    """Return a pinhole camera with distortion.
+
+    An unnamed distortion model follows from the number of coefficients.
+    """
     width, height = (int(value) for value in size)
     if [width, height] != list(size) or not 1 <= min(size) <= max(size) <= _LARGEST_SIDE_PX:
         raise UserError(path, "image size", list(size), f"two whole numbers from 1 to {_LARGEST_SIDE_PX}")
@@ -227,7 +230,10 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
 
 
 def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:
-    """Return finite numbers from a list, a list of lists or a mapping with `data`; raise UserError on others."""
+    """Return finite numbers from a list, a list of lists or a mapping with `data`.
+
+    Raises UserError on others.
+    """
     if isinstance(value, dict):
         value = value.get("data")
     flat: list[object] = []

@@ -81,7 +81,10 @@ def rotation_vectors(rotation: ArrayLike) -> Array:
 
 
 def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
-    """Return the unit vector (3,) in O_L towards the Sun; azimuth clockwise from north, so 90 degrees is east."""
+    """Return the unit vector (3,) in O_L towards the Sun.
+
+    The azimuth is clockwise from north, so 90 degrees is east.
+    """
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     east, north = np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation)
     return np.array([-east, -north, np.sin(elevation)])

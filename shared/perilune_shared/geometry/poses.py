@@ -89,11 +89,11 @@ def descent(
     azimuth_deg: float = 0.0,
     duration_s: float = 65.0,
 ) -> list[Pose]:
-    """Return poses along a parabola to a point above the site, with their velocities; the camera looks straight down.
+    """Return poses along a parabola to a point above the site, with their velocities.
 
-    Trajectory and attitude are the nominal ones of datasets, without perturbations (`NominalTrajectory.parabola`), so
-    south is up in the images. The trajectory starts `downrange_m` from the site, in the direction `azimuth_deg`. Frames
-    are evenly spaced in time. Raises UserError on values out of range.
+    The camera looks straight down. Trajectory and attitude are the nominal ones of datasets, without perturbations
+    (`NominalTrajectory.parabola`), so south is up in the images. The trajectory starts `downrange_m` from the site, in
+    the direction `azimuth_deg`. Frames are evenly spaced in time. Raises UserError on values out of range.
 
         poses = descent(n_frames=20, start_altitude_m=1000)
     """

@@ -1,4 +1,7 @@
-"""Check the sizes in the footer of a Parquet file, before anything is decompressed. The footer is untrusted."""
+"""Check the sizes in the footer of a Parquet file, before anything is decompressed.
+
+The footer is untrusted.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

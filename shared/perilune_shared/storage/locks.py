@@ -50,7 +50,10 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove temporary files of killed writers at any depth. Call it only if no other process writes in the folder."""
+    """Remove temporary files of killed writers at any depth.
+
+    Call it only if no other process writes in the folder.
+    """
     for root, _, names in os.walk(folder):
         for name in filter(TEMPORARY_FILE.fullmatch, names):
             Path(root, name).unlink(missing_ok=True)
@@ -84,9 +87,10 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
 
 
 def _seconds_left(record: Path) -> float:
-    """Return the seconds until the record of a process on another machine expires; 0 if there is no such record.
+    """Return the seconds until the record of a process on another machine expires.
 
-    A record from this machine is ignored: since the lock was free, that process has ended.
+    Returns 0 if there is no such record. A record from this machine is ignored: since the lock was free, that process
+    has ended.
     """
     holder = _read(record)
     if holder is None or holder.get("boot_id") == _boot_id():

@@ -243,7 +243,10 @@ def _vrt_files(path: Path, head: bytes, field: str, tiles: Sequence[str]) -> Ras
 
 
 def _beside(path: Path, name: str, field: str) -> Path | None:
-    """Return the file that a label names, in the folder of the label, ignoring letter case; None if it is missing."""
+    """Return the file that a label names, in the folder of the label, ignoring letter case.
+
+    Returns None if it is missing.
+    """
     folder = path.resolve().parent
     beside = path.parent / name
     if not beside.exists():

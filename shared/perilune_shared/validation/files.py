@@ -187,9 +187,9 @@ def _cure(path: str) -> str:
 
 
 def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]:
-    """Compare path, size and hash in the index with the table frames or scenes; yield the first difference of each.
+    """Compare path, size and hash in the index with the table frames or scenes.
 
-    These faults name the index folder as their file.
+    Yields the first difference of each. These faults name the index folder as their file.
     """
     rows_in_index = pc.index_in(named["path"], rows["path"].combine_chunks())
     if rows_in_index.null_count:

@@ -214,10 +214,10 @@ def _vectors(column: pa.ChunkedArray) -> Array:
 
 
 def measurement_faults(table: str, rows: pa.Table, trajectory: dict) -> Iterator[Fault]:
-    """Yield the faults of a trajectory's rows of `inertial` or `ranges`; `trajectory` is the row of the trajectory.
+    """Yield the faults of a trajectory's rows of `inertial` or `ranges`.
 
-    For each grade, times must increase and lie between 0 and the duration of the trajectory. The intervals of inertial
-    measurements must follow each other without gaps.
+    `trajectory` is the row of the trajectory. For each grade, times must increase and lie between 0 and the duration of
+    the trajectory. The intervals of inertial measurements must follow each other without gaps.
     """
     where, key = f"manifest/{table}", f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
     grades = rows["grade"].unique().to_pylist() if "grade" in rows.column_names else [None]

@@ -42,11 +42,11 @@ _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 
 
 class Renderer:
-    """Renders frames of one scene. Use as a context manager: it holds a temporary folder and Blender's only scene.
+    """Renders frames of one scene.
 
-    If the ground is too large for one mesh, a frame shows the level (`perilune_render.terrain.levels`) of its
-    trajectory that is made for the height of the camera. Blender holds the mesh of one level at a time, so render
-    frames in an order with few changes of level.
+    Use as a context manager: it holds a temporary folder and Blender's only scene. If the ground is too large for one
+    mesh, a frame shows the level (`perilune_render.terrain.levels`) of its trajectory that is made for the height of
+    the camera. Blender holds the mesh of one level at a time, so render frames in an order with few changes of level.
 
     It is an `Engine` of `perilune_render.engines.frame_source`: `camera` has no distortion, `sun` (3,) is the unit
     vector towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only
@@ -103,7 +103,10 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Remove the temporary folder and release Blender for another Renderer. `render` then raises RuntimeError."""
+        """Remove the temporary folder and release Blender for another Renderer.
+
+        `render` then raises RuntimeError.
+        """
         self._folder.cleanup()
         _open.discard(self)
 

@@ -106,10 +106,10 @@ def _highest(tops, x0, x1, y0, y1):
 
 @njit(**WITHOUT_COUNTS)
 def begin_m(tops, ground, origin, basis, rectangle):
-    """Height at which the rays through a rectangle of the image may begin, metres; inf if not all rays fall.
+    """Height at which the rays through a rectangle of the image may begin, metres.
 
-    The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above this height no ray through the
-    rectangle (u0, u1, v0, v1), pixels, hits anything.
+    Returns inf if not all rays fall. The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above
+    this height no ray through the rectangle (u0, u1, v0, v1), pixels, hits anything.
     """
     u0, u1, v0, v1 = rectangle
     x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf

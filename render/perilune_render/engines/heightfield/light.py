@@ -45,7 +45,10 @@ class _Factors(NamedTuple):
 
 
 def _factors(p: HapkeParameters) -> _Factors:
-    """The constants of a parameter set. Each is computed in double precision and rounded once, as NumPy does."""
+    """The constants of a parameter set.
+
+    Each is computed in double precision and rounded once, as NumPy does.
+    """
     slope, chi, gamma = slope_of(p.theta_bar_deg), chi_of(p.theta_bar_deg), float(np.sqrt(1 - p.w))
     scale = (1 - p.b**2) / 2
     values = (

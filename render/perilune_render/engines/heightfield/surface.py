@@ -34,7 +34,10 @@ _MARGIN_M = 0.01
 
 
 class Ground(NamedTuple):
-    """Arrays of the ground, as an argument of compiled functions; few arrays, since each is passed as eight numbers."""
+    """Arrays of the ground, as an argument of compiled functions.
+
+    There are few arrays, since each is passed as eight numbers.
+    """
 
     half_widths_m: Array
     """Half-widths of the inner square and the rings, ascending, metres (R + 1,)."""
@@ -116,7 +119,10 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
 
 @njit()
 def _coarser(tops):
-    """The largest values in blocks of 2 x 2 of `tops` (sides, rows, columns); blocks at an odd end are smaller."""
+    """The largest values in blocks of 2 x 2 of `tops` (sides, rows, columns).
+
+    Blocks at an odd end are smaller.
+    """
     n_sides, n_rows, n_columns = tops.shape
     coarse = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
     for side in range(n_sides):

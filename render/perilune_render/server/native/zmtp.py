@@ -34,7 +34,10 @@ class Message(NamedTuple):
 
 
 async def greet(connection: Connection) -> None:
-    """Exchange greetings and the types of the sockets. Raises Dropped for a client that does not speak ZMTP 3."""
+    """Exchange greetings and the types of the sockets.
+
+    Raises Dropped for a client that does not speak ZMTP 3.
+    """
     signature = await connection.hello(1)
     if signature != _SIGNATURE[:1]:
         raise Dropped("not a client of ZeroMQ 4")

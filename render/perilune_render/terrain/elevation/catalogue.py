@@ -1,4 +1,7 @@
-"""Craters of a real elevation model, read from a catalogue; they become labels, as generated craters do."""
+"""Craters of a real elevation model, read from a catalogue.
+
+They become labels, as generated craters do.
+"""
 
 import functools
 from dataclasses import dataclass, replace

@@ -81,11 +81,11 @@ class HeightBand:
         return height
 
     def in_metres(self, height: Array, width_m: float) -> Array:
-        """Convert heights or radii (rows, columns) to metres of height, in place; the ground is `width_m` wide.
+        """Convert heights or radii (rows, columns) to metres of height, in place.
 
-        Raises UserError if they cannot be heights on the Moon: if values are beyond the Moon's highest and lowest
-        points, if many are equal and far from the rest (undeclared fill), or if the ground is too flat for metres and
-        no unit is stated.
+        The ground is `width_m` wide. Raises UserError if they cannot be heights on the Moon: if values are beyond the
+        Moon's highest and lowest points, if many are equal and far from the rest (undeclared fill), or if the ground is
+        too flat for metres and no unit is stated.
         """
         height[np.isinf(height)] = np.nan
         known = height[np.isfinite(height)]
@@ -195,7 +195,10 @@ def _index_of(path: Path, raster: Any, config: ElevationConfig) -> int:
 
 
 def _unit_of(path: Path, files: RasterFiles, raster: Any, index: int) -> str | None:
-    """The unit of heights that a file states: in the band, in a label, or as vertical unit; None if it states none."""
+    """The unit of heights that a file states: in the band, in a label, or as vertical unit.
+
+    Returns None if it states none.
+    """
     stated = [raster.units[index - 1] or ""]
     if files.driver == "PDS":
         label = label_text(files)

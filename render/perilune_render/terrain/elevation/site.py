@@ -136,7 +136,10 @@ def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
 
 
 def circle_of(crs: rasterio.crs.CRS) -> float | None:
-    """Width of 360 degrees in a system's coordinates; None unless meridians are vertical lines at even distances."""
+    """Width of 360 degrees in a system's coordinates.
+
+    Returns None unless meridians are vertical lines at even distances.
+    """
     import rasterio.warp
 
     if crs.is_geographic:

@@ -44,7 +44,10 @@ class Window:
 
 
 def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Window:
-    """The part of a raster to read for square ground of a side around a site, metres; None reads a usual size."""
+    """The part of a raster to read for square ground of a side around a site, metres.
+
+    None reads a part of a usual size.
+    """
     rows, columns = raster.shape
     net = np.linspace(-0.5, 0.5, 9) * (UNSTATED_GROUND_M if ground_m is None else ground_m) * _AROUND
     column, row = _places_about(raster, site, *np.meshgrid(net, net))

@@ -89,7 +89,10 @@ class TextTable:
             yield line, words
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read the given columns; columns that the table lacks are omitted. Raises UserError on an invalid value."""
+        """Read the given columns; columns that the table lacks are omitted.
+
+        Raises UserError on an invalid value.
+        """
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
@@ -163,7 +166,10 @@ class TextTable:
         return names
 
     def _names_in_comment(self, n_columns: int) -> list[str] | None:
-        """Return the names in the last comment if there are `n_columns` of them; 0 accepts any number above one."""
+        """Return the names in the last comment if there are `n_columns` of them.
+
+        0 accepts any number above one.
+        """
         for comment in reversed(self.comments[-1:]):
             names = (
                 comment.split() if self.separator == " " else [word.strip() for word in comment.split(self.separator)]
