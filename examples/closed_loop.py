@@ -199,7 +199,7 @@ def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: i
 
 
 def draw(path: Path, flown: dict[str, Flight]) -> None:
-    """Draw the paths of both flights and the errors of their estimates; below, frames with the detected craters."""
+    """Draw paths and estimation errors of both flights, and below them frames with the detected craters."""
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     (side, top, error), below = figure.subplots(2, 3)
     for (name, flight), colour in zip(flown.items(), ("tab:blue", "tab:orange"), strict=True):

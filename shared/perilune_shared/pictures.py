@@ -55,7 +55,7 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
 
 
 def display(picture: "Image") -> None:
-    """Display a picture in the notebook that runs this process; without one, open it in the system's viewer."""
+    """Display a picture in the notebook that runs this process, or else in the system's viewer."""
     if "ipykernel" in sys.modules:
         from IPython.display import display as show_in_notebook
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _PORT = 10363
 _NATIVE_PORT = 10364
 _LOOPBACK = "127.0.0.1"
-_LOOPBACK = (_LOOPBACK, "::1", "localhost")
+_LOCAL_HOSTS = (_LOOPBACK, "::1", "localhost")
 """Loopback addresses, which only this machine can reach."""
 _Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
 
@@ -106,7 +106,7 @@ def serve(
             "the rest see docs/reference/pangu.md"
         )
         say(f"perilune_shared.client at {native_address(host, native_interface.port)}")
-        if host not in _LOOPBACK:
+        if host not in _LOCAL_HOSTS:
             say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
         server.run()
 

@@ -30,7 +30,7 @@ def real_ground_share(
 
 
 def outline_m(model: ElevationModel) -> Array:
-    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres; points off the map omitted."""
+    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres, without points off the map."""
     rows, columns = model.height_m.shape
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns

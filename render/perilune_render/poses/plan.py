@@ -100,9 +100,10 @@ def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tu
 
 
 def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: bool) -> None:
-    """Raise UserError if attitudes miss the ground and another interpretation shows it in all frames; name that one.
+    """Raise UserError if attitudes miss the ground and another interpretation shows it in all frames.
 
-    Checks up to _N_CHECKED poses. Other poses that miss the ground are rejected later.
+    The error names that interpretation. Checks up to _N_CHECKED poses; other poses that miss the ground are rejected
+    later.
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _N_CHECKED)).round().astype(int))
     position = poses.position_m[chosen]

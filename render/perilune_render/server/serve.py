@@ -248,7 +248,7 @@ class Server:
         return True
 
     async def _refuse(self, interface: Interface, connection: Connection) -> None:
-        """Let the interface tell a client that the limit is reached; with too many such clients, close at once."""
+        """Tell a client that the limit is reached, or close the connection if there are too many such clients."""
         self._say(f"{connection.name}: refused, {interface.limits.clients} clients are connected")
         if interface.n_extra >= interface.limits.clients:
             connection.writer.transport.abort()

@@ -216,7 +216,7 @@ def lines_in(window, n_half, half_widths, lines):
 
 @njit()
 def place_in_ring(x, y, n_half):
-    """Position along the square ring through (x, y), counted in vertices from the corner at -x, -y; fractional."""
+    """Fractional position along the square ring through (x, y), in vertices from the corner at -x, -y."""
     distance = max(abs(x), abs(y))
     if y <= -distance:
         side, along = 0, x

@@ -104,7 +104,7 @@ def user_error_of(
 
 
 def got_of(fault: ErrorDetails) -> str:
-    """Return the wrong value; if several settings contradict each other, only those that the message names."""
+    """Return the wrong value, or the contradictory settings that the message names."""
     if fault["type"] == "missing":
         return "nothing"
     value = fault["input"]

@@ -1,4 +1,4 @@
-"""Names that datasets and command lines use: kinds, splits, states of images; ids and paths of frames and parts.
+"""Names that datasets and command lines share: kinds, splits, image states, ids and paths.
 
 This module imports neither pandas nor pyarrow, so that configurations and `--help` load without them.
 """

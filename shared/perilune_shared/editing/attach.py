@@ -21,7 +21,7 @@ def attach(
     *,
     link: bool = False,
 ) -> None:
-    """Write a dataset from a manifest without frames and the frames in `frames_root`, whose paths the manifest states.
+    """Write a dataset from a manifest without frames and its frames in the folder `frames_root`.
 
     Frames are copied, or hard-linked with `link`. Every PNG must match the hash in the manifest. With `rehash` the
     hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. The

@@ -1,4 +1,4 @@
-"""Write a new dataset atomically, scene by scene; used by merge, subset, split and the other editing commands.
+"""Write a new dataset atomically, scene by scene, for all editing commands.
 
 The row counts, the number of frames and split of each trajectory, and the split unit are recomputed from the rows.
 """

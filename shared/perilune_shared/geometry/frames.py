@@ -68,7 +68,8 @@ def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
 
 
 def rotation_vectors(rotation: ArrayLike) -> Array:
-    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3); angles well below 180 degrees.
+    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3), for angles well below 180
+    degrees.
 
     The angle is computed from sine and cosine; the arc cosine alone is inexact for small angles.
     """
