@@ -51,8 +51,8 @@ GATE_M, GATE_MPS = np.array([0.0, 0.0, 150.0]), np.array([0.0, 0.0, -3.0])
 DURATION_S, STEP_S, FRAME_S = 60.0, 0.02, 1.0
 PRIOR_M, PRIOR_MPS, PRIOR_DEG = 60.0, 0.5, 0.5
 """Standard deviations of the initial estimate, on each axis."""
-MOST_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
-SHOWN_S = (0.0, 30.0, 60.0)
+MAX_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
+DRAWN_S = (0.0, 30.0, 60.0)
 """Times of the frames in the picture."""
 LAST_S = 4.0
 """Remaining time below which guidance keeps its last command, since the law divides by the remaining time."""
@@ -77,7 +77,7 @@ class Flight:
     true_m: list[Array] = field(default_factory=list)
     estimated_m: list[Array] = field(default_factory=list)
     matched: list[int] = field(default_factory=list)
-    shown: list[DrawnFrame] = field(default_factory=list)
+    drawn: list[DrawnFrame] = field(default_factory=list)
     """Frames for the picture."""
 
     @property
@@ -118,7 +118,7 @@ def guidance(position_m: Array, velocity_mps: Array, left_s: float) -> Array:
     to_go = GATE_M - position_m - velocity_mps * left_s
     faster = GATE_MPS - velocity_mps
     thrust = 6 * to_go / left_s**2 - 2 * faster / left_s - gravity
-    return thrust * min(1.0, MOST_THRUST_MPS2 / float(np.linalg.norm(thrust)))
+    return thrust * min(1.0, MAX_THRUST_MPS2 / float(np.linalg.norm(thrust)))
 
 
 def sway(time_s: float) -> Array:
@@ -172,10 +172,10 @@ def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: i
             lander.range(position[2] - ground + RANGE_NOISE_M * rng.normal())
             located = None
             if camera is not None:
-                sightings, shown = camera.look(position, sway(time_s), velocity)
+                sightings, drawn = camera.look(position, sway(time_s), velocity)
                 located = lander.sightings(sightings)
-                if time_s in SHOWN_S:
-                    flight.shown.append(shown)
+                if time_s in DRAWN_S:
+                    flight.drawn.append(drawn)
             flight.true_m.append(position.copy())
             flight.estimated_m.append(lander.state.position_m.copy())
             flight.matched.append(len(located.fix.crater) if located else 0)
@@ -199,7 +199,7 @@ def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: i
 
 
 def draw(path: Path, flown: dict[str, Flight]) -> None:
-    """Draw the paths of both flights and the errors of their estimates; below, frames with the detected craters."""
+    """Draw paths and estimation errors of both flights, and below them frames with the detected craters."""
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     (side, top, error), below = figure.subplots(2, 3)
     for (name, flight), colour in zip(flown.items(), ("tab:blue", "tab:orange"), strict=True):
@@ -216,11 +216,11 @@ def draw(path: Path, flown: dict[str, Flight]) -> None:
     side.legend()
     for axes in (side, top, error):
         axes.grid(alpha=0.3)
-    for axes, shown in zip(below, flown["with camera"].shown, strict=True):
-        axes.imshow(shown.image, cmap="gray")
-        for left, upper, right, lower in shown.boxes:
+    for axes, drawn in zip(below, flown["with camera"].drawn, strict=True):
+        axes.imshow(drawn.image, cmap="gray")
+        for left, upper, right, lower in drawn.boxes:
             axes.add_patch(Rectangle((left, upper), right - left, lower - upper, fill=False, edgecolor="tab:cyan"))
-        axes.set(title=f"frame at {shown.height_m:.0f} m, {len(shown.boxes)} detections", xticks=[], yticks=[])
+        axes.set(title=f"frame at {drawn.height_m:.0f} m, {len(drawn.boxes)} detections", xticks=[], yticks=[])
     figure.savefig(path, dpi=90)
 
 
@@ -229,8 +229,8 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", type=Path, default=Path("runs/closed-loop"))
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     say("starting the server")
     flown = {}
     with server() as address, SceneClient(address) as scene:
@@ -243,18 +243,18 @@ def main() -> None:
         )
         exact = Catalogue(places, normals, craters["diameter_m"][large] / 2, 0.0, 0.0)
         for name, camera in (("with camera", CraterCamera(scene)), ("without camera", None)):
-            rng = np.random.default_rng([given.seed, 1])
+            rng = np.random.default_rng([arguments.seed, 1])
             catalogue = with_errors(exact, CatalogueErrors(), rng)
-            flown[name] = fly(scene, lander_of(scene, catalogue, rng), camera, given.seed)
+            flown[name] = fly(scene, lander_of(scene, catalogue, rng), camera, arguments.seed)
     figures = {
         name: {"miss_m": flight.miss_m, "error_at_the_end_m": float(flight.errors_m[-1])}
         for name, flight in flown.items()
     }
-    (given.out / "closed_loop.json").write_text(json.dumps(figures, indent=2) + "\n")
-    draw(given.out / "closed_loop.png", flown)
+    (arguments.out / "closed_loop.json").write_text(json.dumps(figures, indent=2) + "\n")
+    draw(arguments.out / "closed_loop.png", flown)
     for name, flight in flown.items():
         say(f"{name}: misses the gate by {flight.miss_m:.1f} m; error of the estimate {flight.errors_m[-1]:.1f} m")
-    say(f"look at {given.out / 'closed_loop.png'}")
+    say(f"look at {arguments.out / 'closed_loop.png'}")
 
 
 if __name__ == "__main__":

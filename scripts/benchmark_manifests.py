@@ -4,7 +4,7 @@
 
 Nine scenes of highland and nine of mare ground, two scenes with another camera, and one scene on each of two elevation
 models (NPB_1km.tif and NPC_2km.tif of the repository nasa-jpl/lunasynth), for detection and for navigation. All frames
-are test frames. Names, and with them all seeds, are those of no preset.
+are test frames. No preset has the same name, so no preset has the same seeds.
 """
 
 import subprocess
@@ -15,7 +15,7 @@ from typing import Annotated
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer
@@ -46,7 +46,7 @@ ELEVATION_MODELS = {"npb": "NPB_1km.tif", "npc": "NPC_2km.tif"}
 
 
 def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, object], *options: str) -> None:
-    """Plan one manifest; `settings` are in addition to those above, by their whole names."""
+    """Plan one manifest with additional `settings`, given by their full names."""
     chosen = {
         "dataset.name": f"benchmark-{part}",
         f"dataset.{kind}.n_scenes": n_scenes,
@@ -54,8 +54,8 @@ def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, obj
         **settings,
     }
     pairs = [text for key, value in chosen.items() for text in ("--set", f"{key}={value}")]
-    program, place = Path(sys.executable).with_name("perilune-render"), out / f"benchmark-{kind}-{part}"
-    command = [program, "plan", "--preset", "large", "--kind", kind, *options, *pairs, "--out", place]
+    program, folder = Path(sys.executable).with_name("perilune-render"), out / f"benchmark-{kind}-{part}"
+    command = [program, "plan", "--preset", "large", "--kind", kind, *options, *pairs, "--out", folder]
     subprocess.run(list(map(str, command)), check=True)
 
 

@@ -1,7 +1,7 @@
 """All steps of `make demo`: frames, detection, navigation, explanation, report.
 
 Navigation frames are rendered beside the training of the detector; their progress is in <data>/nav.log. Run the same
-command again to resume. Ctrl-C stops both sides, and both keep what is finished.
+command again to resume. Ctrl-C stops both; finished work is kept.
 
     python scripts/demo.py --preset demo --name demo --data data/demo --runs runs --set dataset.seed=7
 """
@@ -19,7 +19,7 @@ from typing import Annotated
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer
@@ -61,18 +61,18 @@ class Demo:
     """Folder of the runs."""
     settings: tuple[str, ...]
     """Options of all commands: preset, configuration file, single settings."""
-    of_rendering: tuple[str, ...] = ()
+    render_options: tuple[str, ...] = ()
     """Options of rendering alone: elevation model and catalogue."""
 
     def render(self, kind: str, *options: str) -> list[str]:
         """Command that renders a dataset."""
-        options = ("--kind", kind, "--out", str(self.data), *self.of_rendering, *options)
+        options = ("--kind", kind, "--out", str(self.data), *self.render_options, *options)
         return ["perilune-render", "dataset", *self.settings, *options]
 
     def train(self, *words: str, dataset: Path) -> list[str]:
         """Command that trains on a dataset, or explains."""
-        place = ["--out", str(self.runs), "--name", self.name, "--dataset", str(dataset)]
-        return ["perilune-train", *words, *self.settings, *place]
+        folders = ["--out", str(self.runs), "--name", self.name, "--dataset", str(dataset)]
+        return ["perilune-train", *words, *self.settings, *folders]
 
     def rendered(self, kind: str) -> bool:
         """Whether a dataset is complete; an interrupted one has a dataset.json too."""
@@ -81,7 +81,7 @@ class Demo:
 
 
 class Processes:
-    """Commands of the demo. Each has a process group of its own, so that Ctrl-C reaches it once, through this class."""
+    """Commands of the demo, each in a separate process group, so that Ctrl-C reaches it once, through this class."""
 
     def __init__(self) -> None:
         self._running: list[subprocess.Popen] = []
@@ -99,7 +99,7 @@ class Processes:
         self.end(self.start(title, command))
 
     def start(self, title: str, command: list[str], log: Path | None = None) -> subprocess.Popen:
-        """Start a command; `log` takes what it prints."""
+        """Start a command; its output goes to the file `log`, if given."""
         self.started_s[title] = round(self.elapsed_s, 1)
         print(f"{title}, after {self.elapsed_s / 60:.1f} minutes" + (f"; progress in {log}" if log else ""), flush=True)
         program = [str(BIN / command[0]), *command[1:]]
@@ -144,22 +144,22 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     processes.run("train the detector", demo.train("detect", "train", dataset=demo.data / "detect"))
     installed = demo.runs / "detect" / f"{demo.name}-installed"
     if not has_metrics(installed):
-        place = ["--dataset", str(demo.data / "detect"), "--out", str(installed)]
-        processes.run("evaluate the installed detector", ["perilune-train", "detect", "evaluate", *place])
+        folders = ["--dataset", str(demo.data / "detect"), "--out", str(installed)]
+        processes.run("evaluate the installed detector", ["perilune-train", "detect", "evaluate", *folders])
     if beside is not None:
         processes.end(beside, log)
     processes.run("train the navigators", demo.train("navigate", "train", dataset=demo.data / "nav"))
     landing = demo.runs / "navigate" / f"{demo.name}-landing"
     page = landing / "monte_carlo.md"
     if not (page.is_file() and page.stat().st_size > 0):
-        place = ["--draws", str(DRAWS), "--dataset", str(demo.data / "nav"), "--out", str(landing)]
-        processes.run("land with the filter", ["perilune-train", "navigate", "monte-carlo", *place])
+        folders = ["--draws", str(DRAWS), "--dataset", str(demo.data / "nav"), "--out", str(landing)]
+        processes.run("land with the filter", ["perilune-train", "navigate", "monte-carlo", *folders])
     processes.run("explain", demo.train("explain", dataset=demo.data))
     report = demo.runs / "report" / demo.name
-    place = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
-    processes.run("report", ["perilune-train", "report", *place])
+    folders = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
+    processes.run("report", ["perilune-train", "report", *folders])
     if FIRST_STEP in processes.started_s:
-        # A resumed demo has timed only a part of the steps.
+        # A resumed demo has timed only some of the steps.
         figures = {"seconds": round(processes.elapsed_s, 1), "started_s": processes.started_s}
         write_text(report / "demo.json", json.dumps({**figures, "run": asdict(run_record())}, indent=2) + "\n")
     print(f"after {processes.elapsed_s / 60:.1f} minutes", flush=True)
@@ -181,14 +181,16 @@ def main(
         if folder.exists() and not folder.is_dir():
             raise UserError(folder, "folder", "a file", "a folder, or nothing")
     changes = tuple(settings or ())
-    # A mistake in the last step's settings is found before the first step.
+    # Check the settings of all steps before the first step runs.
     for section, (model, package) in SECTIONS.items():
         resolve(model, section, package, preset, config, changes)
-    given = {"--dem": dem, "--catalogue": catalogue}
-    of_rendering = tuple(word for name, value in given.items() if value is not None for word in (name, value))
+    elevation_options = {"--dem": dem, "--catalogue": catalogue}
+    render_options = tuple(
+        word for name, value in elevation_options.items() if value is not None for word in (name, value)
+    )
     common = ["--preset", preset, *(["--config", str(config)] if config else [])]
     common += [word for change in changes for word in ("--set", change)]
-    demo = Demo(name, data, runs, tuple(common), of_rendering)
+    demo = Demo(name, data, runs, tuple(common), render_options)
     processes = Processes()
     try:
         run_steps(demo, processes)
@@ -200,5 +202,5 @@ def main(
 
 
 if __name__ == "__main__":
-    # Longer than for the commands that it starts, which print how to resume.
+    # Wait longer than the commands that it starts do: they print how to resume.
     run_command_line(lambda: typer.run(main), ended_after_s=2.5)

@@ -9,7 +9,7 @@ from pathlib import Path
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import cv2
@@ -34,7 +34,7 @@ def main(folder: Path, frame_id: str) -> None:
         bounds = raster.bounds
     image = cv2.imread(str(dataset.file(row["png_path"])), cv2.IMREAD_UNCHANGED)
     lidar = read_exr(dataset.file(row["lidar_path"]))["range"]
-    # The camera's x axis points west: turned by 180 degrees, north is up as in the map.
+    # The camera's x axis points west; turn the picture by 180 degrees, so that north is up as in the map.
     image, lidar = image[::-1, ::-1], lidar[::-1, ::-1]
     figure, axes = plt.subplots(1, 6, figsize=(24, 4.2), layout="constrained")
     height_m = row["position_m"][2]

@@ -6,7 +6,7 @@ from pathlib import Path
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import perilune_render.provenance.processor  # noqa: F401, I001 - before NumPy

@@ -10,7 +10,7 @@ from pathlib import Path
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import cv2
@@ -122,9 +122,9 @@ def main() -> None:
     write_row(out / "suns.jpg", frames, [f"600 m, Sun {s:.0f} deg" for s in suns])
     frames, captions = [], []
     for region in ("mare", "highland"):
-        own = settings(config_file=Path("configs") / f"{region}.yaml")
-        grown = cached_scene(own, view_envelope(camera_of(own.camera), flight), SEED)
-        frames += nadir_frames(own, grown, [(1200.0, 25.0), (300.0, 25.0)])
+        region_config = settings(config_file=Path("configs") / f"{region}.yaml")
+        grown = cached_scene(region_config, view_envelope(camera_of(region_config.camera), flight), SEED)
+        frames += nadir_frames(region_config, grown, [(1200.0, 25.0), (300.0, 25.0)])
         captions += [f"{region}, 1200 m", f"{region}, 300 m"]
     write_row(out / "regions.jpg", frames, captions)
     if arguments.dem is not None:
@@ -135,9 +135,9 @@ def main() -> None:
             "dataset.terrain.relief.rms_slope_deg={low: 0.0, high: 0.0}",
         )
         for name, changes in (("the model alone", bare), ("with generated detail", ())):
-            own = settings(f"dataset.terrain.dem={arguments.dem}", *changes)
-            grown = cached_scene(own, view_envelope(camera_of(own.camera), flight), SEED)
-            frames += nadir_frames(own, grown, [(1000.0, 15.0), (250.0, 15.0)], (-150.0, 200.0))
+            dem_config = settings(f"dataset.terrain.dem={arguments.dem}", *changes)
+            grown = cached_scene(dem_config, view_envelope(camera_of(dem_config.camera), flight), SEED)
+            frames += nadir_frames(dem_config, grown, [(1000.0, 15.0), (250.0, 15.0)], (-150.0, 200.0))
             captions += [f"{name}, 1000 m", f"{name}, 250 m"]
         write_row(out / "elevation.jpg", frames, captions)
 

@@ -9,19 +9,20 @@ _BOUND = re.compile(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?>=([0-9.]+)")
 
 
 def lowest(project: Path) -> dict[str, str]:
-    """Name and lowest version of each dependency of a project. Raises ValueError if one has no lower bound.
+    """Name and lowest version of each dependency of a project.
 
-    Build requirements are left out: torch itself requires a newer setuptools than the build.
+    Raises ValueError if one has no lower bound. Build requirements are left out: torch itself requires a newer
+    setuptools than the build.
     """
     content = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
-    found = {}
+    versions = {}
     for requirement in content["project"]["dependencies"]:
-        bound = _BOUND.match(requirement)
-        if bound is not None:
-            found[bound[1].lower()] = bound[2]
+        match = _BOUND.match(requirement)
+        if match is not None:
+            versions[match[1].lower()] = match[2]
         elif not requirement.startswith("perilune-"):
             raise ValueError(f"{project.name}/pyproject.toml: {requirement}: no lower bound")
-    return found
+    return versions
 
 
 def main() -> None:

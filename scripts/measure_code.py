@@ -14,12 +14,12 @@ PACKAGES = {"perilune_shared": "shared", "perilune_render": "render", "perilune_
 
 def modules_in(root: Path) -> dict[str, Path]:
     """Dotted name and path of every module of the three packages under `root`."""
-    found = {}
+    modules = {}
     for package, folder in PACKAGES.items():
         for path in sorted((root / folder / package).rglob("*.py")):
             parts = path.relative_to(root / folder).with_suffix("").parts
-            found[".".join(parts).removesuffix(".__init__")] = path
-    return found
+            modules[".".join(parts).removesuffix(".__init__")] = path
+    return modules
 
 
 def import_depth(modules: dict[str, Path], package: str) -> int:

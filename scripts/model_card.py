@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Shipment:
-    """Inputs of a card."""
+    """The network, figures and notes that a card shows."""
 
     name: str
     """crater-detector or lander-navigator."""
@@ -30,20 +30,20 @@ class Shipment:
     """Caveats of this network or of its benchmark, one line for each."""
 
 
-def model_card(one: Shipment) -> str:
+def model_card(shipment: Shipment) -> str:
     """The card as Markdown."""
-    lines = _detector(one) if one.name == "crater-detector" else _navigator(one)
-    return "\n".join([f"# {one.name}", "", *lines, *[f"- {note}" for note in one.notes], ""])
+    lines = _detector(shipment) if shipment.name == "crater-detector" else _navigator(shipment)
+    return "\n".join([f"# {shipment.name}", "", *lines, *[f"- {note}" for note in shipment.notes], ""])
 
 
-def _facts(one: Shipment, network: str, threshold: str | None) -> list[str]:
-    commit = str(one.metrics.get("run/commit", "unknown"))[:7]
-    data = f"manifest `{one.manifest}`, SHA-256 of dataset.json {one.sha256[:16]}; rendered frames only"
+def _facts(shipment: Shipment, network: str, threshold: str | None) -> list[str]:
+    commit = str(shipment.metrics.get("run/commit", "unknown"))[:7]
+    data = f"manifest `{shipment.manifest}`, SHA-256 of dataset.json {shipment.sha256[:16]}; rendered frames only"
     rows = {
         "Network": network,
-        "Weights": f"{one.size_mb:.1f} MB, {one.precision}, safetensors",
+        "Weights": f"{shipment.size_mb:.1f} MB, {shipment.precision}, safetensors",
         "Training data": data,
-        "Trained at": f"commit {commit}, {one.metrics.get('run/hardware', 'unknown hardware')}",
+        "Trained at": f"commit {commit}, {shipment.metrics.get('run/hardware', 'unknown hardware')}",
         "Threshold": threshold,
         "Licence": "Apache-2.0",
     }
@@ -58,8 +58,8 @@ def _figure(figures: dict[str, Any], key: str) -> str:
     return f"{value:.3f}{limits}"
 
 
-def _detector(one: Shipment) -> list[str]:
-    figures, shape = one.figures, one.content["architecture"]
+def _detector(shipment: Shipment) -> list[str]:
+    figures, shape = shipment.figures, shipment.content["architecture"]
     network = (
         f"attention-YOLOv3, width {shape['width']:g}, {shape['in_channels']} channel, attention "
         f"`{shape['attention']}`, strides {' '.join(map(str, shape['strides']))}"
@@ -81,7 +81,7 @@ def _detector(one: Shipment) -> list[str]:
         "This detector finds lunar craters in camera images taken from above. `perilune-train detect predict` uses it "
         "if `--run` is not given.",
         "",
-        *_facts(one, network, f"{figures.get('threshold', 0):.3f}, chosen on validation scenes"),
+        *_facts(shipment, network, f"{figures.get('threshold', 0):.3f}, chosen on validation scenes"),
         "",
         "## Locked benchmark",
         "",
@@ -110,22 +110,22 @@ def _detector(one: Shipment) -> list[str]:
         "- It finds craters with a radius of about 2 to 80 pixels. Reduce the size of images with larger craters "
         "(`--scale`).",
         "- The training data has no views far from straight down.",
-        *_seeds(one),
+        *_seeds(shipment),
     ]
 
 
-def _seeds(one: Shipment) -> list[str]:
+def _seeds(shipment: Shipment) -> list[str]:
     """Lines with the AP of training runs with other random seeds, the smallest AP first."""
-    if not one.others:
+    if not shipment.others:
         return ["- The figures are of one training run."]
     scoring_rules = {"paper/strict/": "labels `paper`, strict", "visible/edge/": "labels `visible`, edge"}
-    found = []
+    figures_by_rule = []
     for prefix, title in scoring_rules.items():
-        values = sorted(other[f"{prefix}ap50_paper"] for other in one.others)
-        found.append(f"{', '.join(f'{value:.3f}' for value in values)} ({title})")
-    count = len(one.others)
+        values = sorted(other[f"{prefix}ap50_paper"] for other in shipment.others)
+        figures_by_rule.append(f"{', '.join(f'{value:.3f}' for value in values)} ({title})")
+    count = len(shipment.others)
     runs = "a run with another random seed" if count == 1 else f"{count} runs with other random seeds"
-    return [f"- The figures are of one training run. The AP of {runs}: {' and '.join(found)}."]
+    return [f"- The figures are of one training run. The AP of {runs}: {' and '.join(figures_by_rule)}."]
 
 
 def _bin_title(key: str) -> str:
@@ -134,8 +134,8 @@ def _bin_title(key: str) -> str:
     return f"{kind} {low}-{high} {unit}"
 
 
-def _navigator(one: Shipment) -> list[str]:
-    figures, shape = one.figures, one.content["architecture"]
+def _navigator(shipment: Shipment) -> list[str]:
+    figures, shape = shipment.figures, shipment.content["architecture"]
     method = str(figures["headline/method"])
     network = (
         f"Darknet53-LSTM, fusion `{method}`, width {shape['width']:g}, attention `{shape['attention']}`, frames of "
@@ -159,7 +159,7 @@ def _navigator(one: Shipment) -> list[str]:
         "This network estimates the motion of a camera between two frames of a landing, from the frames and the "
         "nominal motion. `perilune-train navigate evaluate` and `benchmark` use it if `--run` is not given.",
         "",
-        *_facts(one, network, None),
+        *_facts(shipment, network, None),
         "",
         "## Locked benchmark",
         "",

@@ -1,9 +1,11 @@
-"""The paper's experiment: render, train, evaluate, explain, and write its page. Run again to resume (`make paper`).
+"""The paper's experiment: render, train, evaluate, explain, and write its page.
+
+Run again to resume (`make paper`).
 
     python scripts/paper.py [--preset paper] [--part whole|gpu|full] [--ground pangu|lunar] [--attitude]
 
-Every step is one of the commands that a user has, printed before it runs. A finished step is left unchanged. Part `gpu`
-renders frames while networks train on finished datasets. With `--minutes`, the page shows what is done by then.
+Every step is a command that users can run, and is printed before it runs. Finished steps are skipped. Part `gpu`
+renders frames while networks train on finished datasets. With `--minutes`, the page shows the steps finished by then.
 """
 
 import itertools
@@ -25,7 +27,7 @@ from typing import Annotated, Any
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer
@@ -44,17 +46,17 @@ PROTOCOL = Path("configs/paper_protocol.yaml")
 ATTITUDE_DEG = 1.0
 """Standard deviation of the attitude per axis in the datasets with attitude noise."""
 CALIBRATED_AP = DETECTION["YOLOv3"]["ap50_paper"]
-"""Validation AP of YOLOv3 without attention on the headline ground: the paper's."""
+"""Validation AP of YOLOv3 without attention for which the headline ground is chosen: the paper's AP."""
 SPARSE, LUNAR = "0.1", "lunar"
-"""The two ends of the curve: a tenth of the equilibrium density, and our usual ground."""
+"""The ends of the curve of AP over crater density: a tenth of the equilibrium density, and perilune's usual ground."""
 RENDER_CORE_S = 0.12
-"""Core-seconds of a frame of 256 px with the engine heightfield, scene included."""
+"""Core-seconds to render a frame of 256 px with the engine heightfield, including the generation of the scene."""
 FRAME_BYTES = 75_000
-"""Bytes of a frame with its labels, roughly."""
+"""Approximate size of a frame with its labels, bytes."""
 
 
 class Part(StrEnum):
-    """How much of the experiment is made, and on what."""
+    """Part of the experiment, chosen for a machine: two cores, a GPU, or all frames of the paper."""
 
     WHOLE = "whole"
     GPU = "gpu"
@@ -79,14 +81,14 @@ class Sizes:
     nav_trajectories: int
     """Navigation trajectories."""
     curve: tuple[str, ...]
-    """Shares of the equilibrium density of the grounds between the sparse and our usual one."""
+    """Crater densities of the grounds between the ends of the curve, shares of the equilibrium density."""
     epochs: int
     """Epochs of each detector on the headline ground and on the curve."""
     long_epochs: int
-    """Epochs on the sparse and on our usual ground. If there are more than `epochs`, two detectors on the headline
-    ground train as long, to show what epochs change."""
+    """Epochs on the sparse and on our usual ground. If larger than `epochs`, two more detectors train for so long on
+    the headline ground, to show the effect of epochs."""
     curve_width: float
-    """Width of the detectors on the curve, and of the lunar ones."""
+    """Width of the detectors on the curve and on the lunar ground."""
     half_width: float
     """Width of the detectors that are trained with three seeds."""
     seeds: tuple[int, ...]
@@ -94,21 +96,21 @@ class Sizes:
     navigator_width: float
     """Width of the navigators. At half width they start from the narrower detectors of the first seed."""
     more: bool
-    """Whether gates from identity on the sparse ground, and transfer from our own network, are trained too."""
+    """Whether to also train identity-initialised gates on the sparse ground, and transfer from our own network."""
     coarse_epochs: int
     """Coarse epochs of the navigators; an epoch has about 30 steps."""
     fine_epochs: int
     """Fine epochs of the navigators in the reading of the paper."""
     renderings: int = 1
-    """Renderings at once beside the trainings."""
+    """Number of simultaneous renderings, in addition to the trainings."""
     render_workers: int | None = None
     """Processes of each rendering; None for the command's default."""
     trainings: int = 1
-    """Trainings at once, beside the rendering; 1 runs one step after another."""
+    """Number of simultaneous trainings, in addition to the rendering; with 1, all steps run one after another."""
     benchmark_scenes: int = 0
-    """Scenes of each part of the locked benchmark; 0 for none."""
+    """Scenes of each part of the locked benchmark; 0 skips the benchmark."""
     settings: dict[str, str] = field(default_factory=dict)
-    """Settings over the preset and the protocol."""
+    """Settings that override the preset and the protocol."""
 
 
 _TWO_CORES = {
@@ -127,7 +129,7 @@ _GPU = {
     "detect.validate_every": "6",
     "detect.workers": "0",
     "navigate.workers": "0",
-    # Two navigators and three detectors at once need 60 GB so.
+    # With these sizes, two navigators and three detectors together need 60 GB.
     "navigate.stack.batch_sequences": "4",
     "navigate.stack.accumulate": "2",
     "navigate.stack.views": "8",
@@ -219,7 +221,7 @@ class Step:
     needs: tuple[str, ...] = ()
     """Titles of the steps whose results it reads."""
     renders: bool = False
-    """Whether it renders frames, in the lane of its own."""
+    """Whether it renders frames; renderings and trainings have separate limits."""
     images: float = 0.0
     """Training images of a detector, or frames to render."""
     width: float = 1.0
@@ -242,7 +244,7 @@ class Experiment:
 
     @property
     def sizes(self) -> Sizes:
-        """How much is made."""
+        """Sizes of this preset and part."""
         if self.preset == "paper":
             return PARTS[self.part]
         return replace(TINY, trainings=2) if self.part == Part.GPU else TINY
@@ -275,33 +277,33 @@ class Experiment:
         return self.runs / "ground.json"
 
     def settings(self, section: str) -> dict[str, str]:
-        """Settings over the preset and the protocol."""
+        """Settings that override the preset and the protocol."""
         sizes = self.sizes
         if section == "dataset":
-            found = {"dataset.name": self.label}
+            values = {"dataset.name": self.label}
             if self.preset == "paper":
                 counts = {"detect": sizes.trajectories, "nav": sizes.nav_trajectories}
                 for kind, count in counts.items():
-                    found |= {f"dataset.{kind}.trajectories_per_scene": str(count)}
-                    found |= {f"dataset.{kind}.n_frames": str(sizes.frames)}
-            return found
-        own = {key: value for key, value in sizes.settings.items() if key.startswith(f"{section}.")}
+                    values |= {f"dataset.{kind}.trajectories_per_scene": str(count)}
+                    values |= {f"dataset.{kind}.n_frames": str(sizes.frames)}
+            return values
+        section_settings = {key: value for key, value in sizes.settings.items() if key.startswith(f"{section}.")}
         if section == "detect":
-            return own
-        return own | {
+            return section_settings
+        return section_settings | {
             "navigate.stack.coarse_epochs": str(sizes.coarse_epochs),
             "navigate.stack.fine_epochs": str(sizes.fine_epochs),
         }
 
     def options(self, section: str, **more: str) -> list[str]:
-        """Options of a command that reads this section; `more` are settings over all others."""
+        """Options of a command that reads this section; `more` are settings that override all others."""
         pairs = self.settings(section) | {key.replace("__", "."): value for key, value in more.items()}
         sets = [text for key, value in pairs.items() for text in ("--set", f"{key}={value}")]
         return ["--preset", self.preset, "--config", str(PROTOCOL), *sets]
 
 
 def program(name: str) -> list[str]:
-    """How a command is started: as installed, or from its folder where nothing is installed."""
+    """Program and arguments that start a command: the installed program, or the module if it is not installed."""
     installed = Path(sys.executable).parent / name
     if installed.is_file():
         return [str(installed)]
@@ -310,7 +312,7 @@ def program(name: str) -> list[str]:
 
 
 def crater_density(share: str) -> dict[str, str]:
-    """Settings of the terrain: the protocol's with another density; our usual terrain for `lunar`."""
+    """Settings of the terrain: the protocol's terrain with another crater density, or our usual terrain for `lunar`."""
     if share == LUNAR:
         usual = resolve(DatasetConfig, "dataset", "perilune_render", "paper").terrain
         craters, relief = usual.craters, usual.relief
@@ -326,23 +328,27 @@ def _inline(values: Any) -> str:
     return json.dumps(values).replace('"', "")
 
 
-def steps(one: Experiment) -> list[Step]:
-    """All steps, the most important first, since a run with a limit on its time may not reach the last."""
-    sizes, ground = one.sizes, "headline"
-    curve = [step for share in sizes.curve for step in _on_curve(one, share)] if one.ground == Ground.PANGU else []
-    # The networks on the two ends of the curve are points of it only if they are as large and train as long.
+def steps(experiment: Experiment) -> list[Step]:
+    """All steps, the most important first, since a run with a time limit may not reach the last."""
+    sizes, ground = experiment.sizes, "headline"
+    curve = (
+        [step for share in sizes.curve for step in _on_curve(experiment, share)]
+        if experiment.ground == Ground.PANGU
+        else []
+    )
+    # Networks at the ends of the curve are comparable only if they are as large and train as long as the others.
     if curve and (sizes.curve_width != 1.0 or sizes.long_epochs != sizes.epochs):
-        curve.append(_detector(one, SPARSE, f"curve-{SPARSE}", "none", sizes.curve_width))
+        curve.append(_detector(experiment, SPARSE, f"curve-{SPARSE}", "none", sizes.curve_width))
     if curve and sizes.long_epochs != sizes.epochs:
-        curve.append(_detector(one, LUNAR, f"curve-{LUNAR}", "none", sizes.curve_width))
-    first = [*curve, _calibration(one)] if one.calibrate else []
-    needs = ("choose the headline ground",) if one.calibrate else ()
+        curve.append(_detector(experiment, LUNAR, f"curve-{LUNAR}", "none", sizes.curve_width))
+    first = [*curve, _calibration(experiment)] if experiment.calibrate else []
+    needs = ("choose the headline ground",) if experiment.calibrate else ()
 
     longer = {"detect__epochs": str(sizes.long_epochs)}
 
     def seeds(folder: str, attention: str) -> list[Step]:
         return [
-            _detector(one, ground, f"{folder}-half-{seed}", attention, sizes.half_width, detect__seed=str(seed))
+            _detector(experiment, ground, f"{folder}-half-{seed}", attention, sizes.half_width, detect__seed=str(seed))
             for seed in sizes.seeds
         ]
 
@@ -351,28 +357,31 @@ def steps(one: Experiment) -> list[Step]:
     half = [] if whole else [*seeds("yolov3", "none")[:1], *seeds("attention-yolov3", "cbam")[:1]]
 
     headline = [
-        _render(one, ground, "detect", headline_density(one), needs),
-        _render(one, ground, "nav", headline_density(one), needs),
-        _detector(one, ground, "yolov3", "none", 1.0),
-        _detector(one, ground, "attention-yolov3", "cbam", 1.0),
+        _render(experiment, ground, "detect", headline_density(experiment), needs),
+        _render(experiment, ground, "nav", headline_density(experiment), needs),
+        _detector(experiment, ground, "yolov3", "none", 1.0),
+        _detector(experiment, ground, "attention-yolov3", "cbam", 1.0),
         *half,
-        *(_navigator(one, *words, "pose") for words in navigators),
-        _explanation(one),
+        *(_navigator(experiment, *words, "pose") for words in navigators),
+        _explanation(experiment),
     ]
-    identity = _detector(one, ground, "attention-identity", "cbam_identity", 1.0)
-    sparse = [*_on_curve(one, SPARSE), _detector(one, SPARSE, "sparse-attention-yolov3", "cbam", 1.0, **longer)]
+    identity = _detector(experiment, ground, "attention-identity", "cbam_identity", 1.0)
+    sparse = [
+        *_on_curve(experiment, SPARSE),
+        _detector(experiment, SPARSE, "sparse-attention-yolov3", "cbam", 1.0, **longer),
+    ]
     lunar = [
-        *_on_curve(one, LUNAR),
-        _detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width, **longer),
+        *_on_curve(experiment, LUNAR),
+        _detector(experiment, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width, **longer),
     ]
-    if one.ground == Ground.LUNAR:
+    if experiment.ground == Ground.LUNAR:
         sparse, lunar = [], []
     long = [
-        _detector(one, ground, "long-yolov3", "none", 1.0, **longer),
-        _detector(one, ground, "long-attention-yolov3", "cbam", 1.0, **longer),
+        _detector(experiment, ground, "long-yolov3", "none", 1.0, **longer),
+        _detector(experiment, ground, "long-attention-yolov3", "cbam", 1.0, **longer),
     ]
-    sparse_identity = _detector(one, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0, **longer)
-    found = [
+    sparse_identity = _detector(experiment, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0, **longer)
+    ordered = [
         *first,
         *headline,
         identity,
@@ -381,22 +390,22 @@ def steps(one: Experiment) -> list[Step]:
         *seeds("attention-yolov3", "cbam")[len(half) // 2 :],
         *seeds("attention-identity", "cbam_identity"),
         *lunar,
-        *(_attitude(one, navigators) if one.attitude else []),
+        *(_attitude(experiment, navigators) if experiment.attitude else []),
         *(long if sizes.long_epochs > sizes.epochs else []),
         *([] if first else curve),
-        *(_navigator(one, *words, "motion") for words in navigators),
+        *(_navigator(experiment, *words, "motion") for words in navigators),
         *([sparse_identity] if sizes.more and sparse else []),
-        *_transfer(one),
-        *_benchmark_steps(one),
+        *_transfer(experiment),
+        *_benchmark_steps(experiment),
     ]
-    return [*found, _page(one)]
+    return [*ordered, _page(experiment)]
 
 
-def _render(one: Experiment, ground: str, kind: str, density: dict[str, str], needs: tuple[str, ...]) -> Step:
-    out = one.data / ground
-    command = [*program("perilune-render"), "dataset", "--kind", kind, *one.options("dataset", **density)]
-    command += [] if one.sizes.render_workers is None else ["--workers", str(one.sizes.render_workers)]
-    count = one.sizes.trajectories if kind == "detect" else one.sizes.nav_trajectories
+def _render(experiment: Experiment, ground: str, kind: str, density: dict[str, str], needs: tuple[str, ...]) -> Step:
+    out = experiment.data / ground
+    command = [*program("perilune-render"), "dataset", "--kind", kind, *experiment.options("dataset", **density)]
+    command += [] if experiment.sizes.render_workers is None else ["--workers", str(experiment.sizes.render_workers)]
+    count = experiment.sizes.trajectories if kind == "detect" else experiment.sizes.nav_trajectories
     title = f"render {ground}" if kind == "detect" else f"render {ground}, navigation"
     return Step(
         title,
@@ -404,22 +413,29 @@ def _render(one: Experiment, ground: str, kind: str, density: dict[str, str], ne
         _rendered(out / kind),
         needs,
         renders=True,
-        images=count * one.sizes.frames,
+        images=count * experiment.sizes.frames,
     )
 
 
-def _detector(one: Experiment, ground: str, folder: str, attention: str, width: float, **more: str) -> Step:
+def _detector(experiment: Experiment, ground: str, folder: str, attention: str, width: float, **more: str) -> Step:
     """Training of a detector on a ground, into detect/<folder>."""
-    width = 0.125 if one.preset == "tiny" else width
+    width = 0.125 if experiment.preset == "tiny" else width
     settings = {"detect__attention": attention, "detect__width": str(width)}
-    options = one.options("detect", **settings, **({"detect__epochs": str(one.sizes.epochs)} | more))
-    command = [*program("perilune-train"), "detect", "train", *options, "--dataset", str(one.data / ground / "detect")]
-    epochs = int(more.get("detect__epochs", one.sizes.epochs))
-    images = 0.8 * one.sizes.trajectories * one.sizes.frames * epochs
+    options = experiment.options("detect", **settings, **({"detect__epochs": str(experiment.sizes.epochs)} | more))
+    command = [
+        *program("perilune-train"),
+        "detect",
+        "train",
+        *options,
+        "--dataset",
+        str(experiment.data / ground / "detect"),
+    ]
+    epochs = int(more.get("detect__epochs", experiment.sizes.epochs))
+    images = 0.8 * experiment.sizes.trajectories * experiment.sizes.frames * epochs
     return Step(
         f"train {folder}",
-        [*command, "--out", str(one.runs), "--name", folder],
-        _finished(one.runs / "detect" / folder),
+        [*command, "--out", str(experiment.runs), "--name", folder],
+        _finished(experiment.runs / "detect" / folder),
         (f"render {ground}",),
         images=images,
         width=width,
@@ -427,34 +443,39 @@ def _detector(one: Experiment, ground: str, folder: str, attention: str, width: 
     )
 
 
-def _on_curve(one: Experiment, share: str) -> list[Step]:
-    """A ground of the curve, and YOLOv3 without attention on it."""
+def _on_curve(experiment: Experiment, share: str) -> list[Step]:
+    """Rendering of a ground of the curve, and training of YOLOv3 without attention on it."""
     folder = {SPARSE: "sparse-yolov3", LUNAR: "lunar-yolov3"}.get(share, f"curve-{share}")
-    width = 1.0 if share == SPARSE else one.sizes.curve_width
-    longer = {"detect__epochs": str(one.sizes.long_epochs)} if share in (SPARSE, LUNAR) else {}
+    width = 1.0 if share == SPARSE else experiment.sizes.curve_width
+    longer = {"detect__epochs": str(experiment.sizes.long_epochs)} if share in (SPARSE, LUNAR) else {}
     return [
-        _render(one, share, "detect", crater_density(share), ()),
-        _detector(one, share, folder, "none", width, **longer),
+        _render(experiment, share, "detect", crater_density(share), ()),
+        _detector(experiment, share, folder, "none", width, **longer),
     ]
 
 
-def _calibration(one: Experiment) -> Step:
-    runs = {share: one.runs / "detect" / f"curve-{share}" for share in one.sizes.curve}
+def _calibration(experiment: Experiment) -> Step:
+    runs = {share: experiment.runs / "detect" / f"curve-{share}" for share in experiment.sizes.curve}
 
     def choose() -> None:
-        found = {float(share): float(str(read_metrics(run)["val/ap50_paper"])) for share, run in runs.items()}
-        share = share_at(found, CALIBRATED_AP)
-        record = {"equilibrium_share": share, "validation_ap": {f"{key:g}": value for key, value in found.items()}}
-        write_text(one.chosen, json.dumps(record, indent=2) + "\n")
-        print(f"headline ground: equilibrium_share {share:g}, by validation AP {found}", flush=True)
+        ap_by_share = {float(share): float(str(read_metrics(run)["val/ap50_paper"])) for share, run in runs.items()}
+        share = share_at(ap_by_share, CALIBRATED_AP)
+        record = {
+            "equilibrium_share": share,
+            "validation_ap": {f"{key:g}": value for key, value in ap_by_share.items()},
+        }
+        write_text(experiment.chosen, json.dumps(record, indent=2) + "\n")
+        print(f"headline ground: equilibrium_share {share:g}, by validation AP {ap_by_share}", flush=True)
 
-    needs = tuple(f"train curve-{share}" for share in one.sizes.curve)
-    return Step("choose the headline ground", choose, one.chosen.is_file, needs)
+    needs = tuple(f"train curve-{share}" for share in experiment.sizes.curve)
+    return Step("choose the headline ground", choose, experiment.chosen.is_file, needs)
 
 
 def share_at(ap_by_share: dict[float, float], ap: float) -> float:
-    """Share of the equilibrium density at which the AP has a value: linear in the logarithm of the share, between the
-    two points around the value or beyond the last two; from 0.1 to 1.7, with two digits."""
+    """Share of the equilibrium density at which the AP has a given value, from 0.1 to 1.7, rounded to two digits.
+
+    The AP is interpolated linearly in the logarithm of the share, or extrapolated from the nearest two points.
+    """
     points = sorted(ap_by_share.items())
     if len(points) == 1:
         return points[0][0]
@@ -466,47 +487,54 @@ def share_at(ap_by_share: dict[float, float], ap: float) -> float:
     return float(f"{min(max(share, 0.1), 1.7):.2g}")
 
 
-def headline_share(one: Experiment) -> str:
+def headline_share(experiment: Experiment) -> str:
     """Share of the equilibrium density of the headline ground, or `lunar`."""
-    if one.ground == Ground.LUNAR:
+    if experiment.ground == Ground.LUNAR:
         return LUNAR
-    if one.calibrate and one.chosen.is_file():
-        return f"{json.loads(one.chosen.read_text(encoding='utf-8'))['equilibrium_share']:g}"
-    dataset = resolve(DatasetConfig, "dataset", "perilune_render", one.preset, PROTOCOL)
+    if experiment.calibrate and experiment.chosen.is_file():
+        return f"{json.loads(experiment.chosen.read_text(encoding='utf-8'))['equilibrium_share']:g}"
+    dataset = resolve(DatasetConfig, "dataset", "perilune_render", experiment.preset, PROTOCOL)
     return f"{dataset.terrain.craters.equilibrium_share.low:g}"
 
 
-def headline_density(one: Experiment) -> dict[str, str]:
+def headline_density(experiment: Experiment) -> dict[str, str]:
     """Settings of the headline ground that differ from the protocol's."""
-    chosen = one.ground == Ground.LUNAR or (one.calibrate and one.chosen.is_file())
-    return crater_density(headline_share(one)) if chosen else {}
+    chosen = experiment.ground == Ground.LUNAR or (experiment.calibrate and experiment.chosen.is_file())
+    return crater_density(headline_share(experiment)) if chosen else {}
 
 
-def _explanation(one: Experiment) -> Step:
-    attended = one.runs / "detect" / "attention-yolov3" / "checkpoints" / "best.ckpt"
-    navigator = one.runs / "navigate" / "attention-darknet53-lstm-stack" / "checkpoints" / "best.ckpt"
-    command = [*program("perilune-train"), "explain", "--preset", one.preset, "--dataset", str(one.data / "headline")]
-    command += ["--out", str(one.runs), "--name", "attention"]
+def _explanation(experiment: Experiment) -> Step:
+    attended = experiment.runs / "detect" / "attention-yolov3" / "checkpoints" / "best.ckpt"
+    navigator = experiment.runs / "navigate" / "attention-darknet53-lstm-stack" / "checkpoints" / "best.ckpt"
+    command = [
+        *program("perilune-train"),
+        "explain",
+        "--preset",
+        experiment.preset,
+        "--dataset",
+        str(experiment.data / "headline"),
+    ]
+    command += ["--out", str(experiment.runs), "--name", "attention"]
     command += ["--detector", str(attended), "--navigator", str(navigator)]
     needs = ("train attention-yolov3", "train attention-darknet53-lstm")
-    return Step("explain", command, _finished(one.runs / "explain" / "attention"), needs)
+    return Step("explain", command, _finished(experiment.runs / "explain" / "attention"), needs)
 
 
-def _attitude(one: Experiment, navigators: list[tuple[str, str, str]]) -> list[Step]:
-    """Navigators over descents with attitude noise, on the backbones of the descents without."""
+def _attitude(experiment: Experiment, navigators: list[tuple[str, str, str]]) -> list[Step]:
+    """Navigators over descents with attitude noise; their backbones were trained without it."""
     noise = {"dataset__nav__flight__attitude_sigma_deg": str(ATTITUDE_DEG)}
-    needs = ("choose the headline ground",) if one.calibrate else ()
-    rendered = _render(one, "attitude", "nav", headline_density(one) | noise, needs)
-    return [rendered, *(_navigator(one, *words, "attitude") for words in navigators)]
+    needs = ("choose the headline ground",) if experiment.calibrate else ()
+    rendered = _render(experiment, "attitude", "nav", headline_density(experiment) | noise, needs)
+    return [rendered, *(_navigator(experiment, *words, "attitude") for words in navigators)]
 
 
-def _navigator(one: Experiment, folder: str, detector: str, attention: str, reading: str) -> Step:
+def _navigator(experiment: Experiment, folder: str, detector: str, attention: str, reading: str) -> Step:
     """Training of a navigator in one of the readings pose, motion, or attitude (the pose with attitude noise)."""
     name = folder if reading == "pose" else f"{folder}-{reading}"
-    sizes = one.sizes
+    sizes = experiment.sizes
     detector = detector if sizes.navigator_width == 1.0 else f"{detector}-half-{sizes.seeds[0]}"
-    width = 0.125 if one.preset == "tiny" else sizes.navigator_width
-    backbone = one.runs / "detect" / detector / "checkpoints" / "best.ckpt"
+    width = 0.125 if experiment.preset == "tiny" else sizes.navigator_width
+    backbone = experiment.runs / "detect" / detector / "checkpoints" / "best.ckpt"
     target, ground = (
         ("motion" if reading == "motion" else "pose"),
         ("attitude" if reading == "attitude" else "headline"),
@@ -515,61 +543,73 @@ def _navigator(one: Experiment, folder: str, detector: str, attention: str, read
     settings |= {"navigate__detector": str(backbone), "navigate__stack__width": str(width)}
     if reading == "motion":
         settings |= {"navigate__stack__fine_epochs": "1", "navigate__stack__views": "0"}
-    options = one.options("navigate", **settings)
-    command = [*program("perilune-train"), "navigate", "train", *options, "--dataset", str(one.data / ground / "nav")]
+    options = experiment.options("navigate", **settings)
+    command = [
+        *program("perilune-train"),
+        "navigate",
+        "train",
+        *options,
+        "--dataset",
+        str(experiment.data / ground / "nav"),
+    ]
     return Step(
         f"train {name}",
-        [*command, "--out", str(one.runs), "--name", name],
-        _finished(one.runs / "navigate" / f"{name}-stack"),
+        [*command, "--out", str(experiment.runs), "--name", name],
+        _finished(experiment.runs / "navigate" / f"{name}-stack"),
         (f"train {detector}", f"render {ground}, navigation"),
         width=width,
         attention=attention,
     )
 
 
-def _transfer(one: Experiment) -> list[Step]:
-    """Detectors that start from YOLOv3 of COCO, or from our own on our usual ground in its place; first frozen."""
-    width = 1.0 if one.darknet is not None else one.sizes.curve_width
-    if one.darknet is None and (one.ground == Ground.LUNAR or not one.sizes.more):
+def _transfer(experiment: Experiment) -> list[Step]:
+    """Detectors that start from YOLOv3 of COCO, or from our detector of the usual ground; at first frozen."""
+    width = 1.0 if experiment.darknet is not None else experiment.sizes.curve_width
+    if experiment.darknet is None and (experiment.ground == Ground.LUNAR or not experiment.sizes.more):
         return []
-    start = str(one.darknet or one.runs / "detect" / "lunar-yolov3" / "checkpoints" / "best.ckpt")
-    more = {"detect__init_from": start, "detect__frozen_epochs": str(min(2, one.sizes.epochs - 1))}
-    found = []
+    start = str(experiment.darknet or experiment.runs / "detect" / "lunar-yolov3" / "checkpoints" / "best.ckpt")
+    more = {"detect__init_from": start, "detect__frozen_epochs": str(min(2, experiment.sizes.epochs - 1))}
+    trainings = []
     for folder, attention in (("transfer-yolov3", "none"), ("transfer-attention-yolov3", "cbam")):
-        step = _detector(one, "headline", folder, attention, width, **more)
-        needs = step.needs if one.darknet is not None else (*step.needs, "train lunar-yolov3")
-        found.append(replace(step, needs=needs))
-    return found
+        step = _detector(experiment, "headline", folder, attention, width, **more)
+        needs = step.needs if experiment.darknet is not None else (*step.needs, "train lunar-yolov3")
+        trainings.append(replace(step, needs=needs))
+    return trainings
 
 
-def _benchmark_steps(one: Experiment) -> list[Step]:
+def _benchmark_steps(experiment: Experiment) -> list[Step]:
     """Scores of the detectors on the locked benchmark."""
-    if one.preset != "paper" or not one.sizes.benchmark_scenes:
+    if experiment.preset != "paper" or not experiment.sizes.benchmark_scenes:
         return []
-    command = ["scripts/render-benchmark", "detect", str(one.scored), str(one.sizes.benchmark_scenes)]
-    parts = [one.scored / f"benchmark-detect-{part}" for part in ("highland", "mare", "camera")]
-    found = [Step("render the benchmark", command, _rendered(*parts), renders=True)]
+    command = ["scripts/render-benchmark", "detect", str(experiment.scored), str(experiment.sizes.benchmark_scenes)]
+    parts = [experiment.scored / f"benchmark-detect-{part}" for part in ("highland", "mare", "camera")]
+    benchmark_steps = [Step("render the benchmark", command, _rendered(*parts), renders=True)]
     for folder in ("yolov3", "attention-yolov3"):
-        out = one.runs / "benchmark" / folder
-        command = [*program("perilune-train"), "detect", "benchmark", "--run", str(one.runs / "detect" / folder)]
-        command += ["--data", str(one.scored), "--out", str(out)]
+        out = experiment.runs / "benchmark" / folder
+        command = [*program("perilune-train"), "detect", "benchmark", "--run", str(experiment.runs / "detect" / folder)]
+        command += ["--data", str(experiment.scored), "--out", str(out)]
         done = (out / "benchmark.json").is_file
-        found.append(Step(f"benchmark {folder}", command, done, (f"train {folder}", "render the benchmark")))
-    return found
+        benchmark_steps.append(Step(f"benchmark {folder}", command, done, (f"train {folder}", "render the benchmark")))
+    return benchmark_steps
 
 
-def _page(one: Experiment) -> Step:
-    sizes = one.sizes
-    about = [f"preset `{one.preset}`, part `{one.part}`"]
-    about += [f"attitude noise: {ATTITUDE_DEG:g} degree per axis, where named"] if one.attitude else []
+def _page(experiment: Experiment) -> Step:
+    sizes = experiment.sizes
+    about = [f"preset `{experiment.preset}`, part `{experiment.part}`"]
+    about += [f"attitude noise: {ATTITUDE_DEG:g} degree per axis, where named"] if experiment.attitude else []
     about += [
         f"{sizes.trajectories * sizes.frames} detection frames over each ground (the paper: 34,300), "
         f"{sizes.nav_trajectories} navigation trajectories of {sizes.frames} frames (the paper: 49 of 100); "
         f"{sizes.epochs} epochs of each detector on the headline ground and the curve, {sizes.long_epochs} on the "
         "sparse and on our usual ground"
     ]
-    command = [*program("perilune-train"), "paper", "--runs", str(one.runs)]
-    command += ["--dataset", str(one.data / "headline" / "detect"), "--headline-share", headline_share(one)]
+    command = [*program("perilune-train"), "paper", "--runs", str(experiment.runs)]
+    command += [
+        "--dataset",
+        str(experiment.data / "headline" / "detect"),
+        "--headline-share",
+        headline_share(experiment),
+    ]
     return Step("page", [*command, *[text for line in about for text in ("--about", line)]], lambda: False)
 
 
@@ -584,7 +624,7 @@ def _complete(dataset: Path) -> bool:
 
 def _finished(run: Path) -> Callable[[], bool]:
     def whole() -> bool:
-        # Importing torch takes seconds; most runs of a plan are not there yet.
+        # Check the file first: most runs do not exist yet, and importing torch takes seconds.
         if not (run / "metrics.json").is_file():
             return False
         from perilune_train.training.runs import RunFolder
@@ -594,51 +634,55 @@ def _finished(run: Path) -> Callable[[], bool]:
     return whole
 
 
-def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
-    """Seconds of the long steps that are left, from a few training steps on this machine, by title."""
+def estimate(experiment: Experiment, plan: list[Step]) -> dict[str, float]:
+    """Estimated seconds of the remaining long steps by title, from a few training steps on this machine."""
     from perilune_train.report.paper.probe import detect_seconds, navigate_seconds
 
-    size_px = int(resolve(DatasetConfig, "dataset", "perilune_render", one.preset, PROTOCOL).camera.width_px)
-    detect = resolve(DetectConfig, "detect", "perilune_train", one.preset, PROTOCOL, _sets(one, "detect"))
-    navigate = resolve(NavigateConfig, "navigate", "perilune_train", one.preset, PROTOCOL, _sets(one, "navigate"))
+    size_px = int(resolve(DatasetConfig, "dataset", "perilune_render", experiment.preset, PROTOCOL).camera.width_px)
+    detect = resolve(DetectConfig, "detect", "perilune_train", experiment.preset, PROTOCOL, _sets(experiment, "detect"))
+    navigate = resolve(
+        NavigateConfig, "navigate", "perilune_train", experiment.preset, PROTOCOL, _sets(experiment, "navigate")
+    )
     cores = len(os.sched_getaffinity(0))
     per_image: dict[tuple[float, str], float] = {}
-    found: dict[str, float] = {}
+    seconds_by_step: dict[str, float] = {}
     for step in plan:
         if step.done():
             continue
         if step.renders and step.images:
-            found[step.title] = RENDER_CORE_S * step.images / cores
+            seconds_by_step[step.title] = RENDER_CORE_S * step.images / cores
         elif step.images:
             kind = (step.width, step.attention)
             if kind not in per_image:
                 config = detect.model_copy(update={"width": step.width, "attention": step.attention})
                 per_image[kind] = detect_seconds(config, size_px)
-            found[step.title] = per_image[kind] * step.images
+            seconds_by_step[step.title] = per_image[kind] * step.images
         elif "lstm" in step.title:
-            own = navigate.stack.model_copy(update={"attention": step.attention, "width": step.width})
-            seconds = navigate_seconds(navigate.model_copy(update={"stack": own}))
-            pairs = 0.8 * one.sizes.nav_trajectories * one.sizes.frames
+            stack = navigate.stack.model_copy(update={"attention": step.attention, "width": step.width})
+            seconds = navigate_seconds(navigate.model_copy(update={"stack": stack}))
+            pairs = 0.8 * experiment.sizes.nav_trajectories * experiment.sizes.frames
             # Features of the coarse stage are computed once, forward only.
             motion = step.title.endswith("motion")
-            fine, views = (1, 0) if motion else (one.sizes.fine_epochs, navigate.stack.views)
-            found[step.title] = seconds * pairs * (fine + (1 + views) / 3)
-    return found
+            fine, views = (1, 0) if motion else (experiment.sizes.fine_epochs, navigate.stack.views)
+            seconds_by_step[step.title] = seconds * pairs * (fine + (1 + views) / 3)
+    return seconds_by_step
 
 
-def _sets(one: Experiment, section: str) -> tuple[str, ...]:
-    return tuple(f"{key}={value}" for key, value in one.settings(section).items())
+def _sets(experiment: Experiment, section: str) -> tuple[str, ...]:
+    return tuple(f"{key}={value}" for key, value in experiment.settings(section).items())
 
 
-def check_disk(one: Experiment, plan: list[Step]) -> None:
-    """Raise UserError before the first frame if the frames that are left do not fit on the disk."""
-    folder = one.data
+def check_disk(experiment: Experiment, plan: list[Step]) -> None:
+    """Raise UserError if the remaining frames do not fit on the disk."""
+    folder = experiment.data
     while not folder.exists():
         folder = folder.parent
     needed = sum(FRAME_BYTES * step.images for step in plan if step.renders and not step.done())
     free = shutil.disk_usage(folder).free
     if needed > free:
-        raise UserError(one.data, "free disk", f"{free / 1e9:.1f} GB", f"at least {needed / 1e9:.1f} GB for the frames")
+        raise UserError(
+            experiment.data, "free disk", f"{free / 1e9:.1f} GB", f"at least {needed / 1e9:.1f} GB for the frames"
+        )
 
 
 def main(
@@ -650,7 +694,7 @@ def main(
         Ground, typer.Option(help="Headline ground: as difficult as the paper's, or our usual one.")
     ] = Ground.PANGU,
     calibrate: Annotated[
-        bool, typer.Option("--calibrate", help="Choose the density of the headline ground again, on validation.")
+        bool, typer.Option("--calibrate", help="Choose the density of the headline ground again by validation AP.")
     ] = False,
     attitude: Annotated[
         bool, typer.Option("--attitude", help="Also train navigators over descents with attitude noise.")
@@ -658,7 +702,7 @@ def main(
     darknet: Annotated[Path | None, typer.Option(help="YOLOv3's weights of COCO (yolov3.weights).")] = None,
     benchmark: Annotated[Path, typer.Option(help="Folder of the rendered locked benchmark.")] = Path("data/benchmark"),
     minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="Stop after this time, and write the page from what is done.")
+        float | None, typer.Option(min=0.1, help="Stop after this time, and write the page from the finished steps.")
     ] = None,
 ) -> None:
     """Run all steps."""
@@ -668,20 +712,20 @@ def main(
         check_start(darknet)
     if calibrate and ground == Ground.LUNAR:
         raise UserError("--calibrate", "--ground", ground, f"{Ground.PANGU}, whose density is chosen")
-    one = Experiment(preset, part, ground, attitude, darknet, benchmark, calibrate)
-    plan = steps(one)
-    check_disk(one, plan)
-    print(f"{one.runs}: {len(plan)} steps", flush=True)
+    experiment = Experiment(preset, part, ground, attitude, darknet, benchmark, calibrate)
+    plan = steps(experiment)
+    check_disk(experiment, plan)
+    print(f"{experiment.runs}: {len(plan)} steps", flush=True)
     if minutes is None:
-        expected = estimate(one, plan)
+        expected = estimate(experiment, plan)
         for title, seconds in expected.items():
             print(f"  {title}: about {_hours(seconds)}")
         print(f"  long steps together: about {_hours(sum(expected.values()))}; Ctrl-C stops, run again to resume")
     else:
         expected = {}
     deadline = math.inf if minutes is None else time.monotonic() + 60 * minutes
-    run_all(one, expected, deadline)
-    print(f"{one.runs}: paper.md")
+    run_all(experiment, expected, deadline)
+    print(f"{experiment.runs}: paper.md")
 
 
 @dataclass
@@ -694,21 +738,21 @@ class Running:
     started: float
 
 
-def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> None:
-    """Run the steps that are left: one after another, or, with several trainings at once, as soon as they can.
+def run_all(experiment: Experiment, expected: dict[str, float], deadline: float) -> None:
+    """Run the remaining steps one after another or, with several simultaneous trainings, as soon as they can start.
 
     Raises typer.Exit with the exit code of the first step that fails, after the others have been stopped. At the
-    deadline running steps are stopped as by Ctrl-C, and only the page is written.
+    deadline, running steps are stopped as by Ctrl-C, and the page is written.
     """
     running: list[Running] = []
-    together = one.sizes.trainings > 1
+    together = experiment.sizes.trainings > 1
     failed: dict[str, int] = {}
     began = time.monotonic()
     try:
         while True:
-            plan = steps(one)
+            plan = steps(experiment)
             titles = {step.title for step in plan if not step.done()}
-            # A step whose needs failed never starts; the page is written last.
+            # A step that needs the result of a failed step never starts; the page is written last.
             page = plan[-1]
             left = [step for step in plan[:-1] if not step.done() and step.title not in failed]
             late = time.monotonic() > deadline
@@ -719,9 +763,9 @@ def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> Non
             if not late:
                 for step in ready:
                     lane = [each for each in running if each.step.renders == step.renders or not together]
-                    most = one.sizes.renderings if step.renders else one.sizes.trainings
+                    most = experiment.sizes.renderings if step.renders else experiment.sizes.trainings
                     if len(lane) < (most if together else 1):
-                        running += _start(one, step, together, began, expected)
+                        running += _start(experiment, step, together, began, expected)
                         if callable(step.command) or not together:
                             break
             _wait(running, failed, together, deadline)
@@ -731,18 +775,20 @@ def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> Non
         if together:
             _stop(running)
             raise
-        # The terminal has stopped the step too, which has printed how to resume.
+        # Ctrl-C has also reached the step, which has printed how to resume.
         _end(running)
         sys.stdout.flush()
         os._exit(EXIT_INTERRUPTED)
     for title, code in failed.items():
-        print(f"failed with code {code}: {title}; see {_log(one, title)}", flush=True)
+        print(f"failed with code {code}: {title}; see {_log(experiment, title)}", flush=True)
     _run(page)
     if failed:
         raise typer.Exit(next(iter(failed.values())))
 
 
-def _start(one: Experiment, step: Step, together: bool, began: float, expected: dict[str, float]) -> list[Running]:
+def _start(
+    experiment: Experiment, step: Step, together: bool, began: float, expected: dict[str, float]
+) -> list[Running]:
     left = sum(seconds for title, seconds in expected.items() if title != step.title)
     rest = f", about {_hours(left + expected.get(step.title, 0))} left" if expected else ""
     print(f"{_hours(time.monotonic() - began)}: {step.title}{rest}", flush=True)
@@ -753,12 +799,12 @@ def _start(one: Experiment, step: Step, together: bool, began: float, expected: 
     if not together:
         print("  " + " ".join(_shown(word) for word in step.command), flush=True)
         return [Running(step, subprocess.Popen(step.command), None, time.monotonic())]
-    log = _log(one, step.title)
+    log = _log(experiment, step.title)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w", encoding="utf-8") as file:
         file.write(" ".join(_shown(word) for word in step.command) + "\n")
         file.flush()
-        # In a session of its own: Ctrl-C reaches it through this script, once.
+        # A separate session, so that Ctrl-C reaches the step once, through this script.
         process = subprocess.Popen(step.command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
     return [Running(step, process, log, time.monotonic())]
 
@@ -813,8 +859,8 @@ def _run(step: Step) -> None:
         raise typer.Exit(done.returncode)
 
 
-def _log(one: Experiment, title: str) -> Path:
-    return one.runs / "logs" / (re.sub(r"[^a-z0-9.-]+", "-", title.lower()) + ".log")
+def _log(experiment: Experiment, title: str) -> Path:
+    return experiment.runs / "logs" / (re.sub(r"[^a-z0-9.-]+", "-", title.lower()) + ".log")
 
 
 def _shown(word: str) -> str:
@@ -833,5 +879,5 @@ if __name__ == "__main__":
 
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(main)
-    # Longer than for the commands that it starts, which print how to resume.
+    # Wait longer than the commands that it starts do: they print how to resume.
     run_command_line(app, ended_after_s=2.5)

@@ -1,4 +1,4 @@
-"""The results of the paper's experiment as a few small files, to be carried away from a machine that is lent.
+"""Pack the results of the paper's experiment into a few small files, to copy them from a borrowed machine.
 
     python scripts/paper_files.py pack runs/paper-gpu OUT
     python scripts/paper_files.py unpack OUT runs/paper-gpu
@@ -17,7 +17,7 @@ from typing import Annotated
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import torch
@@ -72,8 +72,10 @@ def pack(
     if not runs.is_dir():
         raise UserError(runs, "runs", "no such folder", "the folder of the experiment's runs")
     out.mkdir(parents=True, exist_ok=True)
-    found = {str(path.parent.relative_to(runs)): json.loads(path.read_text()) for path in runs.rglob("metrics.json")}
-    write_bytes(out / METRICS, json.dumps(found, indent=1).encode())
+    metrics_by_run = {
+        str(path.parent.relative_to(runs)): json.loads(path.read_text()) for path in runs.rglob("metrics.json")
+    }
+    write_bytes(out / METRICS, json.dumps(metrics_by_run, indent=1).encode())
     with tarfile.open(out / PAGE, "w:gz") as archive:
         for path in sorted(
             {path for pattern in _KEPT for path in (*runs.glob(pattern), *runs.glob(f"logs/{pattern}"))}
@@ -93,17 +95,17 @@ def _pack_weights(best: Path, out: Path) -> None:
     size = 0
     for name, tensor in content["state_dict"].items():
         parts = {f"{name}{key}": value for key, value in rounded(tensor).items()}
-        own = sum(value.numel() * value.element_size() for value in parts.values())
-        if size + own > 0.99 * LARGEST_BYTES:
+        n_bytes = sum(value.numel() * value.element_size() for value in parts.values())
+        if size + n_bytes > 0.99 * LARGEST_BYTES:
             shards.append({})
             size = 0
         shards[-1] |= parts
-        size += own
+        size += n_bytes
     if len(shards) > _MAX_SHARDS:
         raise UserError(best, "weights", f"{len(shards)} shards", f"at most {_MAX_SHARDS} of 16 MiB")
     record = {key: json.dumps(value) for key, value in content.items() if key != "state_dict"}
     for number, shard in enumerate(shards):
-        # Whole numbers of a bell-shaped distribution: a seventh less.
+        # gzip saves a seventh: most of the 8-bit weights are near 0.
         write_bytes(out / SHARDS.replace("*", str(number)), gzip.compress(save(shard, metadata=record), 4))
 
 

@@ -1,10 +1,12 @@
-"""Write what a Python version needs, and check what pip resolved for it. Used by scripts/test-resolves.
+"""Write the requirements for a Python version, and check what pip resolved.
+
+Used by scripts/test-resolves.
 
     python scripts/python_versions.py write 3.13 FOLDER    # requirements.txt of all packages, constraints.txt of pins
     python scripts/python_versions.py check 3.13 FOLDER    # report.json of pip
 
-pip compares markers such as `python_version < "3.12"`, and the Python that a package requires, with the Python that
-runs it, also where it resolves for another one. So both are compared here.
+When pip resolves for another Python version, it still compares markers such as `python_version < "3.12"`, and the
+Python that a package requires, with the Python that runs pip. This script therefore checks both.
 """
 
 import json
@@ -27,16 +29,16 @@ ONLY_ON = {"bpy": "3.11"}
 
 
 def requirements_of(version: str) -> list[str]:
-    """Requirements of all packages with all their extras, without those on each other, for a Python version."""
-    found = set()
+    """Requirements of all packages and extras for a Python version, except on perilune's packages."""
+    requirements = set()
     for package in PACKAGES:
         project = tomllib.loads((ROOT / package / "pyproject.toml").read_text(encoding="utf-8"))["project"]
         groups = {"": project["dependencies"], **project.get("optional-dependencies", {})}
         for group in groups.values():
             if any(ONLY_ON.get(Requirement(each).name, version) != version for each in group):
                 continue
-            found |= {each for each in group if not each.startswith("perilune-")}
-    return sorted(found)
+            requirements |= {each for each in group if not each.startswith("perilune-")}
+    return sorted(requirements)
 
 
 def constraints_of(version: str) -> list[str]:
@@ -54,7 +56,7 @@ def write(version: str, folder: Path) -> None:
 
 
 def check(version: str, folder: Path) -> None:
-    """Print how many packages pip resolved; end with an error if one is not for this Python."""
+    """Print how many packages pip resolved; end with an error if a package does not support this Python."""
     packages = json.loads((folder / "report.json").read_text(encoding="utf-8"))["install"]
     refused = unfit([package["metadata"] for package in packages], version)
     if refused:
@@ -63,7 +65,7 @@ def check(version: str, folder: Path) -> None:
 
 
 def unfit(packages: list[dict[str, str]], version: str) -> list[str]:
-    """Packages, by their metadata, that require another Python than a version."""
+    """Packages that do not support a Python version, according to their metadata."""
     return [
         f"{each['name']} {each['version']} requires Python {each['requires_python']}"
         for each in packages

@@ -1,11 +1,11 @@
-"""Change the version; release it: check, build, try the wheels in a new environment, tag, and upload only if told.
+"""Change the version, or release it: check, build, try the wheels in a new environment, tag, upload on request.
 
     python scripts/release.py version 0.2.0 # write the version into every file that states it
     make release VERSION=0.1.0              # all but the upload; needs no network
-    make release VERSION=0.1.0 UPLOAD=1     # the same, then upload with twine (TWINE_REPOSITORY chooses the index)
+    make release VERSION=0.1.0 UPLOAD=1     # all steps, then upload with twine (TWINE_REPOSITORY chooses the index)
 
 The distributions are built from the commit, so files that are ignored or left over from other builds cannot get into
-them. They lie in dist/VERSION. The tag is vVERSION; a second run on the tagged commit builds again.
+them. They are written to dist/VERSION. The tag is vVERSION; a second run on the tagged commit builds again.
 """
 
 import os
@@ -21,7 +21,7 @@ from typing import Annotated
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer
@@ -34,10 +34,10 @@ ROOT = Path(__file__).resolve().parents[1]
 VERSION = re.compile(r"\d+\.\d+\.\d+((a|b|rc)\d+)?")
 PLACES = {
     "*/perilune*/__init__.py": r'^__version__ = "(?P<version>[^"]+)"',
-    "*/pyproject.toml": r'"perilune(-\w+)?(\[[\w,]+\])?==(?P<version>[^"]+)"|^version = "(?P<own>[^"]+)"',
+    "*/pyproject.toml": r'"perilune(-\w+)?(\[[\w,]+\])?==(?P<version>[^"]+)"|^version = "(?P<package_version>[^"]+)"',
     "CITATION.cff": r"^version: (?P<version>\S+)$",
 }
-"""Files, and the pattern of a version in them; a pyproject.toml states its own or takes that of its package."""
+"""Pattern of the version in each file. A pyproject.toml states the version or takes it from the package."""
 CHANGELOG = "CHANGELOG.md"
 _PROGRAMS = (("perilune-manifest", "--help"), ("perilune-render", "--help"), ("perilune-train", "models"))
 _IMPORTED = """
@@ -66,7 +66,7 @@ def release(
     version: Annotated[str, typer.Argument(help="Version to release, for example 0.1.0.")],
     upload: Annotated[bool, typer.Option("--upload", help="Upload the distributions at the end.")] = False,
 ) -> None:
-    """Check, build, try and tag a version; upload it if told."""
+    """Check, build, try and tag a version; upload it on request."""
     check(version, ROOT, datetime.now(UTC).date())
     run("make", "lint")
     files = build(version)
@@ -81,7 +81,7 @@ def release(
 
 
 def stated_versions(root: Path = ROOT) -> dict[Path, list[str]]:
-    """The versions that each file states, in the order of the text; files without one are left out."""
+    """The versions that each file states, in the order of the text; files without a version are omitted."""
     found = {
         path: [text for each in _matches(path, pattern) for text in each.groupdict().values() if text]
         for pattern, path in _files(root)
@@ -96,15 +96,15 @@ def check_version(version: str) -> None:
 
 
 def write_version(version: str, root: Path = ROOT) -> list[Path]:
-    """Write the version into every file that states one; return the files that changed."""
+    """Write the version into every file that states a version; return the changed files."""
     check_version(version)
     changed = []
     for pattern, path in _files(root):
         text = path.read_text(encoding="utf-8")
         written = text
-        # From the end, so that the positions of earlier matches stay right.
+        # Replace from the end, so that the positions of earlier matches stay valid.
         for match in reversed(_matches(path, pattern)):
-            group = "own" if match.groupdict().get("own") else "version"
+            group = "package_version" if match.groupdict().get("package_version") else "version"
             written = written[: match.start(group)] + version + written[match.end(group) :]
         if written != text:
             write_text(path, written)
@@ -191,8 +191,8 @@ def distributions(root: Path) -> list[Path]:
 def try_installed(version: str, wheels: list[Path]) -> None:
     """Use the wheels in a new environment.
 
-    It has them alone and takes their dependencies from this one, so that no network is needed. scripts/test-wheels
-    also installs the dependencies.
+    Only the wheels are installed there; their dependencies come from the current environment, so that no network is
+    needed. scripts/test-wheels also installs the dependencies.
     """
     packages = [wheel.name.split("-")[0] for wheel in wheels]
     with tempfile.TemporaryDirectory() as folder:
@@ -200,7 +200,8 @@ def try_installed(version: str, wheels: list[Path]) -> None:
         programs = Path(folder) / "bin"
         run(str(programs / "python"), "-m", "pip", "install", "-q", "--no-index", "--no-deps", *map(str, wheels))
         ours, (new,) = Path(typer.__file__).parents[1], Path(folder).glob("lib/python*/site-packages")
-        # A folder named in a .pth file comes after the wheels, and its own .pth files (editable installs) do not count.
+        # A folder named in a .pth file comes after the wheels, and Python ignores the .pth files (editable installs) in
+        # it.
         (new / "dependencies.pth").write_text(f"{ours}\n")
         run(str(programs / "python"), "-c", _IMPORTED, version, *packages, cwd=folder)
         for program, argument in _PROGRAMS:
@@ -212,7 +213,10 @@ def try_installed(version: str, wheels: list[Path]) -> None:
 
 
 def run(*command: str, cwd: str | Path = ROOT, **variables: str) -> None:
-    """Run a command of the release. The sources of this checkout are not on its path. Raises UserError if it fails."""
+    """Run a command of the release.
+
+    The sources of this checkout are not on its path. Raises UserError if it fails.
+    """
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | variables
     print(f"$ {' '.join(Path(word).name if word == command[0] else word for word in command)[:150]}", flush=True)
     code = subprocess.run(command, cwd=cwd, env=environment).returncode

@@ -5,7 +5,7 @@
 
 `record` keeps the JSON of a run or a benchmark as results/<name>.json, with the commit, hardware and command that the
 run recorded itself, and with hashes of that commit's sources: they stay valid in a shallow clone and after a squash of
-the history, when nobody can look the commit up. `write` (`make results`) puts the tables and sentences of
+the history, where the commit is missing. `write` (`make results`) puts the tables and sentences of
 results/headline.toml, with their figures from these records, into the pages. tests/test_results.py fails if they do not
 agree.
 """
@@ -21,7 +21,7 @@ from typing import Annotated, Any
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer
@@ -74,7 +74,7 @@ class Record(BaseModel):
     @classmethod
     def _all_sources(cls, sources: dict[str, str]) -> dict[str, str]:
         if tuple(sources) != SOURCES:
-            raise ValueError(f"got hashes of {', '.join(sources)}, expected those of {', '.join(SOURCES)}")
+            raise ValueError(f"got hashes of {', '.join(sources)}, expected hashes of {', '.join(SOURCES)}")
         return sources
 
     @property
@@ -158,9 +158,9 @@ def record(
 ) -> None:
     """Keep the figures of runs or benchmarks as records."""
     for file in files:
-        found = _record_of(file)
+        record = _record_of(file)
         path = results / f"{record_name(file)}.json"
-        write_text(path, json.dumps(found.model_dump(exclude_defaults=True), indent=1) + "\n")
+        write_text(path, json.dumps(record.model_dump(exclude_defaults=True), indent=1) + "\n")
         print(path)
 
 
@@ -184,35 +184,38 @@ def record_name(file: Path) -> str:
 
 
 def _record_of(file: Path) -> Record:
-    """The record of a file. Raises UserError if it does not record how it was made, or was made by uncommitted code."""
+    """The record of a file.
+
+    Raises UserError if it does not record how it was made, or was made by uncommitted code.
+    """
     try:
         figures = json.loads(file.read_text(encoding="utf-8"))
         # Benchmarks write a table `run`, runs write keys that begin with run/.
-        made = figures.pop("run", None) or {
+        run = figures.pop("run", None) or {
             key.removeprefix("run/"): figures.pop(key) for key in list(figures) if key.startswith("run/")
         }
-        commit, hardware, command = (made[key] for key in ("commit", "hardware", "command"))
-        if made.get("gpu"):
-            hardware = f"{hardware}, {made['gpu']}"
+        commit, hardware, command = (run[key] for key in ("commit", "hardware", "command"))
+        if run.get("gpu"):
+            hardware = f"{hardware}, {run['gpu']}"
         name = f"{file.parent.name}/{file.name}"
-        found = Record(
+        record = Record(
             source=name,
             commit=commit,
             sources=_sources_of_run(file, commit),
-            date=made["date"],
+            date=run["date"],
             hardware=hardware,
-            load=made["load"],
-            # A run of a second working tree names this one by its absolute path.
+            load=run["load"],
+            # A run in another working tree may name files of this one by absolute paths.
             command=command.replace(f"{ROOT}/", ""),
             figures=figures,
         )
     except ValidationError as error:
-        raise UserError(file, "run", str(made), f"{_NEEDED}, with committed code: {error.errors()[0]['msg']}") from None
+        raise UserError(file, "run", str(run), f"{_NEEDED}, with committed code: {error.errors()[0]['msg']}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise UserError(file, "run", "no commit, hardware and command", _NEEDED) from None
-    if re.search(r"(^|[\s=])/", found.command):
+    if re.search(r"(^|[\s=])/", record.command):
         raise UserError(file, "run/command", command, "paths relative to the repository, so that others can run it")
-    return found
+    return record
 
 
 def _sources_of_run(file: Path, commit: str) -> dict[str, str]:
@@ -305,7 +308,7 @@ def figure(row: Figure, records: dict[str, Record]) -> float:
 
 
 def keys_of_figure(row: Figure, records: dict[str, Record]) -> tuple[str, ...]:
-    """The keys of a figure in its record: of the groups of a row, those of the least favourable figure."""
+    """The keys of a figure in its record; if the row has groups, the keys of its least favourable figure."""
     if not isinstance(row, Row) or not row.groups:
         return row.keys
     candidates = [tuple(key.replace("{group}", group) for key in row.keys) for group in row.groups]

@@ -1,4 +1,4 @@
-"""Put a trained run into the package, as the network that is installed by default; then write its card.
+"""Put a trained network into the package, as the default of its commands; then write its card.
 
     python scripts/ship.py install runs/detect/shipped --name crater-detector
     make benchmark
@@ -18,7 +18,7 @@ from typing import Annotated
 from perilune_shared.console.interrupts import end_at_interrupt
 
 if __name__ == "__main__":
-    # Not where another module imports this one.
+    # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
 import typer
@@ -50,7 +50,10 @@ def install(
     name: Name,
     eight_bits: Annotated[bool, typer.Option("--eight-bits", help="Store 8 bits per weight.")] = False,
 ) -> None:
-    """Write weights, configuration and metrics of a run into the package; a card of an earlier network is removed."""
+    """Write weights, configuration and metrics of a run into the package.
+
+    A card of an earlier network is removed.
+    """
     folder, source = _folder(name), RunFolder(run)
     content, metrics = load_weights(source.best), read_metrics(run)
     folder.mkdir(parents=True, exist_ok=True)

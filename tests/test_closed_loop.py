@@ -31,12 +31,12 @@ def test_guidance_leads_to_the_gate(example):
         velocity = velocity + acceleration * example.STEP_S
     assert np.linalg.norm(position - example.GATE_M) < 1.0
     assert np.linalg.norm(velocity - example.GATE_MPS) < 1.0
-    assert most < example.MOST_THRUST_MPS2
+    assert most < example.MAX_THRUST_MPS2
 
 
 def test_thrust_is_limited(example):
     assert np.isclose(
-        np.linalg.norm(example.guidance(np.array([5e3, 0, 900.0]), np.zeros(3), 5.0)), example.MOST_THRUST_MPS2
+        np.linalg.norm(example.guidance(np.array([5e3, 0, 900.0]), np.zeros(3), 5.0)), example.MAX_THRUST_MPS2
     )
 
 

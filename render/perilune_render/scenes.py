@@ -116,12 +116,12 @@ class Scene:
         "dataset.camera.width_px=512". The engine `cycles` needs Blender. Raises UserError if an argument cannot be
         used.
         """
-        given: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "scene.sun_elevation_deg": sun_elevation_deg,
             "scene.sun_azimuth_deg": sun_azimuth_deg,
             "seed": seed,
         }
-        changes = {name: value for name, value in given.items() if value is not None}
+        changes = {name: value for name, value in arguments.items() if value is not None}
         changes["render.engine"] = engine
         for name, value in changes.items():
             if not isinstance(value, str | int | float | np.integer | np.floating) or isinstance(value, bool):
@@ -131,7 +131,7 @@ class Scene:
         every = (*(f"dataset.{name}={value}" for name, value in changes.items()), *settings)
         if isinstance(source, Dataset) or (Path(source) / "dataset.json").is_file() or "://" in str(source):
             if seed is not None or settings:
-                raise UserError("Scene", "seed and settings", "given", "none: a dataset has its own")
+                raise UserError("Scene", "seed and settings", "given", "neither: a dataset has its own")
             dataset = source if isinstance(source, Dataset) else open_single(source)
             self.name = str(dataset.store)
             self._simulated = _simulation_of(dataset, sun_azimuth_deg, sun_elevation_deg, engine)
@@ -200,7 +200,10 @@ class Scene:
 
 
 def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
-    """The settings of a terrain, a preset, a file of settings or an elevation model. Raises UserError otherwise."""
+    """The settings of a terrain, a preset, a file of settings or an elevation model.
+
+    Raises UserError otherwise.
+    """
     name, path = str(source), Path(source)
     preset, file, settings_of_name, dem = _BASE, None, TERRAINS.get(name, ()), None
     if name in PRESETS:
@@ -221,7 +224,7 @@ def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
         raise UserError("Scene", error.field, error.found, error.expected) from None
     for section in ("survey", "counterfactual", "cameras"):
         if getattr(config, section):
-            raise UserError("Scene", f"dataset.{section}", "set", "none: a scene has one camera and given poses")
+            raise UserError("Scene", f"dataset.{section}", "set", "null: a scene has one camera and given poses")
     if dem is not None:
         config = config.model_copy(update={"terrain": config.terrain.model_copy(update={"dem": dem})})
     return config

@@ -44,8 +44,8 @@ SEARCH = {
     "reference/configuration/": {"boost": 0.5},
     "notebook/": {"exclude": True},
 }
-"""How the site's search ranks the pages of a folder: readers look for a recipe first, and the notebook is a record of
-earlier states. Here rather than in the front matter of each page, which the repository's own view of a page shows."""
+"""Rank of a folder's pages in the site's search: recipes come first; the notebook, a record of earlier states, is
+excluded. It is not in the front matter of the pages, because the repository's web view would show it."""
 
 
 def on_config(config: Any) -> Any:

@@ -1,10 +1,10 @@
-"""The table of PANGU's messages, from the server's own list."""
+"""Generate the table of PANGU's messages from the server's list."""
 
 from perilune_render.server.pangu.messages import FIRST_SETTING, MESSAGES
 
 _HEAD = """# PANGU's messages
 
-What `perilune-render serve` does with each message of PANGU's wire protocol 1.20. *answered*: with an effect or a
+How `perilune-render serve` responds to each message of PANGU's wire protocol 1.20. *answered*: with an effect or a
 value; *read*: acknowledged without effect; *refused*: an error, and the session goes on. How to use it:
 [Serve images](../how-to/serve.md).
 
@@ -13,7 +13,7 @@ value; *read*: acknowledged without effect; *refused*: an error, and the session
 
 def pangu_page() -> str:
     """The page as Markdown."""
-    rows = ["| Number | Message | Here | |", "|---|---|---|---|"]
+    rows = ["| Number | Message | Response | Note |", "|---|---|---|---|"]
     for number, message in MESSAGES.items():
         kind = "setting" if number >= FIRST_SETTING else "request"
         note = message.note or ("sets the viewpoint" if "Viewpoint" in message.name else "")

@@ -13,7 +13,10 @@ def processor_quota() -> float | None:
 
 
 def memory_left_bytes() -> float | None:
-    """Memory, in bytes, that the limits of this process's cgroup and its parents still allow; None without a limit."""
+    """Memory, in bytes, that the limits of this process's cgroup and its parents still allow.
+
+    Returns None without a limit.
+    """
     left = [float(limit - used) for limit, used in _pairs("memory") if limit >= 0]
     return min(left, default=None)
 

@@ -1,4 +1,6 @@
-"""A client of `perilune-render serve`: frames at any pose, as arrays. Needs the extra `client` (ZeroMQ).
+"""A client of `perilune-render serve`: frames at any pose, as arrays.
+
+Needs the extra `client` (ZeroMQ).
 
     from perilune_shared.client import SceneClient
 
@@ -34,7 +36,7 @@ CRATER_COLUMNS = (
 """Columns of the craters, as in the table `craters` of a manifest."""
 _TYPES = ("|u1", "<u2", "<f4", "<f8", "<i8")
 """Types of arrays that a reply may have."""
-_MOST_BYTES = 2_000_000_000
+_MAX_BYTES = 2_000_000_000
 _GROUND = {
     "dataset": str,
     "sun_azimuth_deg": float,
@@ -54,8 +56,8 @@ class ServedFrame:
     image: np.ndarray
     """Grey values, DN (h, w) uint8, or uint16 above 8 bits."""
     depth_m: np.ndarray | None
-    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not requested. With a
-    distorting lens it is in the pixels of the pinhole that covers the view."""
+    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not requested. If the lens
+    distorts, the pixels are those of an undistorted camera that covers the view."""
     normal: np.ndarray | None
     """Unit normals, O_L (h, w, 3) float32, in the same pixels; None if not requested."""
     labels: dict[str, np.ndarray] | None
@@ -144,11 +146,11 @@ class SceneClient:
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
     def health(self) -> dict[str, str]:
-        """Names and addresses (host:port) of the server's interfaces.
+        """Check that the server answers at each interface; return names and addresses (host:port).
 
-        The server has just connected to each. Raises UserError, as other requests do; the error names an interface that
-        does not answer. The reply comes after earlier requests of other clients, so it also shows that frames are
-        rendered.
+        The server connects to each interface before it replies. Raises UserError, as other requests do; the error names
+        an interface that does not answer. The reply comes after earlier requests of other clients, so it also shows
+        that frames are rendered.
         """
         head, _ = self._ask({"request": "health"})
         try:
@@ -233,7 +235,10 @@ class SceneClient:
             time.sleep(_POLL_S)
 
     def _ask_until_answered(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Send a request, repeatedly while the server is busy; returns the head of the reply and its arrays by name."""
+        """Send a request, repeatedly while the server is busy.
+
+        Returns the head of the reply and its arrays by name.
+        """
         end = time.monotonic() + self._timeout_ms / 1000
         while True:
             head, arrays = self._ask_once(request)
@@ -278,6 +283,6 @@ def _array(stated: dict[str, Any], content: bytes) -> np.ndarray:
     shape = tuple(int(side) for side in stated["shape"])
     kind = np.dtype(stated["dtype"])
     n_bytes = kind.itemsize * int(np.prod(shape, dtype=np.float64)) if min(shape, default=0) >= 0 else -1
-    if n_bytes != len(content) or n_bytes > _MOST_BYTES:
+    if n_bytes != len(content) or n_bytes > _MAX_BYTES:
         raise ValueError(f"{len(content)} bytes for shape {shape}")
     return np.frombuffer(content, kind).reshape(shape)

@@ -20,7 +20,9 @@ _ANGLES = np.linspace(0, 2 * np.pi, 65)
 
 
 def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, int, int]] | None = None) -> "Image":
-    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits; `colours` has N colours, by default all cyan.
+    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits.
+
+    `colours` has N colours, by default all cyan.
 
     An ellipse has the columns of labels: centre x and y, semi-axes a and b, pixels, and the direction of a,
     radians. A 16-bit image is scaled so that its largest value is white.
@@ -53,7 +55,7 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
 
 
 def display(picture: "Image") -> None:
-    """Display a picture in the notebook that runs this process; without one, open it in the system's viewer."""
+    """Display a picture in the notebook that runs this process, or else in the system's viewer."""
     if "ipykernel" in sys.modules:
         from IPython.display import display as show_in_notebook
 

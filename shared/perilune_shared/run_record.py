@@ -35,7 +35,10 @@ class RunRecord:
 
 @functools.cache
 def run_record() -> RunRecord:
-    """Return the record of this process. The first call creates it, so call this function when the program starts."""
+    """Return the record of this process.
+
+    The first call creates it, so call this function when the program starts.
+    """
     return RunRecord(_commit(), _hardware(), round(_load(), 1), _command(), f"{datetime.now(UTC):%Y-%m-%d}")
 
 

@@ -33,12 +33,12 @@ libgomp's default is about 300,000. The values were chosen by measurement (docs/
 """
 NUMBERS_OF_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Environment variables for the number of threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL and OpenCV."""
-_MOST_THREADS = 1024
+_MAX_THREADS = 1024
 _PATTERNS = {
     **dict.fromkeys(
-        (*NUMBERS_OF_THREADS, "NUMBA_NUM_THREADS"), (r"\d+", f"a number of threads from 1 to {_MOST_THREADS}")
+        (*NUMBERS_OF_THREADS, "NUMBA_NUM_THREADS"), (r"\d+", f"a number of threads from 1 to {_MAX_THREADS}")
     ),
-    "OMP_NUM_THREADS": (r"\d+(\s*,\s*\d+)*", f"a number of threads from 1 to {_MOST_THREADS}"),
+    "OMP_NUM_THREADS": (r"\d+(\s*,\s*\d+)*", f"a number of threads from 1 to {_MAX_THREADS}"),
     "GOMP_SPINCOUNT": (r"\d+\s*[kKmMgGtT]?|INFINITE|INFINITY", "a number of rounds, or INFINITY"),
     "OMP_WAIT_POLICY": (r"ACTIVE|PASSIVE", "ACTIVE or PASSIVE"),
 }
@@ -90,7 +90,7 @@ def _check() -> None:
     for name, (pattern, expected) in _PATTERNS.items():
         value = os.environ.get(name, "").strip()
         numbers = [int(number) for number in re.findall(r"\d+", value)] if name.endswith(("THREADS", "NUM")) else []
-        out_of_range = not all(1 <= number <= _MOST_THREADS for number in numbers)
+        out_of_range = not all(1 <= number <= _MAX_THREADS for number in numbers)
         if value and (out_of_range or not re.fullmatch(pattern, value, re.IGNORECASE)):
             raise UserError("environment", name, value, expected)
 

@@ -25,14 +25,14 @@ def counterfactual(
     out: Annotated[str, typer.Option(help="Folder or address of the new dataset.")],
     split: Annotated[Split, typer.Option(help="Split whose frames are rendered again.")] = "test",
     frames_per_trajectory: Annotated[
-        int, typer.Option(min=1, help="Frames of each trajectory, evenly spaced over those of the split.")
+        int, typer.Option(min=1, help="Frames of each trajectory, evenly spaced in the split.")
     ] = 6,
     craters_per_scene: Annotated[
         int, typer.Option(min=0, max=1000, help="Craters to remove from the ground of each scene.")
     ] = 6,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the choice of craters.")] = 0,
     sun_azimuth_offset_deg: Annotated[
-        float, typer.Option(help="Azimuth of the Sun, relative to that of the dataset, clockwise, degrees.")
+        float, typer.Option(help="Azimuth of the Sun, clockwise from the dataset's Sun, degrees.")
     ] = 0.0,
     dem: Annotated[Path | None, typer.Option(help="Elevation model that the manifest's recipe names.")] = None,
     catalogue: Annotated[Path | None, typer.Option(help="Crater catalogue that the manifest's recipe names.")] = None,
@@ -51,25 +51,25 @@ def counterfactual(
     # Check before reading the manifest, which takes seconds.
     resolve_over(CounterfactualConfig, "counterfactual", "--sun-azimuth-offset-deg", _sun(sun_azimuth_offset_deg))
     options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
-    given, store, table = ps.open_dataset(manifest), open_store(out), _table_beside(out)
+    source, store, table = ps.open_dataset(manifest), open_store(out), _table_beside(out)
     from perilune_render.dataset.begin import new_info
     from perilune_render.dataset.from_manifest import plan_from_manifest
     from perilune_render.flight.counterfactual import craters_to_remove, part_of
     from perilune_render.jobs.job import Job
     from perilune_render.provenance.recipe import recipe_of
 
-    plan, config, info = plan_from_manifest(given, dem, catalogue)
+    plan, config, info = plan_from_manifest(source, dem, catalogue)
     if config.survey is not None or config.counterfactual is not None:
         found = "a survey" if config.survey is not None else "a counterfactual"
         raise UserError(manifest, "recipe", found, "descents over unchanged ground")
     plan = part_of(plan, split, frames_per_trajectory, sun_azimuth_offset_deg)
-    craters = craters_to_remove(given, plan, craters_per_scene, seed)
+    craters = craters_to_remove(source, plan, craters_per_scene, seed)
     removed: dict[int, list[int]] = {}
     for scene in plan.scenes:
-        own = craters.loc[craters["seed"] == scene.seed, "crater_id"].tolist()
-        n_found = len(own)
-        if own:
-            removed[scene.seed] = own
+        ids = craters.loc[craters["seed"] == scene.seed, "crater_id"].tolist()
+        n_found = len(ids)
+        if ids:
+            removed[scene.seed] = ids
         if n_found < craters_per_scene:
             line = (
                 f"{scene.scene_id}: {n_found} of {craters_per_scene} craters are removed; no more are far enough apart"
@@ -80,13 +80,13 @@ def counterfactual(
     config = config.model_copy(update={"counterfactual": settings})
     recipe = recipe_of(config, info.kind, info.recipe().preset)
     name = f"{info.name}-counterfactual"
-    kept = {"name": name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
-    begun = new_info(config, plan, recipe).model_copy(update=kept)
-    made = finished_or_exit(Job(plan, config, begun, manifest), store, options)
-    if made is not None:
+    metadata = {"name": name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
+    begun = new_info(config, plan, recipe).model_copy(update=metadata)
+    dataset = finished_or_exit(Job(plan, config, begun, manifest), store, options)
+    if dataset is not None:
         _write(craters, *table)
         answer(
-            f"{made.store}: {made.info.counts.frames} frames over {made.info.counts.scenes} scenes; "
+            f"{dataset.store}: {dataset.info.counts.frames} frames over {dataset.info.counts.scenes} scenes; "
             f"{len(craters)} craters removed, listed in {table[0].at(table[1])}"
         )
 

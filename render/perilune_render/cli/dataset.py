@@ -74,9 +74,9 @@ class JobOptions:
         dry_run: bool,
     ) -> "JobOptions":
         """Check the options of a command. Raises UserError on a malformed shard or on conflicting options."""
-        given = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
-        if len(given) > 1:
-            raise UserError("dataset", "options", " and ".join(given), "one of them")
+        chosen = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
+        if len(chosen) > 1:
+            raise UserError("dataset", "options", " and ".join(chosen), "one of them")
         matched = re.fullmatch(r"([1-9]\d{0,6})/([1-9]\d{0,6})", shard) if shard is not None else None
         numbers = (int(matched[1]), int(matched[2])) if matched is not None else None
         if shard is not None and (numbers is None or numbers[0] > numbers[1]):
@@ -142,8 +142,10 @@ def dataset(
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
     options = JobOptions.of(executor, address, workers, threads, shard, finish, dry_run)
     if manifest is not None:
-        given = [name for name in ("preset", "config", "setting", "height_unit", "kind") if was_given(context, name)]
-        _render_manifest(manifest, out, dem, catalogue, given, options)
+        other_options = [
+            name for name in ("preset", "config", "setting", "height_unit", "kind") if was_given(context, name)
+        ]
+        _render_manifest(manifest, out, dem, catalogue, other_options, options)
         return
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
@@ -158,16 +160,16 @@ def dataset(
         warn_of_suns(resolved, kinds)
         for name in kinds:
             try:
-                made = _made(Job.planned(resolved, name, preset), store.sub(name), options, early)
+                finished = _run_job(Job.planned(resolved, name, preset), store.sub(name), options, early)
             except RenderingFailed as error:
                 _print_failures(error)
                 failed = True
                 continue
-            if made is not None:
-                counts = made.info.counts
+            if finished is not None:
+                counts = finished.info.counts
                 answer(
-                    f"{made.store}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
-                    f"look at {made.store.at('overview.png')}"
+                    f"{finished.store}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
+                    f"look at {finished.store.at('overview.png')}"
                 )
     if failed:
         raise typer.Exit(1)
@@ -182,7 +184,7 @@ def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.Abst
     return early_worker(config.render.engine)
 
 
-def _made(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
+def _run_job(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
     """Estimate, render or finish; return a finished dataset. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
@@ -201,7 +203,7 @@ def _made(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = 
         if options.shard is None:
             return render_job(job, out, progress, _executor(options, early))
         n_rendered = render_shard(job, out, Shard(*options.shard), progress, _executor(options, early))
-    answer(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish")
+    answer(f"{out}: {n_rendered} trajectories rendered; run with --finish after all shards")
     return None
 
 
@@ -210,7 +212,7 @@ def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker
     from perilune_render.jobs.run import RenderingFailed
 
     try:
-        return _made(job, out, options, early)
+        return _run_job(job, out, options, early)
     except RenderingFailed as error:
         _print_failures(error)
         raise typer.Exit(1) from None
@@ -229,16 +231,16 @@ def _print_estimate(job: "Job", out: Store, options: JobOptions, early: "Worker 
     from perilune_render.jobs.estimate import estimate
 
     with progress_bar() as progress:
-        found = estimate(job, out, progress, _executor(options, early), options.workers or 1)
-    hours = f"{found.seconds / 3600:.2f} hours" if found.seconds > 360 else f"{found.seconds:.0f} seconds"
-    size = next(f"{found.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if found.n_bytes >= 10**n or n == 0)
-    answer(f"{out}: {found.n_frames} frames left, {hours}, {size}")
+        estimated = estimate(job, out, progress, _executor(options, early), options.workers or 1)
+    hours = f"{estimated.seconds / 3600:.2f} hours" if estimated.seconds > 360 else f"{estimated.seconds:.0f} seconds"
+    size = next(f"{estimated.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if estimated.n_bytes >= 10**n or n == 0)
+    answer(f"{out}: {estimated.n_frames} frames left, {hours}, {size}")
 
 
 def _print_failures(error: "RenderingFailed") -> None:
     for name, text in error.errors.items():
         say(f"error: {error.out}: {name}: {text}")
-    again = "run the same command again to try them again"
+    again = "run the same command again to retry"
     say(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}")
 
 
@@ -260,22 +262,29 @@ def _executor(options: JobOptions, early: "Worker | None") -> "MakeExecutor":
 
 
 def _render_manifest(
-    manifest: str, out: str | None, dem: Path | None, catalogue: Path | None, others: list[str], options: JobOptions
+    manifest: str,
+    out: str | None,
+    dem: Path | None,
+    catalogue: Path | None,
+    other_options: list[str],
+    options: JobOptions,
 ) -> None:
-    if out is None or others:
-        found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
+    if out is None or other_options:
+        found = (
+            "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in other_options)
+        )
         expected = (
             "--out, and --dem and --catalogue if the recipe names them; all other settings come from the manifest"
         )
         raise UserError("--manifest", "options", found, expected)
-    given, store = ps.open_dataset(manifest), open_store(out)
+    source, store = ps.open_dataset(manifest), open_store(out)
     from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
     from perilune_render.jobs.job import Job
 
-    made = finished_or_exit(Job(*plan_from_manifest(given, dem, catalogue), manifest), store, options)
-    if made is None:
+    finished = finished_or_exit(Job(*plan_from_manifest(source, dem, catalogue), manifest), store, options)
+    if finished is None:
         return
-    same, known, other_scenes = compare_hashes(given, made)
+    same, known, other_scenes = compare_hashes(source, finished)
     comparison = f"; {same} of {known} frames are byte-identical to the manifest's" if known else ""
     comparison += f"; terrain hash mismatch in {other_scenes} scenes" if other_scenes else "; terrain hashes match"
-    answer(f"{store}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}")
+    answer(f"{store}: {finished.info.counts.frames} frames, {finished.info.counts.labels} labels{comparison}")

@@ -77,14 +77,17 @@ def frames(
         from perilune_render.provenance.recipe import recipe_of
         from perilune_render.terrain.scene import site_of
 
-        given = read_poses(poses, *site_of(config), camera_axes)
-        plan, config = given_plan(given, config, kind, poses)
+        given_poses = read_poses(poses, *site_of(config), camera_axes)
+        plan, config = given_plan(given_poses, config, kind, poses)
         warn_of_sun(config, "sun_elevation_deg", max(scene.sun_elevation_deg for scene in plan.scenes))
         begun = new_info(config, plan, recipe_of(config, kind, preset))
-        made = finished_or_exit(Job(plan, config, begun, str(poses)), store, options, early)
-    if made is not None:
-        counts = made.info.counts
-        answer(f"{made.store}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}")
+        dataset = finished_or_exit(Job(plan, config, begun, str(poses)), store, options, early)
+    if dataset is not None:
+        counts = dataset.info.counts
+        answer(
+            f"{dataset.store}: {counts.frames} frames, {counts.labels} labels; "
+            f"look at {dataset.store.at('overview.png')}"
+        )
 
 
 def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:

@@ -80,9 +80,9 @@ def develop(
     from perilune_render.dataset.develop import develop_dataset
 
     with progress_bar() as progress:
-        made = develop_dataset(ps.open_dataset(dataset), out, progress, config, tuple(setting or ()))
-    counts = made.info.counts
-    answer(f"{out}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}")
+        developed = develop_dataset(ps.open_dataset(dataset), out, progress, config, tuple(setting or ()))
+    counts = developed.info.counts
+    answer(f"{out}: {counts.frames} frames, {counts.labels} labels; look at {developed.store.at('overview.png')}")
 
 
 @app.command()
@@ -110,9 +110,13 @@ def plan(
 
     if manifest is not None:
         options = ("preset", "config", "setting", "dem", "height_unit", "catalogue", "kind")
-        given = [name.replace("_", "-").replace("setting", "set") for name in options if was_given(context, name)]
-        if given:
-            raise UserError("--manifest", "options", f"--{given[0]}", "--out alone: the rest comes from the manifest")
+        other_options = [
+            name.replace("_", "-").replace("setting", "set") for name in options if was_given(context, name)
+        ]
+        if other_options:
+            raise UserError(
+                "--manifest", "options", f"--{other_options[0]}", "--out alone: the rest comes from the manifest"
+            )
         replaced = replaceable(out, ("dataset.json",), overwrite=overwrite, inputs=(manifest,))
         with replaced as folder, progress_bar() as progress:
             write_left_out_frames(ps.open_dataset(manifest), folder, progress)

@@ -100,12 +100,12 @@ def resolved_config(
             "--catalogue", "catalogue", terrain.catalogue, "also --dem, the elevation model of this catalogue"
         )
     for name in (*SITE_FIELDS, *FILE_FIELDS):
-        found = getattr(terrain.elevation, name)
-        if found != ElevationConfig.model_fields[name].default and terrain.dem is None:
+        value = getattr(terrain.elevation, name)
+        if value != ElevationConfig.model_fields[name].default and terrain.dem is None:
             raise UserError(
                 "configuration",
                 f"dataset.terrain.elevation.{name}",
-                found,
+                value,
                 "to be set only with --dem, an elevation model",
             )
     return resolved.model_copy(update={"terrain": terrain})

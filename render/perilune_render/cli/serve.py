@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _PORT = 10363
 _NATIVE_PORT = 10364
 _LOOPBACK = "127.0.0.1"
-_OWN = (_LOOPBACK, "::1", "localhost")
+_LOCAL_HOSTS = (_LOOPBACK, "::1", "localhost")
 """Loopback addresses, which only this machine can reach."""
 _Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
 
@@ -58,7 +58,7 @@ def serve(
     """Serve images from any pose over a scene to clients of PANGU's protocol and of `perilune_shared.client`."""
     config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True)
     if config.cameras:
-        expected = "none: the server has one dataset.camera"
+        expected = "null: the server has one dataset.camera"
         raise UserError("configuration", "dataset.cameras", ", ".join(config.cameras), expected)
     if camera is not None:
         config = config.model_copy(update={"camera": read_camera(camera)})
@@ -83,7 +83,7 @@ def serve(
 
         pangu = Interface("PANGU", host, port, handle, greets, limits)
         native = Native(grounds, limits, say, [pangu])
-        own = native.interface(host, native_port)
+        native_interface = native.interface(host, native_port)
         server = Server(native.interfaces, say)
         server.begin()
         stated = config.scene or SceneConfig()
@@ -101,12 +101,12 @@ def serve(
             "camera and Sun"
         )
         say(
-            "not documented either, and fixed here: first viewpoint 1000 m above the site, straight down; a pulse that "
-            "misses has range 0 and cosine 0; error codes 1 (refused) and 2 (faulty); docs/reference/pangu.md has the "
-            "rest"
+            "PANGU does not document these either; here they are fixed: first viewpoint 1000 m above the site, "
+            "straight down; a pulse that misses has range 0 and cosine 0; error codes 1 (refused) and 2 (faulty); for "
+            "the rest see docs/reference/pangu.md"
         )
-        say(f"perilune_shared.client at {native_address(host, own.port)}")
-        if host not in _OWN:
+        say(f"perilune_shared.client at {native_address(host, native_interface.port)}")
+        if host not in _LOCAL_HOSTS:
             say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
         server.run()
 

@@ -33,7 +33,7 @@ def spice(
     site_height_m: Annotated[
         float | None,
         typer.Option(
-            min=-20_000, max=20_000, help="Height of the site above 1737.4 km, metres. [default: that of --dem, or 0]"
+            min=-20_000, max=20_000, help="Height of the site above 1737.4 km, metres. [default: from --dem, or 0]"
         ),
     ] = None,
     scene: Scene = None,
@@ -51,12 +51,12 @@ def spice(
     from perilune_render.terrain.scene import model_of, site_of
 
     source = SpiceSource(tuple(kernels), spacecraft, camera_frame, camera_axes, fixed_frame, start, end, frames, step_s)
-    place, model = site_of(config), model_of(config.terrain)
+    site, model = site_of(config), model_of(config.terrain)
     height = site_height_m if site_height_m is not None else 0.0 if model is None else height_of_site_m(model)
-    poses = read_spice(source, *place, height)
-    write_text(out, poses_csv(poses, source, *place, height))
+    poses = read_spice(source, *site, height)
+    write_text(out, poses_csv(poses, source, *site, height))
     answer(
         f"{out}: {len(poses.time_s)} poses from {poses.start} UTC relative to {poses.fixed_frame}; site at "
-        f"{place[0]:.6f}, {place[1]:.6f}, {height:.1f} m above 1737.4 km; height above the site "
+        f"{site[0]:.6f}, {site[1]:.6f}, {height:.1f} m above 1737.4 km; height above the site "
         f"{poses.position_m[0, 2]:.1f} to {poses.position_m[-1, 2]:.1f} m; Sun {poses.sun_deg[0, 1]:.2f} degrees high"
     )

@@ -15,18 +15,18 @@ def status(
     from perilune_render.jobs.status import SILENT_S, datasets_below, status_of
 
     for store in datasets_below(open_store(address)):
-        found = status_of(store)
+        state = status_of(store)
         lines = [
-            f"{store.address}: {'complete' if found.complete else 'in progress'}",
-            f"  trajectories  {found.n_done} of {found.n_trajectories} done, {len(found.running)} running, "
-            f"{len(found.failed)} failed",
-            f"  frames        {found.frames_done} of {found.n_frames}",
+            f"{store.address}: {'complete' if state.complete else 'in progress'}",
+            f"  trajectories  {state.n_done} of {state.n_trajectories} done, {len(state.running)} running, "
+            f"{len(state.failed)} failed",
+            f"  frames        {state.frames_done} of {state.n_frames}",
         ]
-        if found.left_s is not None:
-            lines.append(f"  speed         {found.frames_per_s:.1f} frames/s, {found.left_s / 3600:.2f} hours left")
-        lines += [f"  running       {name}" for name in found.running]
-        if found.n_silent:
-            lines.append(f"  silent        {found.n_silent} processes, for {SILENT_S:.0f} s or more")
-        lines += [f"  failed        {name}: {error}" for name, error in found.failed.items()]
+        if state.left_s is not None:
+            lines.append(f"  speed         {state.frames_per_s:.1f} frames/s, {state.left_s / 3600:.2f} hours left")
+        lines += [f"  running       {name}" for name in state.running]
+        if state.n_silent:
+            lines.append(f"  silent        {state.n_silent} processes, for {SILENT_S:.0f} s or more")
+        lines += [f"  failed        {name}: {error}" for name, error in state.failed.items()]
         # Other processes wrote the names and messages; a line break in one must not start a line.
         answer_page("\n".join("".join(line.splitlines()) for line in lines))

@@ -25,9 +25,10 @@ def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None
     latitude = _stated_latitude_deg(config)
     if latitude is None or elevation_deg <= highest_sun_deg(latitude):
         return
-    place = f"{abs(latitude):.1f} degrees {'south' if latitude < 0 else 'north'}"
+    latitude_text = f"{abs(latitude):.1f} degrees {'south' if latitude < 0 else 'north'}"
     say(
-        f"warning: {where}: got {elevation_deg:g} degrees, expected at most {highest_sun_deg(latitude):.1f}: at {place}"
+        f"warning: {where}: got {elevation_deg:g} degrees, expected at most {highest_sun_deg(latitude):.1f}: "
+        f"at {latitude_text}"
         " the Sun is never higher"
     )
 

@@ -53,25 +53,30 @@ def survey(
     }
     settings = resolve_over(SurveyConfig, "survey", "survey", values)
     options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
-    given, store = ps.open_dataset(manifest), open_store(out)
+    source, store = ps.open_dataset(manifest), open_store(out)
     from perilune_render.dataset.begin import new_info
     from perilune_render.dataset.from_manifest import plan_from_manifest
     from perilune_render.flight.survey import survey_plan
     from perilune_render.jobs.job import Job
     from perilune_render.provenance.recipe import recipe_of
 
-    plan, config, info = plan_from_manifest(given, dem, catalogue)
+    plan, config, info = plan_from_manifest(source, dem, catalogue)
     if config.survey is not None:
         raise UserError(manifest, "recipe", "a survey", "descents")
     config = config.model_copy(update={"survey": settings})
     plan = survey_plan(plan, config)
     recipe = recipe_of(config, info.kind, info.recipe().preset)
-    kept = {"name": f"{info.name}-survey", "split_by": info.split_by, "history": info.history, "licence": info.licence}
-    begun = new_info(config, plan, recipe).model_copy(update=kept)
-    made = finished_or_exit(Job(plan, config, begun, manifest), store, options)
-    if made is not None:
-        counts = made.info.counts
+    metadata = {
+        "name": f"{info.name}-survey",
+        "split_by": info.split_by,
+        "history": info.history,
+        "licence": info.licence,
+    }
+    begun = new_info(config, plan, recipe).model_copy(update=metadata)
+    dataset = finished_or_exit(Job(plan, config, begun, manifest), store, options)
+    if dataset is not None:
+        counts = dataset.info.counts
         answer(
-            f"{made.store}: {counts.frames} frames of {plan.camera.width_px} px over {counts.scenes} scenes; "
-            f"make catalogues from them with `perilune-train navigate map --dataset {made.store}`"
+            f"{dataset.store}: {counts.frames} frames of {plan.camera.width_px} px over {counts.scenes} scenes; "
+            f"make catalogues from them with `perilune-train navigate map --dataset {dataset.store}`"
         )

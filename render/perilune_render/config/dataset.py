@@ -26,11 +26,11 @@ from perilune_shared.dataset.names import SplitUnit
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.labels.thresholds import default_label_bound_px
 
-MOST_TRAJECTORIES, MOST_FRAMES = 200_000, 10_000_000
+MAX_TRAJECTORIES, MAX_FRAMES = 200_000, 10_000_000
 """Largest numbers of trajectories and frames of a dataset; all trajectories are planned before the first frame."""
-MOST_MEASUREMENTS = 10_000_000
+MAX_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
-_LEAST_LIMIT = 3.0
+_MIN_LIMIT_SIGMAS = 3.0
 """Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis; about half of all draws
 stay below it."""
 
@@ -67,11 +67,11 @@ class FlightConfig(Section):
 
     @model_validator(mode="after")
     def _limit_can_be_kept(self) -> "FlightConfig":
-        least = _LEAST_LIMIT * 3**0.5 * self.position_sigma_m / self.correlation_time_s**2
+        least = _MIN_LIMIT_SIGMAS * 3**0.5 * self.position_sigma_m / self.correlation_time_s**2
         if self.max_perturbation_mps2 is not None and self.max_perturbation_mps2 < least:
             raise ValueError(
-                f"max_perturbation_mps2 at least {least:.3g}, {_LEAST_LIMIT:g} standard deviations of the acceleration "
-                f"on each axis, sqrt(3) position_sigma_m / correlation_time_s^2"
+                f"max_perturbation_mps2 at least {least:.3g}, {_MIN_LIMIT_SIGMAS:g} standard deviations of the "
+                f"acceleration on each axis, sqrt(3) position_sigma_m / correlation_time_s^2"
             )
         return self
 
@@ -125,7 +125,7 @@ class KindConfig(Section):
     val_share: Share = 0.1
     """Share of scenes, trajectories or frames (`split_by`) in the validation split."""
     test_share: Share = 0.1
-    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 makes a test set alone."""
+    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 assigns all to it."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()
@@ -136,21 +136,21 @@ class KindConfig(Section):
     @model_validator(mode="after")
     def _fits(self) -> "KindConfig":
         trajectories = self.n_scenes * self.trajectories_per_scene
-        if trajectories > MOST_TRAJECTORIES:
+        if trajectories > MAX_TRAJECTORIES:
             product = f"n_scenes x trajectories_per_scene, which is {trajectories}"
-            raise ValueError(f"{product}, at most {MOST_TRAJECTORIES}: lower one of them")
+            raise ValueError(f"{product}, at most {MAX_TRAJECTORIES}: lower one of them")
         frames = trajectories * self.n_frames
-        if frames > MOST_FRAMES:
+        if frames > MAX_FRAMES:
             product = f"n_scenes x trajectories_per_scene x n_frames, which is {frames}"
-            raise ValueError(f"{product}, at most {MOST_FRAMES}: lower one of them")
+            raise ValueError(f"{product}, at most {MAX_FRAMES}: lower one of them")
         rate_hz = max(
             self.instruments.inertial_rate_hz if self.instruments.inertial_grades else 0, self.instruments.range_rate_hz
         )
         measurements = rate_hz * self.flight.duration_s
-        if measurements > MOST_MEASUREMENTS:
+        if measurements > MAX_MEASUREMENTS:
             raise ValueError(
                 f"rate x flight.duration_s, which is {measurements:.3g} measurements of one instrument, at most "
-                f"{MOST_MEASUREMENTS}: lower instruments.inertial_rate_hz, range_rate_hz or flight.duration_s"
+                f"{MAX_MEASUREMENTS}: lower instruments.inertial_rate_hz, range_rate_hz or flight.duration_s"
             )
         return self
 

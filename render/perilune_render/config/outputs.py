@@ -7,9 +7,9 @@ from pydantic import Field, model_validator
 from perilune_render.config.values import Deviation, Length, Share
 from perilune_shared.config.resolve import Section
 
-_LEAST_PX, _MOST_PX = 3, 100
+_MIN_PX, _MAX_PX = 3, 100
 """Smallest and largest footprint, pixels: fitting a plane needs 3, and run time grows with the square."""
-_MOST_SIDE_PX = 2048
+_MAX_SIDE_PX = 2048
 _ROUNDING = 1e-9
 
 
@@ -35,10 +35,10 @@ class HazardConfig(Section):
 
     @model_validator(mode="after")
     def _of_pixels(self) -> "HazardConfig":
-        if not _LEAST_PX <= self.footprint_m / self.pixel_m * (1 + _ROUNDING) <= _MOST_PX:
-            raise ValueError(f"footprint_m of {_LEAST_PX} to {_MOST_PX} pixel_m, which is {self.pixel_m:g}")
-        if not 1 <= self.side_px() <= _MOST_SIDE_PX:
-            raise ValueError(f"extent_m of 1 to {_MOST_SIDE_PX} pixel_m, which is {self.pixel_m:g}")
+        if not _MIN_PX <= self.footprint_m / self.pixel_m * (1 + _ROUNDING) <= _MAX_PX:
+            raise ValueError(f"footprint_m of {_MIN_PX} to {_MAX_PX} pixel_m, which is {self.pixel_m:g}")
+        if not 1 <= self.side_px() <= _MAX_SIDE_PX:
+            raise ValueError(f"extent_m of 1 to {_MAX_SIDE_PX} pixel_m, which is {self.pixel_m:g}")
         return self
 
     def side_px(self) -> int:

@@ -151,8 +151,8 @@ class ElevationConfig(Section):
     @model_validator(mode="after")
     def _one_pair(self) -> "ElevationConfig":
         values = {name: getattr(self, name) for name in SITE_FIELDS}
-        given = tuple(name for name, value in values.items() if value is not None)
-        if given not in ((), SITE_FIELDS[:2], SITE_FIELDS[2:]):
+        stated = tuple(name for name, value in values.items() if value is not None)
+        if stated not in ((), SITE_FIELDS[:2], SITE_FIELDS[2:]):
             raise ValueError(f"{' and '.join(SITE_FIELDS[:2])}, or {' and '.join(SITE_FIELDS[2:])}, or none of them")
         return self
 

@@ -129,15 +129,15 @@ def open_finished(store: Store) -> Dataset:
 
 def check_code(recipe: Recipe, *, with_dem: bool) -> None:
     """Raise UserError if code or libraries of this process differ from a recipe."""
-    found = all_versions(
+    current = all_versions(
         with_dem=with_dem,
         engine=recipe.config.get("render", {}).get("engine", "cycles"),
         outputs="hazard" in recipe.config or "flash_lidar" in recipe.config,
     )
-    recorded, found = (_without_releases(versions) for versions in (recipe.versions, found))
-    if recorded != found:
+    recorded, current = (_without_releases(versions) for versions in (recipe.versions, current))
+    if recorded != current:
         expected = "the code that the rendering began with: render with one version from start to end"
-        raise UserError("perilune_render", "versions", first_difference(recorded, found), expected)
+        raise UserError("perilune_render", "versions", first_difference(recorded, current), expected)
 
 
 def _compared(recipe: Recipe, name: str) -> object:

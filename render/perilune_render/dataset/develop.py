@@ -155,11 +155,11 @@ def _develop(
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
     """The source's settings with the user's changes, which may affect only the sensor and the camera."""
     where = str(source.store.at("dataset.json"))
-    given = settings_of(source.info.recipe())
-    before = resolve_over(DatasetConfig, "dataset", where, given)
-    after = resolve_over(DatasetConfig, "dataset", where, given, config_file, settings)
-    kept = set(DatasetConfig.model_fields) - {"sensor", "camera", "cameras"}
-    fixed_before, fixed_after = before.model_dump(include=kept), after.model_dump(include=kept)
+    source_settings = settings_of(source.info.recipe())
+    before = resolve_over(DatasetConfig, "dataset", where, source_settings)
+    after = resolve_over(DatasetConfig, "dataset", where, source_settings, config_file, settings)
+    fixed_fields = set(DatasetConfig.model_fields) - {"sensor", "camera", "cameras"}
+    fixed_before, fixed_after = before.model_dump(include=fixed_fields), after.model_dump(include=fixed_fields)
     for fixed, config in ((fixed_before, before), (fixed_after, after)):
         fixed["cameras"] = {name: camera.mounting.model_dump() for name, camera in config.cameras.items()}
     if fixed_before != fixed_after:
@@ -194,7 +194,7 @@ def _rig(source: Dataset, config: DatasetConfig) -> Rig:
                 "dataset.camera" if name is None else f"dataset.cameras.{name}",
                 f"a view that the EXRs ({exr_camera.width_px} x {exr_camera.height_px} px, focal length"
                 f" {exr_camera.fx_px:.6g} px) do not cover",
-                "a view within that of the EXRs",
+                "a view that the EXRs cover",
             )
     return rig
 

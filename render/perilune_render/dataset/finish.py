@@ -64,11 +64,11 @@ def remove_work(store: Store) -> None:
     store.delete_below(work.FOLDER)
 
 
-def _read_ahead(read: Callable[[_Name], _Rows], given: Iterable[_Name]) -> Iterator[tuple[_Name, _Rows]]:
-    """Yield each of `given` with the result of `read`, in order; several calls run at the same time."""
+def _read_ahead(read: Callable[[_Name], _Rows], names: Iterable[_Name]) -> Iterator[tuple[_Name, _Rows]]:
+    """Yield each of `names` with the result of `read`, in order; several calls run at the same time."""
     waiting: deque[tuple[_Name, Future[_Rows]]] = deque()
     with ThreadPoolExecutor(_AHEAD) as readers:
-        for each in given:
+        for each in names:
             waiting.append((each, readers.submit(read, each)))
             if len(waiting) > _AHEAD:
                 first, future = waiting.popleft()

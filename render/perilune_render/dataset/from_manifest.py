@@ -69,8 +69,8 @@ def plan_from_manifest(
     }
     plan = Plan(rig, view, tuple(scenes), recorded, ranges)
     begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
-    kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
-    return plan, config, begun.model_copy(update=kept)
+    metadata = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
+    return plan, config, begun.model_copy(update=metadata)
 
 
 def _rig_of_frames(manifest: Dataset, rig: Rig) -> Rig:
@@ -129,8 +129,8 @@ class Recorded(Sequence[TrajectoryPlan]):
             pc.binary_join_element_wise(*(table[key] for key in keys), "/") for table in (trajectories, frames)
         )
         if trajectories.num_rows and not frames.num_rows:
-            expected = "its frames: write the whole manifest with `perilune-render plan --manifest ... --out FOLDER`"
-            raise UserError(manifest.store.at("manifest/frames"), "frames", "none: they were left out", expected)
+            expected = "rows for all frames; restore them with `perilune-render plan --manifest ... --out FOLDER`"
+            raise UserError(manifest.store.at("manifest/frames"), "frames", "no rows: they were left out", expected)
         position = pc.fill_null(pc.index_in(of_frames, names), -1).to_numpy()
         order = np.lexsort((frames["frame_index"].to_numpy(), position))[np.count_nonzero(position < 0) :]
         first = np.concatenate([[0], np.cumsum(np.bincount(position[order], minlength=len(names)))])
@@ -192,15 +192,15 @@ def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamer
     return np.allclose(motion.path_at(columns["time_s"])[0], position, rtol=0, atol=_SAME_M)
 
 
-def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
+def compare_hashes(manifest: Dataset, rendered: Dataset) -> tuple[int, int, int]:
     """Numbers of frames with equal hashes, frames with a hash in the manifest, and scenes with different ground."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))
-        for d in (manifest, made)
+        for d in (manifest, rendered)
     )
     ground = (
         dict(zip(*(d.table("scenes", ["scene_id", "content_sha256"]).to_pydict().values()), strict=True))
-        for d in (manifest, made)
+        for d in (manifest, rendered)
     )
     before, after = ground
     known = [name for name, sha256 in old.items() if sha256 is not None]

@@ -66,7 +66,7 @@ def write_left_out_frames(manifest: Dataset, out: Address, progress: Progress) -
     """
     info, where = manifest.info, manifest.store.at("dataset.json")
     if len(info.recipes) != 1:
-        raise UserError(where, "recipes", len(info.recipes), "one: frames are drawn again by it")
+        raise UserError(where, "recipes", len(info.recipes), "one recipe, from which the frames are drawn again")
     if not frames_left_out(manifest):
         raise UserError(where, "frames", f"{info.counts.frames} frames", "a manifest whose table `frames` was left out")
     recipe = info.recipe()

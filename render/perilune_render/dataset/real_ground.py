@@ -17,9 +17,9 @@ _OUTLINE = (230, 190, 60)
 def real_ground_share(
     scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth_m: np.ndarray
 ) -> float:
-    """Share of a frame's ground pixels that show known ground of the elevation model; 0 without ground pixels.
+    """Share of a frame's ground pixels that show known ground of the elevation model.
 
-    depth_m (h, w) is along the camera's axis, infinite where no ground is hit.
+    Returns 0 without ground pixels. depth_m (h, w) is along the camera's axis, infinite where no ground is hit.
     """
     hit = np.isfinite(depth_m)
     if not hit.any() or not scene.real.any():
@@ -30,7 +30,7 @@ def real_ground_share(
 
 
 def outline_m(model: ElevationModel) -> Array:
-    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres; points off the map omitted."""
+    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres, without points off the map."""
     rows, columns = model.height_m.shape
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns

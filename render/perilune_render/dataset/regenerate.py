@@ -180,7 +180,10 @@ def _of_scene(
 
 
 def _trajectories(dataset: Dataset, scene_id: str, rows: list[dict]) -> dict[str, dict]:
-    """Rows of the trajectories of a scene by their ids. Raises UserError if a frame of `rows` has no trajectory."""
+    """Rows of the trajectories of a scene by their ids.
+
+    Raises UserError if a frame of `rows` has no trajectory.
+    """
     columns = ["trajectory_id", "seed", "nominal_position_m"]
     recorded = dataset.table("trajectories", columns, scene_id=scene_id).to_pylist()
     trajectories = {row["trajectory_id"]: row for row in recorded}
@@ -196,7 +199,7 @@ def _check_cameras(dataset: Dataset, rows: list[dict], rig: Rig) -> None:
     where = dataset.store.at("dataset.json")
     for row in rows:
         if row["camera"] not in rig:
-            raise UserError(where, "cameras", row["camera"], f"one of its recipe, {', '.join(map(str, rig))}")
+            raise UserError(where, "cameras", row["camera"], f"a camera of its recipe: {', '.join(map(str, rig))}")
         recorded, expected = dataset.camera_of(row), rig[row["camera"]].camera
         if recorded != expected:
             raise UserError(where, "camera", recorded, f"the camera of its recipe, {expected}")
@@ -264,7 +267,10 @@ def png_outlier_share(first: bytes, second: bytes) -> float:
 
 
 def exr_outlier_share(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
-    """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE; 1 if shapes differ."""
+    """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE.
+
+    Returns 1 if shapes differ.
+    """
     if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
         return 1.0
     shares = []

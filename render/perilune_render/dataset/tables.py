@@ -129,7 +129,10 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory; `files` holds each frame's file and measurement columns."""
+    """Part of the table `frames` for one trajectory.
+
+    `files` holds each frame's file and measurement columns.
+    """
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
@@ -165,7 +168,7 @@ def measurement_tables(
         keys = {"scene_id": [trajectory.scene_id] * n_rows, "trajectory_id": [trajectory.trajectory_id] * n_rows}
         return _table(name, keys | columns)
 
-    found, seed = {}, trajectory.seed
+    parts, seed = {}, trajectory.seed
     if config.inertial_grades and motion is not None:
         true = true_increments(motion, config.inertial_rate_hz)
         units = [measured(true, grade, seed) for grade in config.inertial_grades]
@@ -173,15 +176,15 @@ def measurement_tables(
         for name in ("angular_rate_radps", "specific_force_mps2"):
             columns[name] = _vectors(np.concatenate([getattr(unit, name) for unit in units]))
         grades = [grade for grade in config.inertial_grades for _ in true.time_s]
-        found["inertial"] = table("inertial", len(grades), {"grade": grades, **columns})
+        parts["inertial"] = table("inertial", len(grades), {"grade": grades, **columns})
     if config.range_rate_hz and (motion is not None or at_frames):
         if motion is not None:
             ranges = measure_ranges(motion, scene, config, motion.nominal.duration_s, seed)
         else:
             ranges = measure_ranges_of_frames(trajectory.flight, trajectory.frame_index, scene, config, seed)
         columns = {"time_s": ranges.time_s, "range_m": pa.array(ranges.range_m, from_pandas=True)}
-        found["ranges"] = table("ranges", len(ranges.time_s), columns)
-    return found
+        parts["ranges"] = table("ranges", len(ranges.time_s), columns)
+    return parts
 
 
 def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:

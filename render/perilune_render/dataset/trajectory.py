@@ -66,8 +66,8 @@ def render_trajectory(
         advance()
     rows = tables.frame_table(trajectory, source.camera, source.engine.sun, [frame.row for frame in frames])
     labels = [frame.labels for frame in frames]
-    given = of_scene.config.scene is not None
-    measured = tables.measurement_tables(trajectory, of_scene.scene, of_scene.instruments, at_frames=given)
+    has_given_poses = of_scene.config.scene is not None
+    measured = tables.measurement_tables(trajectory, of_scene.scene, of_scene.instruments, at_frames=has_given_poses)
     commit(out, labels, rows, measured)
     return [trajectory.frame_id(index) for index, frame in enumerate(frames) if frame.is_dark]
 

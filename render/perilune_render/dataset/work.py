@@ -57,10 +57,10 @@ def write_scene(store: Store, scene_id: str, tables: Mapping[str, pa.Table]) -> 
     path = _path("scenes", scene_id)
     if store.exists(path):
         # Compare by content hash, since craters computed on another processor may differ in the last digits.
-        recorded, found = (
+        recorded, computed = (
             rows["content_sha256"].to_pylist() for rows in (Part(store, path, "scenes").read(), tables["scenes"])
         )
-        if recorded != found:
+        if recorded != computed:
             expected = "the elevation model and catalogue that the dataset was started with"
             raise UserError(store.at(path), "craters", "other craters or boulders", expected)
         return
@@ -82,19 +82,19 @@ def trajectory_rows(store: Store, name: str) -> tuple[dict[str, pa.Table], pa.Ta
     committed = Part(store, _path("index", name), "index", INDEX).read()
     n_tables = sum(path.startswith(f"{FOLDER}/") for path in committed["path"].to_pylist())
     listed = {row["path"]: row for row in committed.slice(0, n_tables).to_pylist()}
-    found = {}
+    tables = {}
     for table in OF_TRAJECTORY:
         path = _path(table, name)
         if table in OPTIONAL_TABLES and path not in listed:
-            found[table] = TABLES[table].empty_table()
+            tables[table] = TABLES[table].empty_table()
             continue
         recorded = listed.get(path, {"bytes": 0, "sha256": ""})
         content = store.read(path, most_bytes=recorded["bytes"])
         if hashlib.sha256(content).hexdigest() != recorded["sha256"]:
             expected = f"SHA-256 {recorded['sha256']}; delete {_path('index', name)} to render the trajectory again"
             raise UserError(store.at(path), "SHA-256", "a different SHA-256", expected)
-        found[table] = pq.read_table(pa.BufferReader(content))
-    return found, committed.slice(n_tables)
+        tables[table] = pq.read_table(pa.BufferReader(content))
+    return tables, committed.slice(n_tables)
 
 
 def _path(table: str, name: str) -> str:

@@ -27,7 +27,10 @@ from perilune_shared.geometry.rolling_shutter import Moving
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Pose, velocity and random seed of one frame. The pose refers to the middle of the exposure of the middle row."""
+    """Pose, velocity and random seed of one frame.
+
+    The pose refers to the middle of the exposure of the middle row.
+    """
 
     position_m: Array
     """Position of the camera, O_L, metres (3,)."""
@@ -126,7 +129,7 @@ class FrameSource:
         if the engine's camera does not cover the view of `camera`.
         """
         if not engine.camera.covers(camera):
-            raise ValueError(f"camera of the engine: got {engine.camera}, expected one that covers {camera}")
+            raise ValueError(f"camera of the engine: got {engine.camera}, expected a camera that covers {camera}")
         pattern = FixedPattern.draw(config.sensor, camera, camera_seed(config.seed, name))
         return cls(engine, camera, circles, config.sensor, pattern, config.labels)
 
@@ -166,7 +169,10 @@ class FrameSource:
         return RowPoses(sensor_rows(self.camera, self.engine.camera), times_s, lambda t: shot.pose_at(time_s + t))
 
     def places_m(self, frame: Frame) -> Array:
-        """Points (h, w, 3), O_L, metres, that the engine's camera sees, each from the pose of its row; NaN for sky."""
+        """Points (h, w, 3), O_L, metres, that the engine's camera sees, each from the pose of its row.
+
+        Returns NaN for sky.
+        """
         shot, camera, depth_m = frame.shot, self.engine.camera, frame.radiance.depth_m.astype(np.float64)
         depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan)[..., None]
         rays = camera.rays(camera.pixel_centres())
@@ -194,8 +200,8 @@ class FrameSource:
 
     def with_contrast(self, labels: Labels, frame: Frame) -> Labels:
         """The labels with their contrast, computed from the frame's exposure."""
-        shown = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
-        return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, shown)
+        grey = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
+        return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, grey)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
         """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32, -1 for none."""

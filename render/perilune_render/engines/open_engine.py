@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 def open_engine(
     scene: Scene, config: DatasetConfig, camera: Camera, sun: Array, surface: "Surface | None" = None
 ) -> AbstractContextManager[Engine]:
-    """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L; use it as a context manager.
+    """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L.
 
-    The engine `heightfield` builds the surface of the scene unless `surface` is given.
+    Use it as a context manager. The engine `heightfield` builds the surface of the scene unless `surface` is given.
     Raises UserError if the engine cannot be loaded or does not render what the configuration asks for.
     """
     if config.render.engine == "heightfield":
@@ -42,7 +42,10 @@ def open_engine(
 
 
 def load_engine(name: str) -> None:
-    """Import the libraries of an engine before a scene exists. `open_engine` later reports a missing library."""
+    """Import the libraries of an engine before a scene exists.
+
+    `open_engine` later reports a missing library.
+    """
     with contextlib.suppress(ImportError):
         if name == "heightfield":
             import perilune_render.engines.heightfield.engine

@@ -22,7 +22,7 @@ from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_errors import drawn_errors
 from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 
-_MOST_STEPS = 50
+_MAX_STEPS = 50
 """Largest number of iterations to find a range."""
 _TOLERANCE_M = 1e-3
 """Change in one iteration below which a range has converged, metres."""
@@ -91,10 +91,13 @@ def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, dura
 def measure_ranges_of_frames(
     flight: Flight, frame_index: Sequence[int], scene: Scene, config: InstrumentsConfig, seed: int
 ) -> Ranges:
-    """Simulate one range at each frame of a flight, with its random seed; the beam is along the axis of the camera."""
+    """Simulate one range at each frame of a flight, with its random seed.
+
+    The beam is along the axis of the camera.
+    """
     true_m = range_to_ground_m(scene, flight.position_m, flight.rotation_camera_from_site[:, 2])
     sigma_m = config.range_sigma_m + config.range_sigma_share * true_m
-    # Each frame has a random stream of its own, so that parts of one trajectory in several scenes have different noise.
+    # Each frame has a separate random stream, so that parts of one trajectory in several scenes have different noise.
     noise = np.array([stream(seed, "range", index).normal() for index in frame_index])
     return Ranges(flight.time_s, true_m + sigma_m * noise)
 
@@ -108,7 +111,7 @@ def range_to_ground_m(scene: Scene, position_m: Array, direction: Array) -> Arra
     x, y, z = position_m.T
     dx, dy, dz = direction.T
     distance, change = z / -dz, np.full(len(z), np.inf)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         ground = value_at(scene.height_m, scene.grid, x + distance * dx, y + distance * dy)
         following = (z - ground) / -dz
         change = np.abs(following - distance)

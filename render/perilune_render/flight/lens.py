@@ -32,7 +32,7 @@ def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
             "configuration",
             f"{section}.distortion",
             camera.distortion,
-            "a distortion that does not fold back within the image: weaker, or a narrower view",
+            "no distortion that folds back within the image; use a weaker one, or a narrower view",
         )
     covering = camera.covering_pinhole()
     if covering.width_px * covering.height_px > _LARGEST_COVER * width * height:
@@ -40,6 +40,6 @@ def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
             "configuration",
             f"{section}.distortion",
             camera.distortion,
-            f"a weaker one (this one needs a rendering of {covering.width_px} x {covering.height_px} pixels)",
+            f"a weaker distortion (this one needs a rendering of {covering.width_px} x {covering.height_px} pixels)",
         )
     return camera

@@ -14,7 +14,7 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 _N_WAVES = 256
 """Number of random waves in each smooth process."""
-_MOST_DRAWS = 1000
+_MAX_DRAWS = 1000
 _STEP = 2 * np.pi / 20
 """Time step of the check of a draw's acceleration, radians of its fastest wave."""
 
@@ -118,7 +118,7 @@ def draw_motion(config: FlightConfig, seed: int) -> Motion:
     sigmas = config.position_sigma_m, float(np.radians(config.attitude_sigma_deg))
     correlation_s = np.repeat([config.correlation_time_s, config.attitude_correlation_s], 3)
     limit = config.max_perturbation_mps2
-    for number in range(_MOST_DRAWS):
+    for number in range(_MAX_DRAWS):
         process = SmoothProcess.draw(correlation_s, rng)
         motion = Motion(nominal, *sigmas, process.part(slice(0, 3)), process.part(slice(3, 6)))
         if limit is None or motion.largest_perturbation_mps2() <= limit:

@@ -18,7 +18,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.curvature import hits_sphere, horizon_m
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
-LEAST_CLEARANCE_M = 1.0
+MIN_CLEARANCE_M = 1.0
 """Smallest height of the camera above the ground or above a boulder, metres."""
 LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
 """Largest velocity, metres per second (five times escape velocity), and angular velocity, radians per second."""
@@ -107,7 +107,7 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
 
 
 def check_places(poses: Poses, scene: Scene, where: object) -> None:
-    """Check that cameras are over the mesh of a scene, and LEAST_CLEARANCE_M above its ground and its boulders.
+    """Check that cameras are over the mesh of a scene, and MIN_CLEARANCE_M above its ground and its boulders.
 
     In scenes with horizon, cameras must be low enough for the horizon to lie within the mesh. Raises UserError with
     `where` and the first frame that fails.
@@ -116,21 +116,21 @@ def check_places(poses: Poses, scene: Scene, where: object) -> None:
     x, y, z = poses.position_m.T
     ground = value_at(scene.height_m, scene.grid, x, y)
     _check_clearance(poses, ground, "ground", where)
-    low = np.flatnonzero(z < ground + LEAST_CLEARANCE_M + largest_height_m(scene.boulders))
+    low = np.flatnonzero(z < ground + MIN_CLEARANCE_M + largest_height_m(scene.boulders))
     top = np.full(len(z), -np.inf)
     top[low] = tops_m(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed, x[low], y[low])
     _check_clearance(poses, top, "boulder below it", where)
 
 
 def _check_clearance(poses: Poses, surface_m: Array, what: str, where: object) -> None:
-    """Check that cameras are LEAST_CLEARANCE_M above surfaces with heights `surface_m` (N,), metres."""
+    """Check that cameras are MIN_CLEARANCE_M above surfaces with heights `surface_m` (N,), metres."""
     z = poses.position_m[:, 2]
     _refuse(
-        z < surface_m + LEAST_CLEARANCE_M,
+        z < surface_m + MIN_CLEARANCE_M,
         poses,
         where,
         lambda n: f"a camera {z[n] - surface_m[n]:.1f} m above the {what}",
-        lambda n: f"at least {LEAST_CLEARANCE_M:g} m: position_m[2] at least {surface_m[n] + LEAST_CLEARANCE_M:.1f}",
+        lambda n: f"at least {MIN_CLEARANCE_M:g} m: position_m[2] at least {surface_m[n] + MIN_CLEARANCE_M:.1f}",
     )
 
 
@@ -183,7 +183,7 @@ def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> No
         poses,
         where,
         lambda n: f"a horizon {farthest[n]:.0f} m from the site, beyond the terrain's edge",
-        lambda n: f"at most {half:.0f} m: a last view of dataset.scene.views as high as the camera, and as far",
+        lambda n: f"at most {half:.0f} m; raise height_m and reach_m of the last view in dataset.scene.views",
     )
 
 
@@ -194,7 +194,10 @@ def _check_not_only_sky(poses: Poses, camera: Camera, matrices: Array, where: ob
 
 
 def ground_in_view(position_m: Array, matrices: Array, camera: Camera) -> np.ndarray:
-    """Whether each view (N,) shows ground, curved as the Moon; `matrices` are rotation_camera_from_site (N, 3, 3)."""
+    """Whether each view (N,) shows ground, curved as the Moon.
+
+    `matrices` are rotation_camera_from_site (N, 3, 3).
+    """
     share = (np.arange(2 * _POINTS_PER_SIDE) + 0.5) / (2 * _POINTS_PER_SIDE)
     u, v = share * camera.width_px, share * camera.height_px
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)

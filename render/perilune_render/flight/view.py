@@ -20,7 +20,7 @@ _HILL_M = 64.0
 
 
 def view_of(config: DatasetConfig, rig: Rig, kind: str) -> ViewEnvelope:
-    """The views for which the ground of a configuration is generated: those of all cameras on the body.
+    """The views of all cameras on the body, for which the ground of a configuration is generated.
 
     Raises UserError if frames of the flights of `kind` could show the horizon, or if a given scene has no views.
     """
@@ -80,7 +80,10 @@ def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
 
 
 def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
-    """The envelope of several views, with the largest focal length; heights are scaled to this focal length."""
+    """The envelope of several views, with the largest focal length.
+
+    Heights are scaled to this focal length.
+    """
     focal = max(view.focal_px for view in views)
     reach = np.unique(np.concatenate([view.reach_m for view in views]))
     heights = []
@@ -119,7 +122,10 @@ def _spread_m(flight: FlightConfig) -> float:
 
 
 def _lowest_m(flight: FlightConfig, altitude_m: Array) -> Array:
-    """Lowest height above the ground at nominal altitudes (N,); the ground may rise by a twentieth of the altitude."""
+    """Lowest height above the ground at nominal altitudes (N,).
+
+    The ground may rise by a twentieth of the altitude.
+    """
     return np.maximum(0.95 * altitude_m - _spread_m(flight), 0.2 * altitude_m)
 
 

@@ -16,7 +16,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.store import Store
 
-_MOST_CHANNELS = 64
+_MAX_CHANNELS = 64
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
@@ -48,9 +48,10 @@ def local_exr(store: Store, path: str) -> Iterator[Path]:
 
 
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
-    """Channels (h, w) by name. Raises UserError if the file is missing, damaged or not of `size_px` (width, height).
+    """Channels (h, w) by name.
 
-    A small file may decompress to any size, so the header is checked before the pixels are read.
+    Raises UserError if the file is missing, damaged or not of `size_px` (width, height). A small file may decompress to
+    any size, so the header is checked before the pixels are read.
     """
     if not path.is_file():
         raise UserError(path, "exr", "no such file", "an EXR frame")
@@ -75,8 +76,8 @@ def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | No
     if size_px is not None and (width, height) != size_px:
         raise UserError(path, "size", f"{width} x {height} pixels", f"{size_px[0]} x {size_px[1]}")
     channels = header["channels"]
-    if len(channels) > _MOST_CHANNELS:
-        raise UserError(path, "channels", len(channels), f"at most {_MOST_CHANNELS}")
+    if len(channels) > _MAX_CHANNELS:
+        raise UserError(path, "channels", len(channels), f"at most {_MAX_CHANNELS}")
     if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):
         raise UserError(path, "channels", "fewer samples than pixels", "a value for each pixel")
 

@@ -22,7 +22,7 @@ import numpy as np
 
 Law = Callable[[Any, Any, Any], Any]
 
-LEAST_SINE_SQUARED = 1e-7
+MIN_SINE_SQUARED = 1e-7
 """Floor against division by 0 at i = 0 and e = 0, also in float32; roughness terms vanish at larger angles already."""
 
 
@@ -125,7 +125,7 @@ def chi_of(theta_bar_deg: float) -> float:
 
 def _slopes(slope: float, cosine: Any) -> tuple[Any, Any, Any]:
     """Sine of an angle, and Hapke's E1 and E2."""
-    sine = np.sqrt(np.maximum(cosine * cosine * -1 + 1, LEAST_SINE_SQUARED))
+    sine = np.sqrt(np.maximum(cosine * cosine * -1 + 1, MIN_SINE_SQUARED))
     exponent = cosine / sine * (-2 / np.pi / slope)
     return sine, np.exp(exponent), np.exp(exponent * exponent * (-np.pi / 4))
 

@@ -11,10 +11,10 @@ from perilune_shared.geometry.camera import Camera
 
 
 def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
-    """Resample an image (h, w) of the camera `source` to `camera` (Lanczos, 8 x 8 px); unchanged if both are equal.
+    """Resample an image (h, w) of the camera `source` to `camera` (Lanczos, 8 x 8 px).
 
-    `source` must cover the view of `camera`. OpenCV rounds sample positions to 1/32 px. If the pixels of `source` are
-    finer, several samples per pixel are averaged, to avoid aliasing.
+    It is unchanged if both cameras are equal. `source` must cover the view of `camera`. OpenCV rounds sample positions
+    to 1/32 px. If the pixels of `source` are finer, several samples per pixel are averaged, to avoid aliasing.
     """
     if camera == source:
         return image

@@ -27,7 +27,7 @@ from perilune_shared.geometry.frames import Array
 
 _STRETCH = 1.5
 """Approximate bound on how much distortion stretches motion at the image edges."""
-_LEAST_MOTION_PX = 0.05
+_MIN_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
 _FAINT_E = 100.0
 """Signal above which a rounded Gaussian approximates Poisson noise, ten times faster, electrons."""
@@ -89,7 +89,7 @@ def expose(
     move_m = np.asarray(velocity_camera_mps) * exposure_s
     turn_rad = np.zeros(3) if angular_velocity_radps is None else angular_velocity_radps * exposure_s
     fastest_px = _fastest_px(radiance.depth_m, camera, exr_camera, move_m, turn_rad)
-    if config.motion_blur and fastest_px >= _LEAST_MOTION_PX:
+    if config.motion_blur and fastest_px >= _MIN_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
         light = _blurred(light, motion_px(depth_m, camera, move_m, turn_rad))
     return Exposure(light, exposure_s)
@@ -232,7 +232,7 @@ def _rays(camera: Camera) -> np.ndarray:
 def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """The mean of an image over the exposure, in which its content moves by `motion` (h, w, 2), pixels."""
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
-    if longest < _LEAST_MOTION_PX:
+    if longest < _MIN_MOTION_PX:
         return light
     # Gauss-Legendre nodes: two are enough for the correct width of a short blur.
     times, weights = np.polynomial.legendre.leggauss(int(min(2 * longest, 126)) + 2)

@@ -82,9 +82,9 @@ def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecu
         if work.failures:
             raise RenderingFailed(out, {sample.name(index): error for index, error in work.failures.items()})
         finish_begin = time.perf_counter()
-        made = finish(sample, scratch, info)
+        dataset = finish(sample, scratch, info)
         finish_s = time.perf_counter() - finish_begin
-        bytes_of = _Bytes.of(made)
+        bytes_of = _Bytes.of(dataset)
     frame_s = fmean((times.frames[p][-1] - times.frames[p][0]) / max(len(times.frames[p]) - 1, 1) for p in indices)
     scene_s = max(fmean(times.frames[p][0] - times.begin[p] for p in indices) - frame_s, 0.0)
     parts_s = fmean(times.end[p] - times.frames[p][-1] for p in indices)
@@ -115,13 +115,13 @@ def _sample(job: Job, left: list[int], n_trajectories: int) -> Job:
 def _thinned(trajectory: TrajectoryPlan) -> TrajectoryPlan:
     """A trajectory with few frames, evenly spread from the first to the last."""
     n, flight = len(trajectory.splits), trajectory.flight
-    kept = np.unique(np.linspace(0, n - 1, min(_N_FRAMES, n)).round().astype(int))
+    indices = np.unique(np.linspace(0, n - 1, min(_N_FRAMES, n)).round().astype(int))
     arrays = (flight.time_s, flight.position_m, flight.velocity_mps, flight.rotation_wxyz)
-    thinned = Flight(flight.nominal, *(array[kept] for array in arrays))
+    thinned = Flight(flight.nominal, *(array[indices] for array in arrays))
     return replace(
         trajectory,
-        frame_index=tuple(trajectory.frame_index[i] for i in kept),
-        splits=tuple(trajectory.splits[i] for i in kept),
+        frame_index=tuple(trajectory.frame_index[i] for i in indices),
+        splits=tuple(trajectory.splits[i] for i in indices),
         draw_flight=partial(_same, thinned),
     )
 
@@ -142,21 +142,23 @@ class _Bytes:
     """Size of the frame and label tables and the index that does not depend on their number of rows."""
 
     @classmethod
-    def of(cls, made: Dataset) -> "_Bytes":
+    def of(cls, dataset: Dataset) -> "_Bytes":
         """The mean sizes in a finished sample."""
-        images = sum(item.size_bytes for item in made.store.list("frames"))
-        index = pa.concat_tables(pq.read_table(pa.BufferReader(made.store.read(part.path))) for part in made.info.index)
+        images = sum(item.size_bytes for item in dataset.store.list("frames"))
+        index = pa.concat_tables(
+            pq.read_table(pa.BufferReader(dataset.store.read(part.path))) for part in dataset.info.index
+        )
         rows = fixed = 0.0
-        for table in (made.table("frames"), made.table("labels"), index.cast(INDEX)):
+        for table in (dataset.table("frames"), dataset.table("labels"), index.cast(INDEX)):
             whole, half = (_parquet_bytes(table.slice(0, n)) for n in (len(table), len(table) // 2))
             rows += 2 * (whole - half)
             fixed += max(2 * half - whole, 0)
         ground = sum(
             item.size_bytes
             for name in ("scenes", "craters", "boulders", "trajectories")
-            for item in made.store.list(f"manifest/{name}")
+            for item in dataset.store.list(f"manifest/{name}")
         )
-        return cls((images + rows) / made.info.counts.frames, ground / made.info.counts.scenes, fixed)
+        return cls((images + rows) / dataset.info.counts.frames, ground / dataset.info.counts.scenes, fixed)
 
 
 def _parquet_bytes(rows: pa.Table) -> int:

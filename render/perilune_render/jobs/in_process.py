@@ -32,7 +32,10 @@ class InProcess:
             say(line)
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
+        """Render all trajectories of a work list.
+
+        Raises the first error that would stop all other trajectories too.
+        """
         while (index := work.take(self._renderer.scene_id)) is not None:
             report.started(index)
             try:

@@ -26,7 +26,10 @@ class Job:
 
     @classmethod
     def planned(cls, config: DatasetConfig, kind: Kind, preset: str) -> "Job":
-        """The job of the dataset `detect` or `nav` of a configuration. Raises UserError on impossible settings."""
+        """The job of the dataset `detect` or `nav` of a configuration.
+
+        Raises UserError on impossible settings.
+        """
         plan = make_plan(config, kind)
         return cls(
             plan, config, new_info(config, plan, recipe_of(config, kind, preset)), f"configuration: dataset.{kind}"

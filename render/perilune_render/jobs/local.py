@@ -33,9 +33,10 @@ _GROUND_BYTES, _GROWING_BYTES = 16, 70
 
 
 class LocalWorkers:
-    """The executor that renders in `n_workers` processes. Its workers end with the block, or with this process.
+    """The executor that renders in `n_workers` processes.
 
-    `early` is a worker that is already running; it is used unless it has ended.
+    Its workers end with the block, or with this process. `early` is a worker that is already running; it is used unless
+    it has ended.
     """
 
     def __init__(self, job: Job, out: Store, n_workers: int, early: Worker | None = None):
@@ -75,7 +76,10 @@ class LocalWorkers:
                     return
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
+        """Render all trajectories of a work list.
+
+        Raises the first error that would stop all other trajectories too.
+        """
         while True:
             n_busy = sum(worker.trajectory is not None for worker in self._workers.values())
             if not n_busy and not work.n_waiting:
@@ -118,7 +122,10 @@ class LocalWorkers:
         return [worker for connection, worker in self._workers.items() if connection in ready]
 
     def _receive(self, worker: Worker) -> tuple[Any, ...] | None:
-        """The next message of a worker; None if the worker has ended, which removes it. Raises its final error."""
+        """The next message of a worker; None if the worker has ended, which removes it.
+
+        Raises its final error.
+        """
         try:
             message = worker.connection.recv()
             if message == ("started",):
@@ -148,7 +155,10 @@ class LocalWorkers:
 
 
 def for_other_processes(out: Store) -> Store:
-    """A store that processes with other working directories can open too. Raises UserError if they cannot open it."""
+    """A store that processes with other working directories can open too.
+
+    Raises UserError if they cannot open it.
+    """
     if out.address.startswith("memory://"):
         raise UserError(out, "--out", "memory of this process", "--workers 0, or an address that workers can open")
     return out if out.folder is None else open_store(out.folder.absolute())

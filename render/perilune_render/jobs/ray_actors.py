@@ -94,7 +94,7 @@ class RayActors:
         n_fitting = sum(each // self._n_threads for each in n_cores)
         if not n_fitting:
             ray.shutdown()
-            expected = f"a machine with {self._n_threads}, as many as a process has threads (--threads)"
+            expected = f"a machine with {self._n_threads} cores, one for each thread of a process (--threads)"
             raise UserError("--executor", "Ray", f"machines with {' and '.join(map(str, n_cores))} cores", expected)
         self._n_workers = self._n_workers or n_fitting
         self._remote_job = ray.put(self._job)
@@ -123,7 +123,10 @@ class RayActors:
                 return
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
+        """Render all trajectories of a work list.
+
+        Raises the first error that would stop all other trajectories too.
+        """
         while True:
             busy = [actor for actor in self._actors if actor.trajectory is not None]
             if not busy and not work.n_waiting:
@@ -174,7 +177,10 @@ class RayActors:
                 ray.kill(actor.handle)
 
     def _lose_start(self, actor: _Actor, error: RayActorError) -> None:
-        """Remove an actor lost before it rendered anything. Raises UserError if too many were lost in succession."""
+        """Remove an actor lost before it rendered anything.
+
+        Raises UserError if too many were lost in succession.
+        """
         self._actors.remove(actor)
         self._lost_starts += 1
         if self._lost_starts > LOST_STARTS * (self._n_workers or 1):

@@ -44,7 +44,10 @@ class Executor(Protocol):
         """Generate a scene and check that its poses fit it. Raises UserError."""
 
     def render(self, work: WorkList, report: Report) -> None:
-        """Render all trajectories of a work list. Raises the first error that would stop all other trajectories too."""
+        """Render all trajectories of a work list.
+
+        Raises the first error that would stop all other trajectories too.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +99,10 @@ def render_job(job: Job, address: Address, progress: Progress, executor: MakeExe
 
 
 def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, executor: MakeExecutor) -> int:
-    """Render the unfinished trajectories of one shard of a job into the dataset at an address; return their number.
+    """Render the unfinished trajectories of one shard of a job into the dataset at an address.
 
-    Processes on many machines may render different shards into one dataset at the same time, so it is not locked.
-    Raises the errors of `render_job`.
+    Returns their number. Processes on many machines may render different shards into one dataset at the same time, so
+    it is not locked. Raises the errors of `render_job`.
     """
     out = open_store(address)
     check(job)
@@ -112,7 +115,10 @@ def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, e
 
 
 def finish_job(job: Job, address: Address) -> Dataset:
-    """Finish a dataset whose shards are all rendered. Raises UserError if trajectories are still to be rendered."""
+    """Finish a dataset whose shards are all rendered.
+
+    Raises UserError if trajectories are still to be rendered.
+    """
     out = open_store(address)
     if not is_begun(out):
         raise UserError(out, "--finish", "no dataset", "the address of the rendered shards")
@@ -174,7 +180,7 @@ def finish(job: Job, out: Store, info: DatasetInfo) -> Dataset:
     left = unfinished(job, out)
     if left:
         found = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"
-        raise UserError(out, "trajectories", found, "all rendered: run the shards that hold them again")
+        raise UserError(out, "trajectories", found, "all rendered; run their shards again")
     scenes = (
         (scene.scene_id, [trajectory.trajectory_id for trajectory in job.plan.of_scene(scene.scene_id)])
         for scene in job.plan.scenes

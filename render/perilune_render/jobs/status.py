@@ -45,15 +45,21 @@ class Status:
 
 
 def datasets_below(store: Store) -> list[Store]:
-    """The dataset at an address, or the datasets `detect` and `nav` below it. Raises UserError without a dataset."""
-    found = [each for each in (store, *map(store.sub, KINDS)) if each.exists(INFO_NAME)]
-    if not found:
+    """The dataset at an address, or the datasets `detect` and `nav` below it.
+
+    Raises UserError without a dataset.
+    """
+    stores = [each for each in (store, *map(store.sub, KINDS)) if each.exists(INFO_NAME)]
+    if not stores:
         raise UserError(store.address, INFO_NAME, "no such file", "the address of a dataset that was begun")
-    return found
+    return stores
 
 
 def status_of(store: Store) -> Status:
-    """The state of one dataset. Raises UserError if it is in progress and its record of the plan is missing."""
+    """The state of one dataset.
+
+    Raises UserError if it is in progress and its record of the plan is missing.
+    """
     complete, counts = _info(store)
     if complete:
         n_trajectories, n_frames = counts.get("trajectories", 0), counts.get("frames", 0)

@@ -56,7 +56,10 @@ class WorkList:
         self._running[self._scene[index]] -= 1
 
     def failed(self, index: int, error: str) -> int:
-        """Record a failed attempt; return the number of attempts left. If it is not 0, the trajectory waits again."""
+        """Record a failed attempt; return the number of attempts left.
+
+        If it is not 0, the trajectory waits again.
+        """
         self._running[self._scene[index]] -= 1
         left = N_ATTEMPTS - self._attempts[index]
         if left > 0:

@@ -86,7 +86,7 @@ def start_worker(scratch: str, engine: str) -> Worker:
 
 @contextlib.contextmanager
 def early_worker(engine: str) -> Iterator[Worker]:
-    """A worker that loads its libraries while its parent plans the job; it ends with the block at the latest."""
+    """Yield a worker that loads its libraries while its parent plans the job; end it with the block."""
     with tempfile.TemporaryDirectory(prefix="perilune-", ignore_cleanup_errors=True) as scratch:
         worker = start_worker(scratch, engine)
         try:

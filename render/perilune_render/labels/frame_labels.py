@@ -132,14 +132,14 @@ def label_frame(
         circles.radius_m[candidate],
     )
     radius = ellipses.radius_px()
-    kept = (radius >= min_radius_px) & (radius <= max_radius_px)
-    rows = candidate[kept]
+    in_range = (radius >= min_radius_px) & (radius <= max_radius_px)
+    rows = candidate[in_range]
     ellipses = Ellipses(
-        ellipses.cx_px[kept],
-        ellipses.cy_px[kept],
-        ellipses.a_px[kept],
-        ellipses.b_px[kept],
-        ellipses.theta_rad[kept],
+        ellipses.cx_px[in_range],
+        ellipses.cy_px[in_range],
+        ellipses.a_px[in_range],
+        ellipses.b_px[in_range],
+        ellipses.theta_rad[in_range],
     )
     visible = _visible_fraction(circles, camera, position_m, rotation_camera_from_site, radiance.depth_m, rows)
     lit = sunlit_fractions(ellipses, radiance.sunlit)

@@ -248,7 +248,7 @@ def smallest_crater(
     """Index image (h, w) float32: the smallest crater whose visible interior contains each pixel's centre.
 
     `circles` are the rims in O_C, largest first, `boxes_px` (N, 4) the bounding boxes of their images. `camera` has no
-    distortion. `depth_m` (h, w), metres along the optical axis, tells which interiors are hidden; with None none is.
+    distortion. `depth_m` (h, w), metres along the optical axis, determines which interiors are hidden; None hides none.
     Pixels without a crater are -1.
     """
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)

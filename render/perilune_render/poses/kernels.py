@@ -10,8 +10,8 @@ from perilune_shared.errors import UserError
 
 _LISTED = "KERNELS_TO_LOAD"
 _VALUES, _SYMBOLS = "PATH_VALUES", "PATH_SYMBOLS"
-_MOST_LISTED = 1000
-_MOST_CHARACTERS = 1000
+_MAX_LISTED = 1000
+_MAX_CHARACTERS = 1000
 """Maximum length of a path in a meta-kernel; SPICE itself allows 255."""
 
 
@@ -111,12 +111,12 @@ def _texts(spice: Any, path: Path, name: str) -> list[str]:
         return []
     if kind != "C":
         raise UserError(path, name, "numbers", "texts in quotes")
-    if n_parts > _MOST_LISTED:
-        raise UserError(path, name, f"{n_parts} texts", f"at most {_MOST_LISTED}")
+    if n_parts > _MAX_LISTED:
+        raise UserError(path, name, f"{n_parts} texts", f"at most {_MAX_LISTED}")
     texts: list[str] = []
     with contextlib.suppress(spice.exceptions.NotFoundError):
         while len(texts) < n_parts:
-            text, _ = spice.stpool(name, len(texts), "+", _MOST_CHARACTERS)
+            text, _ = spice.stpool(name, len(texts), "+", _MAX_CHARACTERS)
             texts.append(text)
     return texts
 

@@ -24,7 +24,7 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 SAME_SUN_DEG = 0.05
 """Frames whose Suns differ by less than this share the Sun of the first such frame; a tenth of the Sun's diameter,
 degrees."""
-_MOST_SCENES = 1000
+_MAX_SCENES = 1000
 _N_VIEWS = 24
 _LOWER = 0.9
 """Lowest camera height that the views allow for, as a share of its height: the ground may rise towards the camera."""
@@ -56,10 +56,10 @@ def views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ..
 
 
 def horizon_views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
-    """Views with horizon that contain all poses, rounded to three digits; the last view is at the highest pose.
+    """Views with horizon that contain all poses, rounded to three digits.
 
-    The ground is taken to be at most a tenth of a camera's height above the plane z = 0. Raises UserError for a pose
-    that is not above the plane, or higher than HIGHEST_M.
+    The last view is at the highest pose. The ground is taken to be at most a tenth of a camera's height above the plane
+    z = 0. Raises UserError for a pose that is not above the plane, or higher than HIGHEST_M.
     """
     places = []
     for name, mounted in rig.items():
@@ -100,28 +100,29 @@ def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tu
 
 
 def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: bool) -> None:
-    """Raise UserError if attitudes miss the ground and another interpretation shows it in all frames; name that one.
+    """Raise UserError if attitudes miss the ground and another interpretation shows it in all frames.
 
-    Checks up to _N_CHECKED poses. Other poses that miss the ground are rejected later.
+    The error names that interpretation. Checks up to _N_CHECKED poses; other poses that miss the ground are rejected
+    later.
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _N_CHECKED)).round().astype(int))
     position = poses.position_m[chosen]
     if poses.attitudes is None or (position[:, 2] <= 0).any():
         return
     stated = replace(poses.attitudes, quaternion_wxyz=poses.attitudes.quaternion_wxyz[chosen])
-    shown = _is_ground_shown(position, stated.rotation_wxyz, rig, horizon=horizon)
-    if shown.all():
+    fits = _is_ground_shown(position, stated.rotation_wxyz, rig, horizon=horizon)
+    if fits.all():
         return
     single, double = stated.alternatives()
-    for readings in (single, [] if shown.any() else double):
+    for readings in (single, [] if fits.any() else double):
         fitting = [
             what
             for what, other in readings
             if _is_ground_shown(position, other.rotation_wxyz, rig, horizon=horizon).all()
         ]
         if fitting:
-            n = int(chosen[np.argmin(shown)])
-            share = "all frames" if not shown.any() else f"{(~shown).mean():.0%} of the frames"
+            n = int(chosen[np.argmin(fits)])
+            share = "all frames" if not fits.any() else f"{(~fits).mean():.0%} of the frames"
             view, ground, sky = (
                 ("a view of the sky alone", "some ground in view", "")
                 if horizon
@@ -146,7 +147,10 @@ def _is_ground_shown(position_m: Array, rotation_wxyz: Array, rig: Rig, *, horiz
 
 
 def _corner_rays(camera: Camera, matrices: Array) -> Array:
-    """Rays (N, 4, 3), O_L, through the corners of the image; `matrices` are rotation_camera_from_site (N, 3, 3)."""
+    """Rays (N, 4, 3), O_L, through the corners of the image.
+
+    `matrices` are rotation_camera_from_site (N, 3, 3).
+    """
     corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
     return np.einsum("nji,sj->nsi", matrices, corners)
 
@@ -184,7 +188,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
 
     Frames whose Suns differ by SAME_SUN_DEG or more are in different scenes over the same ground. A trajectory under
     several Suns has a part in the scene of each, with the indices and the times of the whole trajectory. Raises
-    UserError if the poses fit no ground, or for more than _MOST_SCENES Suns.
+    UserError if the poses fit no ground, or for more than _MAX_SCENES Suns.
     """
     scene = config.scene or SceneConfig()
     rig = rig_of(config)
@@ -192,9 +196,9 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     views = scene.views or (horizon_views_of(poses, rig, where) if scene.horizon else views_of(poses, rig, where))
     scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
     suns, lit_by = _suns(poses, scene)
-    if len(suns) > _MOST_SCENES:
-        found = f"more than {_MOST_SCENES} Suns that differ by {SAME_SUN_DEG} degrees"
-        raise UserError(where, "sun_azimuth_deg", found, f"at most {_MOST_SCENES}")
+    if len(suns) > _MAX_SCENES:
+        found = f"more than {_MAX_SCENES} Suns that differ by {SAME_SUN_DEG} degrees"
+        raise UserError(where, "sun_azimuth_deg", found, f"at most {_MAX_SCENES}")
     seed = scene_seed(config)
     scenes = tuple(ScenePlan(f"scene-{k:04d}", seed, *map(float, sun)) for k, sun in enumerate(suns))
     trajectories: list[TrajectoryPlan] = []
@@ -222,7 +226,7 @@ def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarra
             same = np.flatnonzero(_is_same_sun(sun, np.array(suns).reshape(-1, 2)))
             if not len(same):
                 suns.append(sun)
-            if len(suns) > _MOST_SCENES:
+            if len(suns) > _MAX_SCENES:
                 return suns, index
             index[n] = same[0] if len(same) else len(suns) - 1
         else:
@@ -254,9 +258,10 @@ def _origin(poses: GivenPoses, rows: np.ndarray, index: int) -> str:
 
 
 def _flight(poses: GivenPoses, rows: np.ndarray, whole: np.ndarray) -> Flight:
-    """The flight through the poses `rows` of a trajectory; the first pose of the trajectory's poses `whole` has time 0.
+    """The flight through the poses `rows` of a trajectory.
 
-    The nominal trajectory is a straight line from the first to the last pose of the whole trajectory.
+    The first pose of the trajectory's poses `whole` has time 0. The nominal trajectory is a straight line from the
+    first to the last pose of the whole trajectory.
     """
     first, last = whole[0], whole[-1]
     duration = float(poses.time_s[last] - poses.time_s[first])

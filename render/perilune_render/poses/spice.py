@@ -71,7 +71,7 @@ class SpicePoses:
     velocity_mps: Array
     """Velocity relative to the ground, O_L, metres per second (N, 3)."""
     angular_velocity_radps: Array | None
-    """Angular velocity of the camera relative to the ground, in its own axes, radians per second (N, 3); None if the
+    """Angular velocity of the camera relative to the ground, O_C, radians per second (N, 3); None if the
     kernels lack it."""
     sun_deg: Array
     """Apparent azimuth and elevation of the Sun at the site, degrees (N, 2)."""
@@ -96,7 +96,7 @@ def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, s
     The site is `site_height_m` above the sphere of 1737.4 km.
 
     Camera poses are geometric, without light time. The Sun is apparent (light time and stellar aberration, "LT+S") and
-    seen from the site. SPICE runs in a process of its own, since damaged kernels can crash it. Raises UserError if
+    seen from the site. SPICE runs in a separate process, since damaged kernels can crash it. Raises UserError if
     spiceypy is not installed, for an unreadable kernel, an unknown body or frame, a time without data, or a Sun below
     the plane.
     """
@@ -126,7 +126,7 @@ def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, s
 
 
 def _send(sending: Connection, source: SpiceSource, latitude_deg: float, longitude_deg: float, height_m: float) -> None:
-    """Send _LOADED, then the poses or the error; in a process of its own."""
+    """Send _LOADED, then the poses or the error; runs in a separate process."""
     # The parent ends this process after Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -185,7 +185,10 @@ def _read(
 
 
 def _angular_velocity_radps(spice: Any, fixed: str, camera_frame: str, et: float, axes: Array) -> Array | None:
-    """Angular velocity (3,) of a camera's axes relative to the fixed frame, in the camera's axes; None without data."""
+    """Angular velocity (3,) of a camera's axes relative to the fixed frame, in the camera's axes.
+
+    Returns None without data.
+    """
     try:
         rotation, turn = spice.xf2rav(spice.sxform(fixed, camera_frame, et))
     except spice.exceptions.SpiceyError:

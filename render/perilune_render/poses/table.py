@@ -66,7 +66,10 @@ class PoseTable:
 
 
 def read_pose_table(path: Path) -> PoseTable:
-    """Read the table of a file. Raises UserError if it is unreadable, of another format or has an unknown column."""
+    """Read the table of a file.
+
+    Raises UserError if it is unreadable, of another format or has an unknown column.
+    """
     suffix = path.suffix.lower()
     if path.exists() and suffix not in _SUFFIXES:
         found = _OTHER_SUFFIXES.get(suffix, suffix or "none")

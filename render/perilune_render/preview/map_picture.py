@@ -29,7 +29,10 @@ def map_picture(
     tracks: Sequence[Array],
     horizon: SiteHorizon,
 ) -> np.ndarray:
-    """The picture (h, w, 3) uint8, BGR, north up. `tracks` are positions (N, 2 or more) in O_L, first frame first."""
+    """The picture (h, w, 3) uint8, BGR, north up.
+
+    `tracks` are positions (N, 2 or more) in O_L, first frame first.
+    """
     relief = cv2.resize(_shaded(site_map), (_MAP_PX, _MAP_PX), interpolation=cv2.INTER_AREA)
     _draw_square(relief, site_map)
     if site_map.outline_m is not None:

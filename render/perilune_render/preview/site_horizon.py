@@ -11,7 +11,7 @@ from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array, sun_direction
 
-_MOST_LINES = 5
+_MAX_LINES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def _distances(grid: Grid, towards: Array) -> Array:
 
 
 def shadow_warnings(scene: Scene, plans: Sequence[ScenePlan]) -> list[str]:
-    """One warning per plan over this ground whose Sun is below the site's horizon; at most _MOST_LINES lines."""
+    """One warning per plan over this ground whose Sun is below the site's horizon; at most _MAX_LINES lines."""
     lines = []
     for plan in plans:
         horizon = site_horizon_of(scene, plan.sun_azimuth_deg)
@@ -63,5 +63,5 @@ def shadow_warnings(scene: Scene, plans: Sequence[ScenePlan]) -> list[str]:
                 f"{plan.sun_elevation_deg:.1f} degrees high, and ground {horizon.distance_m:.0f} m away reaches "
                 f"{horizon.elevation_deg:.1f} degrees"
             )
-    more = len(lines) - _MOST_LINES
-    return lines if more <= 0 else [*lines[:_MOST_LINES], f"warning: the site lies in shadow under {more} more Suns"]
+    more = len(lines) - _MAX_LINES
+    return lines if more <= 0 else [*lines[:_MAX_LINES], f"warning: the site lies in shadow under {more} more Suns"]

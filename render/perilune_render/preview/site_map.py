@@ -26,7 +26,10 @@ _LIFT = 0.02
 
 @dataclass(frozen=True, slots=True)
 class SiteMap:
-    """A square map in O_L's plane. Row 0 is the northern edge (smallest y), column 0 the western one (largest x)."""
+    """A square map in O_L's plane.
+
+    Row 0 is the northern edge (smallest y), column 0 the western one (largest x).
+    """
 
     height_m: Array
     """Heights above the site (n, n), metres; NaN where no height is known."""

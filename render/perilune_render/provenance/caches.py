@@ -25,7 +25,7 @@ _LONGEST_WAIT_S = 120.0
 
 
 def cache_home() -> Path:
-    """perilune's folder in the user's cache folder; for a user without a home folder, one in the temporary folder.
+    """perilune's cache folder, in the user's cache folder or, without a home folder, in the temporary folder.
 
     Other users may write to the temporary folder, and numba executes the files it reads. If the folder there is not
     owned by the user or is accessible to others, a new folder with a random name is used.

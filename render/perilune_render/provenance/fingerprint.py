@@ -65,9 +65,10 @@ class _Module:
 
 
 def fingerprint(*roots: str, folders: dict[str, Path] | None = None) -> Fingerprint:
-    """The fingerprint of functions and classes, given as `package.module:name`; `package.module:` is a whole module.
+    """The fingerprint of functions and classes, given as `package.module:name`.
 
-    `folders` gives the folder of each package, by default the folders of the imported packages.
+    `package.module:` is a whole module. `folders` gives the folder of each package, by default the folders of the
+    imported packages.
     """
     return _fingerprint(roots, tuple(sorted((folders or FOLDERS).items())))
 
@@ -109,7 +110,10 @@ class _Walk:
         self.sources: dict[str, _Module | None] = {}
 
     def follow(self, module: str, names: tuple[str, ...]) -> None:
-        """Collect the code to which a dotted name in a module refers; ignore names that the module does not define."""
+        """Collect the code to which a dotted name in a module refers.
+
+        Ignore names that the module does not define.
+        """
         if module.startswith(_NO_EFFECT):
             return
         source = self._source(module)

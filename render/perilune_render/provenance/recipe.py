@@ -23,7 +23,10 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """The recipe of a dataset. With `planned`, the recipe of a plan, with only the versions that affect the ground."""
+    """The recipe of a dataset.
+
+    With `planned`, it is the recipe of a plan, with only the versions that affect the ground.
+    """
     with_dem = config.terrain.dem is not None
     versions = (
         ground_versions(with_dem=with_dem)
@@ -96,18 +99,18 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
     Recipes are untrusted: the files that they name are never opened, only `dem` and `catalogue`. Raises UserError if a
     needed file is not given, if a given file is not used by the recipe, or if this version rejects the settings.
     """
-    given = {"dem": dem, "catalogue": catalogue}
+    copies = {"dem": dem, "catalogue": catalogue}
     terrain = recipe.config.get("terrain", {})
     if not isinstance(terrain, dict):
         raise UserError(where, "terrain", repr(terrain), "settings")
     terrain = dict(terrain)
     for name in _FILES:
-        if terrain.get(name) is None and given[name] is not None:
-            raise UserError(f"--{name}", name, given[name], f"no --{name}, since the recipe names no such file")
+        if terrain.get(name) is None and copies[name] is not None:
+            raise UserError(f"--{name}", name, copies[name], f"no --{name}, since the recipe names no such file")
         if terrain.get(name) is not None:
-            if given[name] is None:
+            if copies[name] is None:
                 raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with a local copy of it")
-            terrain[name] = str(given[name])
+            terrain[name] = str(copies[name])
     elevation = terrain.get("elevation", {})
     if terrain.get("catalogue") is not None and isinstance(elevation, dict):
         # Recipes older than this setting took all rims from the catalogue.

@@ -70,7 +70,10 @@ def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = Fals
 
 
 def check_installed(engine: str) -> None:
-    """Raise UserError for the engine `cycles` if Blender's module is missing; other engines do not need it."""
+    """Raise UserError for the engine `cycles` if Blender's module is missing.
+
+    Other engines do not need it.
+    """
     if engine == "cycles" and importlib.util.find_spec("bpy") is None:
         found = "cycles, without Blender's module bpy"
         expected = "heightfield, or on Python 3.11 `pip install 'perilune-render[blender]'`"

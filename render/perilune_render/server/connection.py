@@ -56,7 +56,10 @@ class Connection:
         return await self.rest(n_bytes)
 
     async def first(self, n_bytes: int) -> bytes:
-        """The first bytes of a message. Raises TimeoutError after `limits.idle_s`, or if only part of them arrives."""
+        """The first bytes of a message.
+
+        Raises TimeoutError after `limits.idle_s`, or if only part of them arrives.
+        """
         async with asyncio.timeout(self.limits.idle_s):
             begun = await self.reader.readexactly(1)
         self._due_s = time.monotonic() + self.limits.message_s

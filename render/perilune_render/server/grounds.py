@@ -15,9 +15,9 @@ from perilune_render.server.simulation import SimulatedScene
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.errors import UserError
 
-MOST_KEPT = 3
+MAX_KEPT = 3
 """Largest number of scenes in memory besides scene 0 and the scene that is being generated."""
-MOST_WAITING = 16
+MAX_WAITING = 16
 """Largest number of scenes that wait to be generated."""
 _STREAM = "served"
 
@@ -60,7 +60,7 @@ class Grounds:
     def simulated(self, number: int, client: object) -> SimulatedScene | None:
         """The simulated scene of a number; None if it is not in memory yet; then ask again.
 
-        The scene is then being generated or queued, unless another scene of the client or MOST_WAITING scenes are
+        The scene is then being generated or queued, unless another scene of the client or MAX_WAITING scenes are
         queued. Raises UserError for a number that the server does not have, and the original error if generation
         failed.
         """
@@ -71,7 +71,7 @@ class Grounds:
             raise self._failed.pop(number)
         if number == 0 or number in self._kept:
             return self._used(number)
-        is_full = client in self._waiting.values() or len(self._waiting) >= MOST_WAITING
+        is_full = client in self._waiting.values() or len(self._waiting) >= MAX_WAITING
         if number not in self._waiting and not is_full:
             self._waiting[number] = client
             self._asked.put(number)
@@ -94,7 +94,7 @@ class Grounds:
             if isinstance(result, Exception):
                 self._failed[number] = result
                 continue
-            while len(self._kept) >= MOST_KEPT:
+            while len(self._kept) >= MAX_KEPT:
                 self._kept.pop(next(iter(self._kept))).close()
             self._kept[number] = result
 

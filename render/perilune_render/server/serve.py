@@ -1,4 +1,6 @@
-"""The server: many clients, one thread that renders. It answers the requests of all clients one after another.
+"""The server: many clients, one thread that renders.
+
+It answers the requests of all clients one after another.
 
 The first thread renders, since Blender must be in it. An event loop in a second thread holds the connections of all
 interfaces. It reads a connection again once its request is answered, so a client has at most one request in the queue,
@@ -113,7 +115,10 @@ class Server:
             raise self._failure
 
     def run(self) -> None:
-        """Answer requests until `stop` is called. Raises UserError if the thread of the connections ended before."""
+        """Answer requests until `stop` is called.
+
+        Raises UserError if the thread of the connections ended before.
+        """
         try:
             while (item := self._work.get()) is not None:
                 _answer(*item)
@@ -228,7 +233,10 @@ class Server:
         return reason
 
     def _drop_silent(self, interface: Interface) -> bool:
-        """Close the connection that has been silent longest without any request. False without such a connection."""
+        """Close the connection that has been silent longest without any request.
+
+        Returns False without such a connection.
+        """
         now_s = time.monotonic()
         silent = [each for each in interface.clients if not each.has_asked and now_s - each.heard_s >= _GRACE_S]
         if not silent:
@@ -240,7 +248,7 @@ class Server:
         return True
 
     async def _refuse(self, interface: Interface, connection: Connection) -> None:
-        """Let the interface tell a client that the limit is reached; with too many such clients, close at once."""
+        """Tell a client that the limit is reached, or close the connection if there are too many such clients."""
         self._say(f"{connection.name}: refused, {interface.limits.clients} clients are connected")
         if interface.n_extra >= interface.limits.clients:
             connection.writer.transport.abort()

@@ -30,7 +30,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, sun_direction
 
-_MOST_SOURCES = 8
+_MAX_SOURCES = 8
 _PREPARED_AT_M = 500.0
 _DOWN = np.diag([1.0, -1.0, -1.0])
 
@@ -99,7 +99,10 @@ class SimulatedScene:
         velocity_mps: Array | None = None,
         angular_velocity_radps: Array | None = None,
     ) -> Frame:
-        """Render and develop a frame. Raises UserError like `check_view`, and above LARGEST_MPS or LARGEST_RADPS."""
+        """Render and develop a frame.
+
+        Raises UserError like `check_view`, and above LARGEST_MPS or LARGEST_RADPS.
+        """
         self.check_view(view)
         velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
         turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")
@@ -141,7 +144,7 @@ class SimulatedScene:
 
     def _opened(self, view: View) -> tuple[FrameSource, ExitStack]:
         cycles = self.config.render.engine == "cycles"
-        most = 1 if cycles else _MOST_SOURCES
+        most = 1 if cycles else _MAX_SOURCES
         while len(self._sources) >= most:
             self._sources.pop(next(iter(self._sources)))[1].close()
         if cycles:

@@ -1,1 +1,4 @@
-"""The ground as plain data, independent of Blender: laws, populations, heights. Sources: docs/reference/sources.md."""
+"""The ground as plain data, independent of Blender: laws, populations, heights.
+
+Sources: docs/reference/sources.md.
+"""

@@ -27,7 +27,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 if TYPE_CHECKING:
     import trimesh
 
-MOST_BOULDERS = 3_000_000
+MAX_BOULDERS = 3_000_000
 """Largest mean number of boulders in a scene, on the plain or in all fields; each needs about 1 kB in a renderer."""
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
@@ -114,8 +114,8 @@ def check_boulders(config: BouldersConfig, grid: Grid) -> None:
 
 
 def _check_number(number: float, setting: str) -> None:
-    if number > MOST_BOULDERS:
-        expected = f"at most {MOST_BOULDERS}: lower {setting}, or raise min_diameter_spacings"
+    if number > MAX_BOULDERS:
+        expected = f"at most {MAX_BOULDERS}: lower {setting}, or raise min_diameter_spacings"
         raise UserError("dataset.terrain.boulders", "number", f"about {number:.3g} in a scene", expected)
 
 
@@ -195,7 +195,10 @@ def largest_height_m(boulders: Boulders) -> float:
 
 
 def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_m: Array) -> Array:
-    """Heights (M,) of the highest boulder at positions (M,), O_L, metres; -inf without one. See `boulder_mesh`."""
+    """Heights (M,) of the highest boulder at positions (M,), O_L, metres; -inf without one.
+
+    See `boulder_mesh`.
+    """
     tops = np.full(len(x_m), -np.inf)
     widest = _FARTHEST * boulders.diameter_m.max(initial=0.0)
     if not len(x_m) or not len(boulders):

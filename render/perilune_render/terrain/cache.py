@@ -119,9 +119,9 @@ def _read(path: Path, view: ViewEnvelope) -> Scene | None:
 
 
 def _make_room(folder: Path, most_bytes: float) -> None:
-    kept = sorted(folder.glob("[0-9a-f]*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    files = sorted(folder.glob("[0-9a-f]*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
     total = 0
-    for index, path in enumerate(kept):
+    for index, path in enumerate(files):
         total += path.stat().st_size
         # Keep the newest file, however large.
         if total > most_bytes and index > 0:

@@ -19,7 +19,7 @@ from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
-_MOST_RINGS = 1_000_000
+_MAX_RINGS = 1_000_000
 """Largest number of rings; even the finest ground that fits in memory has fewer."""
 FAR_GROWTH = 0.07
 """Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: ground at a
@@ -87,7 +87,10 @@ class Grid:
         return self.spacing_at(np.maximum(np.abs(x_m - self.centre_x_m), np.abs(y_m - self.centre_y_m)))
 
     def half_width_for(self, spacing_m: float) -> float:
-        """Half side, metres, of the square in which the spacing is at most `spacing_m`; 0 if no such square exists."""
+        """Half side, metres, of the square in which the spacing is at most `spacing_m`.
+
+        Returns 0 if no such square exists.
+        """
         fine = self.spacings_m <= spacing_m * (1 + 1e-9)
         return float(self.half_widths_m[fine].max()) if fine.any() else 0.0
 
@@ -149,8 +152,8 @@ def grid_of(
         distance = np.concatenate([distance, distance[-1] + far])
         allowed = np.concatenate([allowed, allowed[-1] + FAR_GROWTH * far])
     steps = np.concatenate([[0], np.cumsum(np.diff(distance) / allowed[:-1])])
-    if not steps[-1] <= _MOST_RINGS:
-        expected = f"at most {_MOST_RINGS}: raise dataset.terrain.spacing_px or the lowest altitude"
+    if not steps[-1] <= _MAX_RINGS:
+        expected = f"at most {_MAX_RINGS}: raise dataset.terrain.spacing_px or the lowest altitude"
         raise UserError("ground", "vertices along a line", f"about {steps[-1]:.3g}", expected)
     n_rings = int(np.ceil(steps[-1]))
     return Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance), *centre_m)
@@ -165,11 +168,11 @@ def _put(lines, row, start, step, vertices, ring):
 
 @njit()
 def lines_in(window, n_half, half_widths, lines):
-    """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns the number of lines.
+    """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7).
 
-    `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the grid's centre. A line holds
-    x and y of its first vertex, the steps in x and y, the index of the first vertex, the number of vertices, and the
-    ring (0 is the inner square).
+    Returns the number of lines. `window` is (x_low, x_high, y_low, y_high), metres; all coordinates are relative to the
+    grid's centre. A line holds x and y of its first vertex, the steps in x and y, the index of the first vertex, the
+    number of vertices, and the ring (0 is the inner square).
     """
     x_low, x_high, y_low, y_high = window
     count = 0
@@ -213,7 +216,7 @@ def lines_in(window, n_half, half_widths, lines):
 
 @njit()
 def place_in_ring(x, y, n_half):
-    """Position along the square ring through (x, y), counted in vertices from the corner at -x, -y; fractional."""
+    """Fractional position along the square ring through (x, y), in vertices from the corner at -x, -y."""
     distance = max(abs(x), abs(y))
     if y <= -distance:
         side, along = 0, x

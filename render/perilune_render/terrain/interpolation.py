@@ -8,7 +8,7 @@ from perilune_shared.geometry.frames import Array
 
 
 def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -> Array:
-    """Values of a field (n_vertices,) at positions of any shape, bilinear; outside, the value at the border."""
+    """Bilinear values of a field (n_vertices,) at positions of any shape; the border value outside the grid."""
     x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
     relative = np.ravel(x) - grid.centre_x_m, np.ravel(y) - grid.centre_y_m
     return _values_at(field, grid.n_half, grid.half_widths_m, *relative).reshape(x.shape)

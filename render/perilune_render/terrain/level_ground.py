@@ -12,7 +12,7 @@ from perilune_render.terrain.interpolation import corners
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
-_MOST_SAMPLES = 8
+_MAX_SAMPLES = 8
 """Largest number of points along one side of a cell; more would be needed only out of view."""
 
 
@@ -56,7 +56,7 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
     """The scene with only the ground of a level, and the boulders that are large enough for its mesh."""
     height, albedo = (averaged(field, scene.grid, grid) for field in (scene.height_m, scene.albedo))
     real = averaged(scene.real, scene.grid, grid) > 0.5 if scene.real.any() else np.zeros(grid.n_vertices, bool)
-    shown = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
+    is_large = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
         scene.boulders.x_m, scene.boulders.y_m
     )
     return dataclasses.replace(
@@ -65,8 +65,8 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
         height_m=height,
         albedo=albedo,
         real=real,
-        boulders=scene.boulders.chosen(shown),
-        boulder_z_m=scene.boulder_z_m[shown],
+        boulders=scene.boulders.chosen(is_large),
+        boulder_z_m=scene.boulder_z_m[is_large],
     )
 
 
@@ -97,8 +97,8 @@ def _averaged(field, mesh, cells):
             side_x, side_y = around[ring], across[ring]
         nearest = np.searchsorted(half_widths, max(abs(px), abs(py)))
         spacing = spacings[min(nearest, len(spacings) - 1)]
-        n_x = min(max(round(side_x / spacing), 1), _MOST_SAMPLES)
-        n_y = min(max(round(side_y / spacing), 1), _MOST_SAMPLES)
+        n_x = min(max(round(side_x / spacing), 1), _MAX_SAMPLES)
+        n_y = min(max(round(side_y / spacing), 1), _MAX_SAMPLES)
         total = 0.0
         for j in range(n_y):
             for i in range(n_x):

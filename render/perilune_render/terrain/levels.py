@@ -35,11 +35,12 @@ class Level:
 
 
 def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) -> tuple[Level, ...]:
-    """The levels of a trajectory, finest first; one level if the whole ground has at most `terrain.max_vertices`.
+    """The levels of a trajectory, finest first.
 
-    The trajectory comes from the direction `approach_deg` (clockwise from north) to within half a degree. From the
-    lowest upwards, each band of heights is as wide as this limit and _WIDEST_BAND allow. Spacing is at most
-    `terrain.spacing_px` times the smallest ground pixel of the band. Raises UserError if no level fits.
+    There is one level if the whole ground has at most `terrain.max_vertices`. The trajectory comes from the direction
+    `approach_deg` (clockwise from north) to within half a degree. From the lowest upwards, each band of heights is as
+    wide as this limit and _WIDEST_BAND allow. Spacing is at most `terrain.spacing_px` times the smallest ground pixel
+    of the band. Raises UserError if no level fits.
     """
     whole = checked_grid(terrain, view)
     if view.seen is None or whole.n_vertices <= terrain.max_vertices:
@@ -125,7 +126,10 @@ def _refusal(terrain: TerrainConfig, view: ViewEnvelope, needed: int) -> UserErr
 
 
 def _last_that_fits(band: Callable[[int], Grid], low: int, high: int, most: int) -> int:
-    """The last index from `low` to `high` for which a band has at most `most` vertices; `low` is assumed to fit."""
+    """The last index from `low` to `high` for which a band has at most `most` vertices.
+
+    `low` is assumed to fit.
+    """
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if band(middle).n_vertices <= most else (low, middle - 1)

@@ -43,7 +43,7 @@ from perilune_shared.geometry.frames import Array
 
 _ROUGHNESS_M = 100.0
 """Wavelength below which relief is added on top of the craters, metres."""
-_LEAST_RIM = 0.3
+_MIN_RIM = 0.3
 """Share of a crater's rim that must remain; below it, the crater is no longer counted."""
 
 
@@ -122,7 +122,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     wanted = config.removed_from(seed)
     uncratered = soil.copy() if wanted else soil
     stamped = _stamp(config, soil, grid, drawn, seed)
-    visible = np.flatnonzero(stamped.rim_left >= _LEAST_RIM)
+    visible = np.flatnonzero(stamped.rim_left >= _MIN_RIM)
     craters, sag = drawn.chosen(visible), stamped.sag_m[visible]
     # 3. Craters of the catalogue come first. The elevation model shows them, so nothing is stamped.
     n_real = 0
@@ -148,8 +148,8 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         height -= drop_m(*grid.vertices_xy())
     # 6. Boulders and rims on the finished ground. Boulders are drawn around all craters, including removed ones.
     boulders = draw_boulders(terrain.boulders, grid, craters, seed, removed)
-    kept = np.delete(np.arange(len(craters)), removed)
-    craters, sag = craters.chosen(kept), sag[kept]
+    remaining = np.delete(np.arange(len(craters)), removed)
+    craters, sag = craters.chosen(remaining), sag[remaining]
     return Scene(
         seed,
         *_site_deg(config, model),
@@ -170,9 +170,12 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
 def _stamp(
     config: DatasetConfig, soil: _Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
 ) -> Stamped:
-    """Add rays and stamp craters except the `removed` ones (indices), in place; removed craters have 0 in `Stamped`."""
-    kept = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
-    variation, stays, law = config.light.albedo_variation, craters.chosen(kept), config.terrain.craters
+    """Add rays and stamp craters except the `removed` ones (indices), in place.
+
+    Removed craters have 0 in `Stamped`.
+    """
+    remaining = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
+    variation, stays, law = config.light.albedo_variation, craters.chosen(remaining), config.terrain.craters
     if variation > 0:
         add_rays(soil.albedo, grid, craters, RayLaw(law.n_rayed, variation), seed, removed)
     brightening = variation * brightness(stays)
@@ -180,7 +183,7 @@ def _stamp(
     if removed is None:
         return stamped
     sag, rim_left = np.zeros(len(craters)), np.zeros(len(craters))
-    sag[kept], rim_left[kept] = stamped.sag_m, stamped.rim_left
+    sag[remaining], rim_left[remaining] = stamped.sag_m, stamped.rim_left
     return Stamped(sag, rim_left)
 
 
@@ -190,9 +193,9 @@ def _at_site(height_m: Array, grid: Grid) -> Array:
 
 
 def check_ground(config: DatasetConfig, view: ViewEnvelope) -> Grid:
-    """Check grid, relief and input files before the ground is generated; return the grid. Raises UserError.
+    """Check grid, relief and input files before the ground is generated; return the grid.
 
-    Prints remarks on the elevation model.
+    Raises UserError. Prints remarks on the elevation model.
     """
     grid = checked_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)

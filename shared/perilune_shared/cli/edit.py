@@ -124,11 +124,11 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
     """Show the differences between two datasets. Exit code 1 if there are any."""
     from perilune_shared.editing.diff import differences
 
-    found = differences(ps.open_dataset(first), ps.open_dataset(second))
-    if not found:
+    differing = differences(ps.open_dataset(first), ps.open_dataset(second))
+    if not differing:
         answer("no difference")
         return
-    rows = [(one.place, one.column, one.rows, one.example, one.first, one.second) for one in found]
+    rows = [(each.place, each.column, each.rows, each.example, each.first, each.second) for each in differing]
     answer_table(("where", "column", "rows", "example", "first", "second"), rows)
     raise typer.Exit(EXIT_DIFFERENT)
 

@@ -82,7 +82,7 @@ def export(
         raise UserError("--link", "--format", format, "yolo: other formats have no images")
     if format == "croissant":
         if split is not None:
-            raise UserError("--split", "split", split, "none: Croissant describes the whole dataset")
+            raise UserError("--split", "split", split, "no --split: Croissant describes the whole dataset")
         with progress_bar() as progress:
             written = export_croissant(opened, out, progress)
         _say(f"{written}: written")

@@ -33,11 +33,12 @@ def validate(
     if not faults:
         answer(f"{dataset}: no fault")
         return
-    n_faults = sum(one.n_faults for one in faults)
+    n_faults = sum(fault.n_faults for fault in faults)
     count = "1 fault" if n_faults == 1 else f"{n_faults} faults"
     caption = f"the first {most}; `--most` shows more" if len(faults) > most else ""
     rows = [
-        (one.file, "" if one.row is None else one.row, one.column, one.found, one.expected) for one in faults[:most]
+        (fault.file, "" if fault.row is None else fault.row, fault.column, fault.found, fault.expected)
+        for fault in faults[:most]
     ]
     answer_table(("file", "row", "column", "got", "expected"), rows, title=f"{dataset}: {count}", caption=caption)
     raise typer.Exit(EXIT_USER_ERROR)

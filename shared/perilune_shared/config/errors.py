@@ -104,7 +104,7 @@ def user_error_of(
 
 
 def got_of(fault: ErrorDetails) -> str:
-    """Return the wrong value; if several settings contradict each other, only those that the message names."""
+    """Return the wrong value, or the contradictory settings that the message names."""
     if fault["type"] == "missing":
         return "nothing"
     value = fault["input"]
@@ -126,7 +126,10 @@ def _contains(content: Any, location: list[str]) -> bool:
 
 
 def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
-    """Return the names of the settings at a location below `model`; empty if there is no section at the location."""
+    """Return the names of the settings at a location below `model`.
+
+    The result is empty if there is no section at the location.
+    """
     annotation: Any = model
     for key in location:
         section = next(iter(_sections_in(annotation)), None)

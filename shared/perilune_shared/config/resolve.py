@@ -1,8 +1,8 @@
-"""Load configurations strictly: a preset, then the user's YAML file, then single settings; unknown keys are errors.
+"""Load configurations strictly: a preset, then the user's YAML file, then single settings.
 
-A configuration file has up to four sections, one for each command that reads it: `dataset` (the renderer),
-`detect`, `navigate` and `explain` (the trainer). A command validates its own section and ignores the others,
-so one file can describe a whole experiment.
+Unknown keys are errors. A configuration file has up to four sections, one for each command that reads it: `dataset`
+(the renderer), `detect`, `navigate` and `explain` (the trainer). A command validates its own section and ignores the
+others, so one file can describe a whole experiment.
 """
 
 import json
@@ -72,9 +72,9 @@ def resolve(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """Resolve `section` from a preset of `package`, a user's file and single settings; later sources override.
+    """Resolve `section` from a preset of `package`, a user's file and single settings.
 
-    Raises UserError with the source, the key, the value and the expected value.
+    Later sources override. Raises UserError with the source, the key, the value and the expected value.
     """
     if preset not in PRESETS:
         raise UserError("--preset", "preset", preset, nearest(preset, PRESETS))

@@ -74,7 +74,10 @@ def parse_yaml(text: str, where: object) -> Any:
 
 
 def to_yaml_text(data: dict[str, Any]) -> str:
-    """Format plain data as block YAML; keys keep their order. Quotes text that YAML 1.1 could read as another type."""
+    """Format plain data as block YAML; keys keep their order.
+
+    Quotes text that YAML 1.1 could read as another type.
+    """
     yaml = YAML(typ="safe", pure=True)
     yaml.Representer = _Representer
     yaml.default_flow_style = False

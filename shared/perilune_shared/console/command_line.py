@@ -27,7 +27,7 @@ def _describe_threads(verbose: bool) -> None:
 Verbose = Annotated[
     bool,
     typer.Option(
-        "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the variables of threads."
+        "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the thread variables."
     ),
 ]
 """Option of every program; it precedes the command: `perilune-train -v detect train`."""
@@ -111,7 +111,10 @@ def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -
 
 
 def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
-    """Run a command line; return the line to print if it ended with a user error or Ctrl-C, otherwise None."""
+    """Run a command line.
+
+    Returns the line to print if it ended with a user error or Ctrl-C, otherwise None.
+    """
     try:
         _check_arguments()
         set_up_program()
@@ -139,12 +142,15 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
 
 
 def _folders() -> dict[str, str]:
-    """Return the variable that puts Matplotlib's font list into perilune's cache; empty without a home folder."""
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    """Return the variable that puts Matplotlib's font list into perilune's cache.
+
+    The result is empty without a home folder.
+    """
+    configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
     home = Path(os.environ.get("HOME", ""))
-    if not given.is_absolute() and not (home.is_absolute() and home.is_dir()):
+    if not configured.is_absolute() and not (home.is_absolute() and home.is_dir()):
         return {}
-    cache = given if given.is_absolute() else home / ".cache"
+    cache = configured if configured.is_absolute() else home / ".cache"
     return {"MPLCONFIGDIR": str(cache / "perilune" / "matplotlib")}
 
 

@@ -1,4 +1,4 @@
-"""Handle Ctrl-C: end a program with one line, even during its imports; or delay the interrupt until a step ends.
+"""Handle Ctrl-C: end a program with one line, or delay the interrupt until a step ends.
 
 Imports as little as possible: until `end_at_interrupt` is called, Python prints a traceback at Ctrl-C.
 """

@@ -1,4 +1,4 @@
-"""Report the progress of long tasks to a progress bar, or to nothing.
+"""Report the progress of long tasks to a progress bar, or discard it.
 
 Use: `task = progress.add_task("merging", total=n, unit="scenes")`, then `progress.advance(task)` after each step.
 Command lines pass `terminal.progress_bar()`. Other callers pass nothing, and Rich is not imported.

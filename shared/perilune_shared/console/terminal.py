@@ -61,7 +61,10 @@ def answer_table(
     *,
     numbers: bool = False,
 ) -> None:
-    """Print a table on standard output; long cells are folded. `numbers` right-aligns all columns but the first."""
+    """Print a table on standard output; long cells are folded.
+
+    `numbers` right-aligns all columns but the first.
+    """
     table = Table(title=Text(one_line(title)) if title else None, caption=Text(one_line(caption)) if caption else None)
     for index, name in enumerate(head):
         table.add_column(Text(one_line(name)), justify="right" if numbers and index else "left", overflow="fold")

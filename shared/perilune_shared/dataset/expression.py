@@ -212,7 +212,7 @@ class Condition:
 
     def _number(self, value: _Value, node: ast.expr) -> _Value:
         if not value.is_number:
-            hint = f"; {ast.unparse(node)}[0] is one" if value.kind == "vector" else ""
+            hint = f"; write {ast.unparse(node)}[0] for the first element" if value.kind == "vector" else ""
             raise self._fault(f"{ast.unparse(node)} ({value.kind})", f"a number{hint}")
         return value
 

@@ -31,9 +31,9 @@ INDEX = pa.schema(
     metadata={"perilune.table": FOLDER, "perilune.schema_version": SCHEMA_VERSION},
 )
 """Schema of the index."""
-MOST_ROWS = 2_000_000
+MAX_ROWS = 2_000_000
 """Maximum number of rows of a part."""
-MOST_ROWS_IN_ALL = 4_000_000
+MAX_TOTAL_ROWS = 4_000_000
 """Maximum number of rows of all parts; each row takes about 0.4 kB of memory while the files are checked."""
 LARGEST_FILE_BYTES = 2**36
 _ROWS_PER_GROUP = 2**16
@@ -77,14 +77,14 @@ def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
 
 def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
     """Write the parts of an index and return their records for dataset.json; the rows may be in any order."""
-    if len(rows) > MOST_ROWS_IN_ALL:
-        expected = f"at most {MOST_ROWS_IN_ALL}; pack the frames, or split the dataset"
+    if len(rows) > MAX_TOTAL_ROWS:
+        expected = f"at most {MAX_TOTAL_ROWS}; pack the frames, or split the dataset"
         raise UserError(store, "files", len(rows), expected)
     rows = rows.sort_by("path")
     parts = []
-    for start in range(0, max(len(rows), 1), MOST_ROWS):
+    for start in range(0, max(len(rows), 1), MAX_ROWS):
         sink = pa.BufferOutputStream()
-        chosen = rows[start : start + MOST_ROWS].cast(INDEX)
+        chosen = rows[start : start + MAX_ROWS].cast(INDEX)
         pq.write_table(chosen, sink, compression="zstd", use_dictionary=False, row_group_size=_ROWS_PER_GROUP)
         content = sink.getvalue().to_pybytes()
         sha256 = hashlib.sha256(content).hexdigest()
@@ -94,7 +94,9 @@ def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
 
 
 def seal(store: Store, info: DatasetInfo, rows: pa.Table) -> DatasetInfo:
-    """Write the index, then dataset.json with it, then delete other indexes; return the content of dataset.json.
+    """Write the index, then dataset.json with it, then delete other indexes.
+
+    Returns the content of dataset.json.
 
     If the dataset has an index already and the files in it are unchanged, the dataset matches its index at every
     moment.
@@ -126,10 +128,8 @@ def read_index(store: Store, info: DatasetInfo) -> pa.Table:
             last = paths[-1].as_py() if len(paths) else last
             pieces.append(rows)
             n_rows += len(rows)
-            if n_rows > MOST_ROWS_IN_ALL:
-                raise UserError(
-                    store.at(FOLDER), "rows", f"more than {MOST_ROWS_IN_ALL}", f"at most {MOST_ROWS_IN_ALL}"
-                )
+            if n_rows > MAX_TOTAL_ROWS:
+                raise UserError(store.at(FOLDER), "rows", f"more than {MAX_TOTAL_ROWS}", f"at most {MAX_TOTAL_ROWS}")
     return pa.concat_tables([INDEX.empty_table(), *pieces])
 
 
@@ -146,8 +146,8 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
     for group in range(part.n_groups):
         # Check the paths of each small group before decompressing the next one.
         in_group = part.file.metadata.row_group(group).num_rows
-        if part.n_rows > MOST_ROWS or in_group > _ROWS_PER_GROUP:
-            expected = f"at most {MOST_ROWS}, at most {_ROWS_PER_GROUP} in a row group"
+        if part.n_rows > MAX_ROWS or in_group > _ROWS_PER_GROUP:
+            expected = f"at most {MAX_ROWS}, at most {_ROWS_PER_GROUP} in a row group"
             raise UserError(where, "rows", f"{part.n_rows}, {in_group} in a row group", expected)
         rows = part.read(groups=[group])
         _check_rows(where, rows)

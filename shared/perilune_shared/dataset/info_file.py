@@ -20,7 +20,10 @@ _EXPECTED = "the folder or address of a dataset (see `make dataset`)"
 
 
 def read_object(address: Address) -> dict[str, Any]:
-    """Read the JSON object in dataset.json. Raises UserError if it is missing, too large or not a JSON object."""
+    """Read the JSON object in dataset.json.
+
+    Raises UserError if it is missing, too large or not a JSON object.
+    """
     store = open_store(address)
     where = store.at(INFO_NAME)
     if store.folder is not None:
@@ -48,7 +51,10 @@ def read_object(address: Address) -> dict[str, Any]:
 
 
 def _with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a dict from members. Raises ValueError on a duplicate name: JSON readers disagree on which one is valid."""
+    """Build a dict from members.
+
+    Raises ValueError on a duplicate name: JSON readers disagree on which one is valid.
+    """
     members: dict[str, Any] = {}
     for name, value in pairs:
         if name in members:
@@ -81,7 +87,10 @@ def read_info(address: Address) -> DatasetInfo:
 
 
 def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
-    """Validate plain data as a DatasetInfo. Raises UserError about the first wrong field; messages name `path`."""
+    """Validate plain data as a DatasetInfo.
+
+    Raises UserError about the first wrong field; messages name `path`.
+    """
     try:
         info = DatasetInfo.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -106,7 +115,10 @@ def _check_texts(info: DatasetInfo, path: object) -> None:
 
 
 def _unsafe_text(tree: object) -> str | None:
-    """Return the first text or member name in plain data that contains unsafe characters; None if there is none."""
+    """Return the first text or member name in plain data that contains unsafe characters.
+
+    Returns None if there is none.
+    """
     if isinstance(tree, str):
         return None if tree.isprintable() and not set(tree) & set("<>&`$") else tree
     if isinstance(tree, dict):
@@ -123,7 +135,10 @@ def write_info(address: Address, info: DatasetInfo) -> None:
 
 
 def info_bytes(info: DatasetInfo, where: object) -> bytes:
-    """Return the content of dataset.json. Raises UserError, which names `where`, if texts of recipes are unsafe."""
+    """Return the content of dataset.json.
+
+    Raises UserError, which names `where`, if texts of recipes are unsafe.
+    """
     _check_texts(info, where)
     return with_own_hash(info.model_dump_json(indent=2).encode())
 

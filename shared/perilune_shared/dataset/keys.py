@@ -58,9 +58,9 @@ class KeyCheck:
     """
 
     def __init__(self, dataset: Dataset, frames: pa.Table):
-        """Check the keys of all tables except labels. `frames` is the table frames with at least FRAME_COLUMNS.
+        """Check the keys of all tables except labels.
 
-        Raises UserError if a key is broken.
+        `frames` is the table frames with at least FRAME_COLUMNS. Raises UserError if a key is broken.
         """
         self._dataset = dataset
         scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
@@ -83,9 +83,10 @@ class KeyCheck:
         self._seen: list[NDArray[np.int64]] = []
 
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
-        """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
+        """Return the row number (N,) of each label's frame in the table frames.
 
-        Raises UserError if a frame or crater is missing, or if a label and its frame have different scene_ids.
+        `rows` has frame_id and crater_id. Raises UserError if a frame or crater is missing, or if a label and its frame
+        have different scene_ids.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         if "scene_id" in rows.column_names:
@@ -122,7 +123,10 @@ class KeyCheck:
 
 
 def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
-    """Return the value in `place_of` for each text of a column (N,); -1 if it is missing. Looks up equal texts once."""
+    """Return the value in `place_of` for each text of a column (N,); -1 if it is missing.
+
+    Looks up equal texts once.
+    """
     looked_up = []
     for chunk in column.chunks:
         words = chunk.dictionary_encode()
@@ -134,7 +138,10 @@ def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[
 def _checked_ids_and_keys(
     dataset: Dataset, table: str, scene_of: Mapping[str, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Check the keys of craters or boulders; return all ids and all keys (scene and id as one integer), sorted."""
+    """Check the keys of craters or boulders.
+
+    Returns all ids and all keys (scene and id as one integer), sorted.
+    """
     rows = dataset.table(table, KEYS[table])
     scene = _check_known(dataset, table, "scene_id", rows["scene_id"], scene_of)
     numbers, position = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
@@ -147,11 +154,11 @@ def _checked_ids_and_keys(
 def _check_known(
     dataset: Dataset, table: str, name: str, column: pa.ChunkedArray, place_of: Mapping[str, int]
 ) -> NDArray[np.int64]:
-    found = _looked_up(column, place_of)
-    if (found < 0).any():
-        missing = column[int(np.argmin(found))].as_py()
+    numbers = _looked_up(column, place_of)
+    if (numbers < 0).any():
+        missing = column[int(np.argmin(numbers))].as_py()
         raise UserError(dataset.store, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")
-    return found
+    return numbers
 
 
 def _check_unique(dataset: Dataset, table: str, rows: pd.DataFrame) -> None:

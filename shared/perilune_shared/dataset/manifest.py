@@ -107,7 +107,10 @@ class Dataset:
 
     @functools.cached_property
     def labels(self) -> pd.DataFrame:
-        """The table labels; cached, about 200 bytes of memory per label. `table` can read single columns or a split."""
+        """The table labels; cached, about 200 bytes of memory per label.
+
+        `table` can read single columns or a split.
+        """
         return self.table("labels").to_pandas()
 
     @functools.cached_property
@@ -249,7 +252,10 @@ def open_dataset(address: Address) -> Dataset:
 
 
 def open_single(address: Address) -> Dataset:
-    """Open a dataset of one camera. Raises UserError as `open_dataset` does, and if there are several cameras."""
+    """Open a dataset of one camera.
+
+    Raises UserError as `open_dataset` does, and if there are several cameras.
+    """
     dataset = open_dataset(address)
     check_single(dataset)
     return dataset

@@ -36,7 +36,10 @@ _Row = tuple[float, float, float]
 
 
 def _printable(text: str) -> str:
-    """Return `text` unchanged. Raises ValueError on unprintable characters, e.g. controls and bidirectional marks."""
+    """Return `text` unchanged.
+
+    Raises ValueError on unprintable characters, e.g. controls and bidirectional marks.
+    """
     if not text.isprintable():
         raise ValueError("text should be printable")
     return text
@@ -131,7 +134,10 @@ class Origin(_Info):
 
 
 class Recipe(_Info):
-    """Settings, random seed and versions. Together with the seeds in the tables, they determine scenes and frames."""
+    """Settings, random seed and versions.
+
+    Together with the seeds in the tables, they determine scenes and frames.
+    """
 
     preset: Name
     """Preset on which the settings are based."""
@@ -228,13 +234,19 @@ class DatasetInfo(_Info):
         return self.camera if self.cameras is None or name is None else self.cameras[name]
 
     def exr_camera_of(self, name: str | None) -> CameraRecord:
-        """Return the EXR camera of frames whose column `camera` is `name`; their PNG camera if there are no EXRs."""
+        """Return the EXR camera of frames whose column `camera` is `name`.
+
+        Returns their PNG camera if there are no EXRs.
+        """
         if self.cameras is None or name is None:
             return self.exr_camera or self.camera
         return (self.exr_cameras or self.cameras)[name]
 
     def with_cameras(self, names: Iterable[str]) -> "DatasetInfo":
-        """Return a copy with only the named cameras. With one name it describes an ordinary dataset of one camera."""
+        """Return a copy with only the named cameras.
+
+        With one name it describes an ordinary dataset of one camera.
+        """
         used = set(names)
         if self.cameras is None or not used & self.cameras.keys() or used >= self.cameras.keys():
             return self
@@ -253,7 +265,10 @@ class DatasetInfo(_Info):
         return recipe
 
     def row_time_s(self, recipe: object) -> float:
-        """Return the row time of the rolling shutter, seconds, for the key of a recipe; 0 without a rolling shutter."""
+        """Return the row time of the rolling shutter, seconds, for the key of a recipe.
+
+        Returns 0 without a rolling shutter.
+        """
         known = self.recipes.get(str(recipe))
         sensor = known.config.get("sensor") if known is not None else None
         value = sensor.get("row_time_s", 0.0) if isinstance(sensor, dict) else 0.0

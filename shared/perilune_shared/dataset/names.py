@@ -1,4 +1,4 @@
-"""Names that datasets and command lines use: kinds, splits, states of images; ids and paths of frames and parts.
+"""Names that datasets and command lines share: kinds, splits, image states, ids and paths.
 
 This module imports neither pandas nor pyarrow, so that configurations and `--help` load without them.
 """
@@ -45,9 +45,9 @@ SCENE_FILE_KINDS: tuple[SceneFileKind, ...] = get_args(SceneFileKind)
 
 
 def frame_path(frame_id: str, kind: ImageKind) -> str:
-    """Return the path of a frame's file relative to the dataset, as written by this version; readers use the manifest.
+    """Return the path of a frame's file relative to the dataset, as written by this version.
 
-    The columns png_path, exr_path and lidar_path of other datasets may contain other paths.
+    Readers use the manifest. The columns png_path, exr_path and lidar_path of other datasets may contain other paths.
     """
     return f"frames/{frame_id}{SUFFIXES[kind]}"
 

@@ -27,7 +27,10 @@ def rows_of_part(
     split: str | None,
     where: Condition | None,
 ) -> pa.Table:
-    """Read the rows of a part that belong to a scene, a trajectory and a split and satisfy `where`; None for any."""
+    """Read the rows of a part that belong to a scene, a trajectory and a split and satisfy `where`.
+
+    None selects any.
+    """
     columns = part.schema.names
     equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
     equal = {name: value for name, value in equal.items() if value is not None and name in columns}

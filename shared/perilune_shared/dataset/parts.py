@@ -32,7 +32,7 @@ from perilune_shared.storage.ranges import Ranges
 from perilune_shared.storage.store import Address, Store, open_store
 from perilune_shared.storage.thrift import Fields, items_of
 
-MOST_ROWS_WRITTEN = 2_000_000
+MAX_ROWS_WRITTEN = 2_000_000
 """Maximum number of rows of a written part; below the reader's limits for every table."""
 _MAX_TEXT_BYTES = 1000
 # Maximum length of lists in a footer. It also limits the depth of the schema: deep nesting can crash the process.
@@ -65,7 +65,10 @@ class WrittenFile:
 
 
 def parquet_files(store: Store, folder: str) -> list[str]:
-    """Return the paths of the Parquet files directly in a folder, sorted by name; hidden files are omitted."""
+    """Return the paths of the Parquet files directly in a folder, sorted by name.
+
+    Hidden files are omitted.
+    """
     if store.folder is not None:
         local = store.folder / folder
         names = [entry.name for entry in os.scandir(local)] if local.is_dir() else []

@@ -6,11 +6,11 @@ import pyarrow as pa
 
 from perilune_shared.dataset.metadata import Counts
 from perilune_shared.dataset.names import WHOLE_TABLE
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WrittenFile, write_part
+from perilune_shared.dataset.parts import MAX_ROWS_WRITTEN, WrittenFile, write_part
 from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, complete
 from perilune_shared.storage.store import Store
 
-_FEWEST_ROWS_PER_GROUP, _MOST_GROUPS = 1000, 200
+_MIN_ROWS_PER_GROUP, _MAX_GROUPS = 1000, 200
 
 
 class WholeTables:
@@ -19,8 +19,8 @@ class WholeTables:
     With `replace`, existing parts are overwritten; otherwise they cause a FileExistsError.
     """
 
-    def __init__(self, store: Store, *, most_rows: int = MOST_ROWS_WRITTEN, replace: bool = False):
-        self._store, self._most_rows, self._replace = store, most_rows, replace
+    def __init__(self, store: Store, *, max_rows: int = MAX_ROWS_WRITTEN, replace: bool = False):
+        self._store, self._max_rows, self._replace = store, max_rows, replace
         self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
         self._n_buffered = dict.fromkeys(TABLES, 0)
         self._n_parts = dict.fromkeys(TABLES, 0)
@@ -37,7 +37,7 @@ class WholeTables:
         rows = complete(name, rows)
         self._n_rows[name] += len(rows)
         while len(rows):
-            free = self._most_rows - self._n_buffered[name]
+            free = self._max_rows - self._n_buffered[name]
             if not free:
                 self._write(name)
                 continue
@@ -57,6 +57,6 @@ class WholeTables:
         rows = pa.concat_tables([TABLES[name].empty_table(), *self._buffered.pop(name, [])])
         self._n_buffered[name] = 0
         stem = f"{WHOLE_TABLE}.{self._n_parts[name]:04d}" if self._n_parts[name] else WHOLE_TABLE
-        per_group = max(_FEWEST_ROWS_PER_GROUP, len(rows) // _MOST_GROUPS)
+        per_group = max(_MIN_ROWS_PER_GROUP, len(rows) // _MAX_GROUPS)
         self._written.append(write_part(self._store, name, stem, rows, per_group, replace=self._replace))
         self._n_parts[name] += 1

@@ -21,7 +21,7 @@ def attach(
     *,
     link: bool = False,
 ) -> None:
-    """Write a dataset from a manifest without frames and the frames in `frames_root`, whose paths the manifest states.
+    """Write a dataset from a manifest without frames and its frames in the folder `frames_root`.
 
     Frames are copied, or hard-linked with `link`. Every PNG must match the hash in the manifest. With `rehash` the
     hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. The
@@ -54,14 +54,14 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
     """Return a scene's rows of `frames` with the hashes of the existing files."""
     names = [f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256")]
     rows = frames.select(["frame_id", "camera", *names]).to_pylist()
-    found: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
+    columns: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
     for row in rows:
         for kind in IMAGE_KINDS:
             file = _file(source, row, kind, rehash)
             if kind == "png" and file["path"] is None:
                 raise UserError(source.store, "frame", f"no {row['png_path']}", "every frame of the manifest")
             for name, value in file.items():
-                found[f"{kind}_{name}"].append(value)
+                columns[f"{kind}_{name}"].append(value)
         head = source.store.read(row["png_path"], 0, 64)
         try:
             header = png_header(head)
@@ -72,9 +72,9 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
             found_px = f"{header.width_px} x {header.height_px}"
             raise UserError(row["png_path"], "size", found_px, f"{camera.width_px} x {camera.height_px} pixels")
     for kind in IMAGE_KINDS:
-        if None in found[f"{kind}_path"]:
-            found |= {name: [None] * len(rows) for name in found if name.startswith(kind)}
-    for name, values in found.items():
+        if None in columns[f"{kind}_path"]:
+            columns |= {name: [None] * len(rows) for name in columns if name.startswith(kind)}
+    for name, values in columns.items():
         frames = with_column(frames, name, values)
     return frames
 
@@ -89,7 +89,10 @@ def _checked_scene(source: Dataset, scenes: pa.Table, rehash: bool) -> pa.Table:
 
 
 def _file(source: Dataset, row: dict, kind: str, rehash: bool) -> dict[str, str | int | None]:
-    """Return path, bytes and sha256 of a row's file; None for a missing file. Raises UserError on a mismatch."""
+    """Return path, bytes and sha256 of a row's file; None for a missing file.
+
+    Raises UserError on a mismatch.
+    """
     path = row[f"{kind}_path"]
     size = source.store.size(path) if path is not None else None
     if size is None:

@@ -47,10 +47,12 @@ def differences(first: Dataset, second: Dataset) -> list[Difference]:
             pair = (dataset.table(name, scene_id=scene_id).to_pandas() for dataset in (first, second))
             for each in _rows(name, *pair):
                 key = (each.place, each.column + (each.first if not each.column else ""))
-                before = gathered.get(key)
-                total = each.rows + (before.rows if before else 0)
-                kept = before or each
-                gathered[key] = Difference(kept.place, kept.column, total, kept.example, kept.first, kept.second)
+                earlier = gathered.get(key)
+                total = each.rows + (earlier.rows if earlier else 0)
+                example = earlier or each
+                gathered[key] = Difference(
+                    example.place, example.column, total, example.example, example.first, example.second
+                )
     return result + list(gathered.values())
 
 

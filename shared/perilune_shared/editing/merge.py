@@ -48,12 +48,12 @@ def merge(
     task = progress.add_task("merging", total=len(groups), unit="scenes")
     with new_dataset(out, info) as writer:
         for scene_id, members in groups.items():
-            tables, used_frames = _join(scene_id, [(sources[i], own_id) for i, own_id in members])
+            tables, used_frames = _join(scene_id, [(sources[i], source_id) for i, source_id in members])
             writer.add_scene(without_derived_rows(tables) if info.images == "planned" else tables)
             if info.images == "files":
-                (i, own_id), *_ = members
+                (i, source_id), *_ = members
                 link = images == "link"
-                writer.add_scene_files(sources[i], sources[i].table("scenes", scene_id=own_id), scene_id, link=link)
+                writer.add_scene_files(sources[i], sources[i].table("scenes", scene_id=source_id), scene_id, link=link)
             for source, frames, names in used_frames:
                 if info.images == "files" and len(frames):
                     writer.add_images(source, frames, names, link=images == "link")
@@ -107,18 +107,18 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
     known: dict[tuple, str] = {}
     for i, source in enumerate(sources):
         for row in sorted(source.table("scenes").to_pylist(), key=lambda row: row["scene_id"]):
-            own_id = row.pop("scene_id")
+            source_id = row.pop("scene_id")
             # Ignore files, since a packed copy of a scene has none.
             row = {name: value for name, value in row.items() if not name.startswith(SCENE_FILE_KINDS)}
             # Labels refer to craters by id, so the ids must be equal too.
             craters = (
-                [] if planned else source.table("craters", ["crater_id"], scene_id=own_id)["crater_id"].to_pylist()
+                [] if planned else source.table("craters", ["crater_id"], scene_id=source_id)["crater_id"].to_pylist()
             )
             key = (*row.values(), tuple(craters))
             if key not in known or any(number == i for number, _ in groups[known[key]]):
-                known[key] = free_name(own_id, groups)
+                known[key] = free_name(source_id, groups)
                 groups[known[key]] = []
-            groups[known[key]].append((i, own_id))
+            groups[known[key]].append((i, source_id))
     return groups
 
 
@@ -140,8 +140,8 @@ def _join(
     known_trajectories: list[tuple[dict, str]] = []
     taken: dict[str, dict] = {}
     first: SceneTables = {}
-    for source, own_id in members:
-        tables = source.scene(own_id)
+    for source, source_id in members:
+        tables = source.scene(source_id)
         check_scene(source.store, tables)
         if not first:
             first = {
@@ -183,7 +183,7 @@ def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tupl
     new = []
     for row in trajectories.to_pylist():
         content = {name: value for name, value in row.items() if name not in _FREE_IN_TRAJECTORIES}
-        matching_ids = [name for found, name in known if found == content and name not in names.values()]
+        matching_ids = [name for other, name in known if other == content and name not in names.values()]
         if not matching_ids:
             matching_ids = [free_name(row["trajectory_id"], {name for _, name in known})]
             known.append((content, matching_ids[0]))

@@ -29,10 +29,10 @@ _ADDED_IN_2 = {"craters": ("origin",)}
 
 
 def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]]) -> dict[str, pa.Schema]:
-    kept = {}
+    remaining = {}
     for name, schema in tables.items():
-        kept[name] = pa.schema([field for field in schema if field.name not in added.get(name, ())])
-    return kept
+        remaining[name] = pa.schema([field for field in schema if field.name not in added.get(name, ())])
+    return remaining
 
 
 def _with_float64(schema: pa.Schema) -> pa.Schema:
@@ -46,10 +46,11 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2, "3": _TABLE
 
 
 def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
-    """Convert a dataset of an older schema version to the current one; frames are copied, or hard-linked with `link`.
+    """Convert a dataset of an older schema version to the current one.
 
-    Versions 1 and 2 did not record the contrast of labels, so it becomes null. Raises UserError if the dataset has the
-    current version already, is damaged or incomplete, or has packed frames.
+    Frames are copied, or hard-linked with `link`. Versions 1 and 2 did not record the contrast of labels, so it becomes
+    null. Raises UserError if the dataset has the current version already, is damaged or incomplete, or has packed
+    frames.
     """
     store = open_store(address)
     content, path = read_object(store), store.at(INFO_NAME)

@@ -1,4 +1,7 @@
-"""Pack a dataset into shards that can be streamed, and unpack it. A shard has frames with pose, image and labels."""
+"""Pack a dataset into shards that can be streamed, and unpack it.
+
+A shard has frames with pose, image and labels.
+"""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,14 +14,14 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import SCENE_FILE_KINDS, SPLITS
 from perilune_shared.dataset.packed import LABEL, SHARDS, packed_rows, shard_name
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
+from perilune_shared.dataset.parts import MAX_ROWS_WRITTEN
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.editing.rewrite import Rewriting, check_source, rewrite
 from perilune_shared.editing.writer import DatasetWriter, new_dataset, with_column, with_new_paths
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 
-MOST_FRAMES_WRITTEN = 100_000
+MAX_FRAMES_WRITTEN = 100_000
 """Maximum number of frames of a shard: at most 1,563 row groups, while readers accept 10,000."""
 _MAX_SHARD_MB = 2000
 _FRAMES_PER_GROUP, _BYTES_PER_GROUP = 64, 2**23
@@ -34,13 +37,13 @@ def pack(
     shard_mb: float = 128,
     progress: Progress = NO_PROGRESS,
     *,
-    most_rows: int = MOST_ROWS_WRITTEN,
-    most_frames: int = MOST_FRAMES_WRITTEN,
+    max_rows: int = MAX_ROWS_WRITTEN,
+    max_frames: int = MAX_FRAMES_WRITTEN,
 ) -> None:
     """Write a packed dataset: frames in shards of about `shard_mb` megabytes, readable by Hugging Face `datasets`.
 
     Each shard contains frames of one split, ordered by scene, trajectory and frame index. A table of more than
-    `most_rows` rows becomes several parts, and a shard contains at most `most_frames` frames, to stay within the limits
+    `max_rows` rows becomes several parts, and a shard contains at most `max_frames` frames, to stay within the limits
     of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs, flash
     lidar images and hazard maps are not packed; their columns become null.
     """
@@ -51,7 +54,7 @@ def pack(
     info = source.info
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None, exr_cameras=None)
-    with new_dataset(out, info, most_rows=most_rows) as writer:
+    with new_dataset(out, info, max_rows=max_rows) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             if packed:
@@ -61,13 +64,16 @@ def pack(
         if packed:
             task = progress.add_task("packing", total=source.info.counts.frames, unit="frames")
             for split in SPLITS:
-                sizes = _sizes(source, split, shard_mb * 1e6, most_frames)
+                sizes = _sizes(source, split, shard_mb * 1e6, max_frames)
                 for n_frames in _write_shards(source, writer, split, sizes):
                     progress.advance(task, n_frames)
 
 
 def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: list[list[int]]) -> Iterator[int]:
-    """Write the shards of one split with row groups of the given sizes; yield the size of each row group written."""
+    """Write the shards of one split with row groups of the given sizes.
+
+    Yields the size of each row group written.
+    """
     groups = _groups(source, split, [size for shard in shards for size in shard])
     for number, shard in enumerate(shards):
         text = [field.name for field in SHARDS if pa.types.is_string(field.type)]
@@ -79,7 +85,7 @@ def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: li
         writer.add_file(shard_name(split, number, len(shards)), sink.getvalue().to_pybytes())
 
 
-def _sizes(source: Dataset, split: str, shard_bytes: float, most_frames: int) -> list[list[int]]:
+def _sizes(source: Dataset, split: str, shard_bytes: float, max_frames: int) -> list[list[int]]:
     """Return, for each shard of a split, the number of frames of each row group."""
     frames = source.table("frames", ["scene_id", "trajectory_id", "frame_index", "png_bytes"], split=split)
     counts = source.info.counts
@@ -88,7 +94,7 @@ def _sizes(source: Dataset, split: str, shard_bytes: float, most_frames: int) ->
     in_group = in_shard = group_bytes = bytes_so_far = 0.0
     for png_bytes in frames.sort_by(_ORDER)["png_bytes"].to_pylist():
         n_bytes = (png_bytes or 0) + label_bytes
-        if not shards or bytes_so_far + n_bytes > shard_bytes or in_shard == most_frames:
+        if not shards or bytes_so_far + n_bytes > shard_bytes or in_shard == max_frames:
             shards.append([0])
             in_group = in_shard = group_bytes = bytes_so_far = 0
         elif in_group == _FRAMES_PER_GROUP or group_bytes + n_bytes > _BYTES_PER_GROUP:
@@ -115,7 +121,10 @@ def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Ta
 
 
 def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield frames and labels of each trajectory of a split; frames are in order and refer to no files but PNGs."""
+    """Yield frames and labels of each trajectory of a split.
+
+    Frames are in order and refer to no files but PNGs.
+    """
     columns = ["scene_id", "trajectory_id", "split"]
     for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
         if row["split"] in (split, None):

@@ -34,9 +34,9 @@ class Rewriting:
 
 
 def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progress = NO_PROGRESS) -> None:
-    """Change the scenes of `source` and write them into `out`; scenes and labels without frames are omitted.
+    """Change the scenes of `source` and write them into `out`.
 
-    The caller must have checked the source (`check_source`).
+    Scenes and labels without frames are omitted. The caller must have checked the source (`check_source`).
     """
     images = rewriting.images
     info = rewriting.info.model_copy(update={"images": state_of([source], images)})
@@ -66,7 +66,7 @@ def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
     if _within(open_store(out), source.store):
-        raise UserError(out, "--out", f"a folder in {source.store}", "one outside the dataset")
+        raise UserError(out, "--out", f"a folder in {source.store}", "a folder outside the dataset")
     check_files(source, progress)
     check_keys(source)
 

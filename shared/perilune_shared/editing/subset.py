@@ -51,13 +51,13 @@ def subset(
         expected = "conditions on frames, trajectories and scenes: a plan has no labels"
         raise UserError("--where", "condition", on_labels[0].text, expected)
     check_source(source, out, progress)
-    kept = None if limit is None else _first_frames(source, on_frames, limit)
+    frames_within_limit = None if limit is None else _first_frames(source, on_frames, limit)
 
     def change(tables: SceneTables) -> SceneTables:
         frames = tables["frames"]
         mask = _all_hold(on_frames, tables, frames)
-        if kept is not None:
-            mask = mask & np.asarray(pc.is_in(frames["frame_id"], kept), bool)
+        if frames_within_limit is not None:
+            mask = mask & np.asarray(pc.is_in(frames["frame_id"], frames_within_limit), bool)
         labels = tables["labels"].filter(pa.array(_all_hold(on_labels, tables, tables["labels"])))
         return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
 

@@ -1,4 +1,4 @@
-"""Write a new dataset atomically, scene by scene; used by merge, subset, split and the other editing commands.
+"""Write a new dataset atomically, scene by scene, for all editing commands.
 
 The row counts, the number of frames and split of each trajectory, and the split unit are recomputed from the rows.
 """
@@ -19,7 +19,7 @@ from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SplitUnit, frame_path, scene_file_path
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WrittenFile
+from perilune_shared.dataset.parts import MAX_ROWS_WRITTEN, WrittenFile
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.dataset.whole_tables import WholeTables
 from perilune_shared.errors import UserError
@@ -35,9 +35,9 @@ _PER_TRAJECTORY = ("frames", "labels")
 class DatasetWriter:
     """Writer of a dataset; created by `new_dataset`."""
 
-    def __init__(self, store: Store, info: DatasetInfo, *, most_rows: int = MOST_ROWS_WRITTEN):
+    def __init__(self, store: Store, info: DatasetInfo, *, max_rows: int = MAX_ROWS_WRITTEN):
         self.store, self.info = store, info
-        self._tables = WholeTables(store, most_rows=most_rows)
+        self._tables = WholeTables(store, max_rows=max_rows)
         self._index: list[pa.Table] = []
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
         self._splits_of_trajectory: dict[tuple[str, int], set[str]] = defaultdict(set)
@@ -112,7 +112,10 @@ class DatasetWriter:
         self._index.append(index_rows([WrittenFile.of(path, content)]))
 
     def finish(self, out: Address) -> None:
-        """Write buffered rows, the index, then dataset.json. Raises UserError about `out` if there are no frames."""
+        """Write buffered rows, the index, then dataset.json.
+
+        Raises UserError about `out` if there are no frames.
+        """
         counts = self._tables.counts
         if not counts.frames:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
@@ -133,18 +136,18 @@ def new_dataset(
     out: Address,
     info: DatasetInfo,
     *,
-    most_rows: int = MOST_ROWS_WRITTEN,
+    max_rows: int = MAX_ROWS_WRITTEN,
 ) -> Iterator[DatasetWriter]:
     """Yield a writer for a new dataset; it appears at `out` only when the block succeeds.
 
-    Each table is one part, or several of at most `most_rows` rows. `info` provides the metadata
+    Each table is one part, or several of at most `max_rows` rows. `info` provides the metadata
     that is not computed from the rows. Raises UserError if there are no frames or `out` is not empty.
     """
     # Copies with replaced fields have not been validated.
     checked_info(json.loads(info.model_dump_json()), out)
     claim = info_bytes(info.model_copy(update={"complete": False, "index": ()}), out)
     with new_store(out, INFO_NAME, claim) as store:
-        writer = DatasetWriter(store, info, most_rows=most_rows)
+        writer = DatasetWriter(store, info, max_rows=max_rows)
         yield writer
         writer.finish(out)
 

@@ -52,7 +52,10 @@ class Target:
         return Target(self.store, name)
 
     def content(self) -> bytes | None:
-        """Return the current content; None if there is no file. Raises UserError on a large or non-regular file."""
+        """Return the current content; None if there is no file.
+
+        Raises UserError on a large or non-regular file.
+        """
         if self.store.folder is not None and not (self.store.folder / self.name).exists():
             return None
         if self.store.folder is None and not self.store.exists(self.name):
@@ -68,11 +71,12 @@ class Target:
 
 
 def check_index(dataset: Dataset, targets: Iterable[Target], progress: Progress = NO_PROGRESS) -> DatasetInfo | None:
-    """Check that files may be written; return dataset.json, or None if index and dataset.json need no change.
+    """Check that files may be written.
 
-    The index changes if one of the files is directly in a complete dataset; an incomplete dataset has no index yet.
-    Raises UserError if another file differs from the index, since a new index would hide the difference, or if a name
-    is not allowed in a dataset (perilune_shared.validation.files).
+    Returns dataset.json, or None if index and dataset.json need no change. The index changes if one of the files is
+    directly in a complete dataset; an incomplete dataset has no index yet. Raises UserError if another file differs
+    from the index, since a new index would hide the difference, or if a name is not allowed in a dataset
+    (perilune_shared.validation.files).
     """
     for target in targets:
         if _is_below(target.store, dataset.store):

@@ -43,7 +43,9 @@ _IMAGES = {
 def write_card(
     dataset: Dataset, out: str | os.PathLike[str] | None, progress: Progress, licence: str | None = None
 ) -> tuple[str, str]:
-    """Write the page and the picture beside it, and update the dataset's index; return their paths or addresses.
+    """Write the page and the picture beside it, and update the dataset's index.
+
+    Returns their paths or addresses.
 
     `out` is by default README.md in the dataset. `licence`, an SPDX expression, replaces the licence of the dataset on
     the page, and also in dataset.json if the page is in the dataset. Raises UserError if a file that is not a card

@@ -70,13 +70,13 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
     for scene in scenes_of(dataset, choose=by_selection(SELECTIONS["visible"])):
         ratio = _depth_ratios(dataset, scene)
         for split, frames in scene.frames.groupby("split"):
-            own = scene.labels["frame_id"].isin(frames["frame_id"]).to_numpy()
-            for name, values in _measured(frames, scene.labels[own], ratio[own]).items():
+            of_frames = scene.labels["frame_id"].isin(frames["frame_id"]).to_numpy()
+            for name, values in _measured(frames, scene.labels[of_frames], ratio[of_frames]).items():
                 collected.setdefault(name, {}).setdefault(str(split), []).append(values.astype(np.float32))
         for k in shown_of_scene.get(scene.scene_id, ()):
             row = scene.frames.iloc[round(k / (_N_FRAMES - 1) * (len(scene.frames) - 1))]
-            own = (scene.labels["frame_id"] == row["frame_id"]).to_numpy()
-            samples.append((row.to_dict(), scene.labels[own].assign(visible=scene.labels["chosen"][own])))
+            of_frames = (scene.labels["frame_id"] == row["frame_id"]).to_numpy()
+            samples.append((row.to_dict(), scene.labels[of_frames].assign(visible=scene.labels["chosen"][of_frames])))
         progress.advance(task)
     measures = {name: {split: np.concatenate(v) for split, v in by.items()} for name, by in collected.items()}
     return Gathered({name: measures[name] for name in TITLES if name in measures}, samples)
@@ -125,7 +125,7 @@ def _depth_ratios(dataset: Dataset, scene: SceneRows) -> NDArray[np.float64]:
 def _measured(frames: pd.DataFrame, labels: pd.DataFrame, depth_ratio: np.ndarray) -> dict[str, np.ndarray]:
     counted = labels.groupby("frame_id").size().reindex(frames["frame_id"], fill_value=0)
     sun = np.stack(frames["sun_direction"].to_list())
-    found = {
+    measures = {
         "labels_per_frame": counted.to_numpy(),
         "altitude_m": np.stack(frames["position_m"].to_list())[:, 2],
         "sun_elevation_deg": np.degrees(np.arcsin(np.clip(sun[:, 2], -1, 1))),
@@ -134,9 +134,9 @@ def _measured(frames: pd.DataFrame, labels: pd.DataFrame, depth_ratio: np.ndarra
     }
     real = frames["real_ground_share"].to_numpy(np.float64)
     if np.nan_to_num(real).any():
-        found["real_ground_share"] = real
+        measures["real_ground_share"] = real
     names = [name for name in TITLES if name in TABLES["labels"].names]
-    return found | {name: labels[name].to_numpy(np.float64) for name in names}
+    return measures | {name: labels[name].to_numpy(np.float64) for name in names}
 
 
 def _draw_frame(axis: "Axes", row: dict, labels: pd.DataFrame, png: bytes) -> None:

@@ -42,10 +42,11 @@ _POLYGON *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 def export_coco(
     dataset: Dataset, out: Address, progress: Progress, split: str | None = None, choose: Choice | None = None
 ) -> int:
-    """Write `out`/instances_<split>.json for one split or each; return the number of annotations that are not crowds.
+    """Write `out`/instances_<split>.json for one split or each.
 
-    `file_name` is the frame's png_path, so give COCO tools the dataset's folder as the image folder. Raises UserError
-    if `out` is not empty, the dataset is a plan, a png_path is outside the dataset or the split has no frames.
+    Returns the number of annotations that are not crowds. `file_name` is the frame's png_path, so give COCO tools the
+    dataset's folder as the image folder. Raises UserError if `out` is not empty, the dataset is a plan, a png_path is
+    outside the dataset or the split has no frames.
     """
     if dataset.info.images == "planned":
         raise UserError(dataset.store, "images", "planned", "a rendered dataset: a plan has no labels")
@@ -140,7 +141,10 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
 
 
 def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_]:
-    """Whether box and outline of each label, clipped to its image, have an area; other labels are not exported."""
+    """Whether box and outline of each label, clipped to its image, have an area.
+
+    Other labels are not exported.
+    """
     boxes, size = clipped_boxes(labels, frames), frame_sizes(labels, frames)
     inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
     polygons = polygons_of(labels)

@@ -172,7 +172,10 @@ def _description(dataset: Dataset) -> str:
 
 
 def _licence(expression: str) -> dict[str, str]:
-    """Return the licence entry: SPDX's page for a single licence, otherwise the expression; empty if not stated."""
+    """Return the licence entry: SPDX's page for a single licence, otherwise the expression.
+
+    The result is empty if not stated.
+    """
     if expression == NOT_STATED:
         return {}
     listed = " " not in expression and not expression.startswith("LicenseRef-")

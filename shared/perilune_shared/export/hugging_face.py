@@ -37,10 +37,10 @@ def export_hugging_face(
     choose: Choice | None = None,
     shard_mb: float = 500,
 ) -> int:
-    """Write data/<split>/*.parquet and a README.md that lists the splits into `out`; return the number of frames.
+    """Write data/<split>/*.parquet and a README.md that lists the splits into `out`.
 
-    The field `chosen` of each label states whether it is selected. Raises UserError if `out` is not empty, an image is
-    missing or the split has no frames.
+    Returns the number of frames. The field `chosen` of each label states whether it is selected. Raises UserError if
+    `out` is not empty, an image is missing or the split has no frames.
     """
     task = progress.add_task("hugging face", total=count_frames(dataset, split), unit="frames")
     writers: dict[str, _Shards] = {}

@@ -30,9 +30,10 @@ _TUM_HEADER = (
 
 
 def export_tum(dataset: Dataset, out: Address, progress: Progress, split: str | None = None) -> int:
-    """Write `out`/<scene_id>/<trajectory_id>.txt for each trajectory, in TUM's format; return their number.
+    """Write `out`/<scene_id>/<trajectory_id>.txt for each trajectory, in TUM's format.
 
-    With `split`, writes only frames of that split. Raises UserError if `out` is not empty or the split has no frames.
+    Returns their number. With `split`, writes only frames of that split. Raises UserError if `out` is not empty or the
+    split has no frames.
     """
     n_trajectories = 0
     with new_files(out) as folder:

@@ -157,7 +157,10 @@ def _coefficients(path: Path, content: dict[str, Any]) -> list[float]:
 def _camera(
     path: Path, size: Sequence[float], intrinsics: Sequence[float], model: str, coefficients: list[float]
 ) -> Camera:
-    """Return a pinhole camera with distortion; an unnamed distortion model follows from the number of coefficients."""
+    """Return a pinhole camera with distortion.
+
+    An unnamed distortion model follows from the number of coefficients.
+    """
     width, height = (int(value) for value in size)
     if [width, height] != list(size) or not 1 <= min(size) <= max(size) <= _LARGEST_SIDE_PX:
         raise UserError(path, "image size", list(size), f"two whole numbers from 1 to {_LARGEST_SIDE_PX}")
@@ -166,8 +169,8 @@ def _camera(
         raise UserError(path, "focal length", min(fx, fy), "above 0, pixels")
     pinhole = Camera(width, height, fx, fy, cx + _HALF_PX, cy + _HALF_PX)
     if not model and len(coefficients) == 4 and any(coefficients):
-        expected = "distortion_model: plumb_bob or equidistant; both may have four"
-        raise UserError(path, "distortion_model", "nothing, with four coefficients", expected)
+        expected = "plumb_bob or equidistant: four coefficients fit both"
+        raise UserError(path, "distortion_model", "no model for four coefficients", expected)
     name = model.strip().lower() or _BROWN[0]
     if name in _EQUIDISTANT:
         return _fitted(path, pinhole, coefficients or [0.0] * 4)
@@ -175,7 +178,7 @@ def _camera(
         raise UserError(path, "distortion_model", model, f"one of {', '.join((*_BROWN, *_EQUIDISTANT))}")
     if any(coefficients[5:]):
         found = f"coefficients beyond k3 ({', '.join(f'{value:g}' for value in coefficients[5:])})"
-        raise UserError(path, f"distortion_model {name}", found, "k1, k2, p1, p2, k3 alone; calibrate without others")
+        raise UserError(path, f"distortion_model {name}", found, "only k1, k2, p1, p2, k3; calibrate with these alone")
     return Camera(*_fields(pinhole), distortion=_five(coefficients) if name != "none" else NO_DISTORTION)
 
 
@@ -219,16 +222,18 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
         weight = weight / weight.mean()
     worst_px = float(error.max()) * max(pinhole.fx_px, pinhole.fy_px)
     if not worst_px <= _LARGEST_FIT_PX:
-        found = f"a view of {np.degrees(angle[inside]):.0f} degrees from the axis, {worst_px:.2g} px off the nearest"
-        raise UserError(
-            path, field, found, f"one within {_LARGEST_FIT_PX} px of radial-tangential: undistort the images"
-        )
+        found = f"a view of {np.degrees(angle[inside]):.0f} degrees from the axis, fitted to {worst_px:.2g} px"
+        expected = f"a radial-tangential fit to {_LARGEST_FIT_PX} px; undistort the images"
+        raise UserError(path, field, found, expected)
     k1, k2, k3 = fit.tolist()
     return Camera(*_fields(pinhole), distortion=(k1, k2, 0.0, 0.0, k3))
 
 
 def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:
-    """Return finite numbers from a list, a list of lists or a mapping with `data`; raise UserError on others."""
+    """Return finite numbers from a list, a list of lists or a mapping with `data`.
+
+    Raises UserError on others.
+    """
     if isinstance(value, dict):
         value = value.get("data")
     flat: list[object] = []

@@ -132,7 +132,10 @@ class Camera:
         return bool((seen >= -1e-6).all() and (seen <= np.array([self.width_px, self.height_px]) + 1e-6).all())
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Distort coordinates; NaN beyond the fold of the radial part or where the mapping reverses its orientation."""
+        """Distort coordinates.
+
+        Returns NaN beyond the fold of the radial part or where the mapping reverses its orientation.
+        """
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -23,7 +23,10 @@ def horizon_m(height_m: ArrayLike) -> Array:
 
 
 def hits_sphere(position_m: Array, rays: Array) -> np.ndarray:
-    """Whether rays (N, S, 3) from positions (N, 3), both in O_L, hit the sphere; true for positions inside it."""
+    """Whether rays (N, S, 3) from positions (N, 3), both in O_L, hit the sphere.
+
+    The result is true for positions inside it.
+    """
     from_centre = (position_m + np.array([0, 0, MOON_RADIUS_M]))[:, None]
     along = np.einsum("nsi,nsi->ns", np.broadcast_to(from_centre, rays.shape), rays)
     above = np.square(from_centre).sum(axis=-1) - MOON_RADIUS_M**2

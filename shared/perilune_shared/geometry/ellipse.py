@@ -47,7 +47,10 @@ class Ellipses:
 
 
 def plane_basis(normals: ArrayLike) -> tuple[Array, Array]:
-    """Return unit vectors p, q (N, 3) that span the planes with unit normals n (N, 3); p, q, n is right-handed."""
+    """Return unit vectors p, q (N, 3) that span the planes with unit normals n (N, 3).
+
+    The triple p, q, n is right-handed.
+    """
     n = np.asarray(normals, np.float64)
     helper = np.where(np.abs(n[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     p = np.cross(helper, n)

@@ -68,7 +68,8 @@ def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
 
 
 def rotation_vectors(rotation: ArrayLike) -> Array:
-    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3); angles well below 180 degrees.
+    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3), for angles well below 180
+    degrees.
 
     The angle is computed from sine and cosine; the arc cosine alone is inexact for small angles.
     """
@@ -81,7 +82,10 @@ def rotation_vectors(rotation: ArrayLike) -> Array:
 
 
 def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
-    """Return the unit vector (3,) in O_L towards the Sun; azimuth clockwise from north, so 90 degrees is east."""
+    """Return the unit vector (3,) in O_L towards the Sun.
+
+    The azimuth is clockwise from north, so 90 degrees is east.
+    """
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     east, north = np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation)
     return np.array([-east, -north, np.sin(elevation)])

@@ -75,7 +75,7 @@ def look_at(position_m: ArrayLike, target_m: ArrayLike = (0.0, 0.0, 0.0)) -> Pos
     west, south, up = (target - position).tolist()
     away = math.hypot(west, south)
     if away == 0 and up == 0:
-        raise UserError("look_at", "target_m", target.tolist(), "another place than position_m")
+        raise UserError("look_at", "target_m", target.tolist(), "a point other than position_m")
     azimuth = math.atan2(-west, -south) if away else 0.0
     return Pose(position, _rotation(math.atan2(away, -up), azimuth), np.zeros(3))
 
@@ -89,11 +89,11 @@ def descent(
     azimuth_deg: float = 0.0,
     duration_s: float = 65.0,
 ) -> list[Pose]:
-    """Return poses along a parabola to a point above the site, with their velocities; the camera looks straight down.
+    """Return poses along a parabola to a point above the site, with their velocities.
 
-    Trajectory and attitude are the nominal ones of datasets, without perturbations (`NominalTrajectory.parabola`), so
-    south is up in the images. The trajectory starts `downrange_m` from the site, in the direction `azimuth_deg`. Frames
-    are evenly spaced in time. Raises UserError on values out of range.
+    The camera looks straight down. Trajectory and attitude are the nominal ones of datasets, without perturbations
+    (`NominalTrajectory.parabola`), so south is up in the images. The trajectory starts `downrange_m` from the site, in
+    the direction `azimuth_deg`. Frames are evenly spaced in time. Raises UserError on values out of range.
 
         poses = descent(n_frames=20, start_altitude_m=1000)
     """

@@ -48,7 +48,10 @@ def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
 
 
 def limited_contrast(contrast: NDArray, radius_px: NDArray, pixels: float | None) -> NDArray:
-    """Return the contrast (N,) if at most `pixels` pixels per crater count as independent; None sets no limit."""
+    """Return the contrast (N,) if at most `pixels` pixels per crater count as independent.
+
+    None sets no limit.
+    """
     if pixels is None:
         return contrast
     around = np.pi * (REACH_RADII * radius_px) ** 2

@@ -25,7 +25,10 @@ _LARGEST_BYTES = 10_000
 
 @contextlib.contextmanager
 def claimed(store: Store, folder: str) -> Iterator[None]:
-    """Hold a claim below `folder` of a store within the block. Raises UserError if another process holds a claim."""
+    """Hold a claim below `folder` of a store within the block.
+
+    Raises UserError if another process holds a claim.
+    """
     path = f"{folder}/{secrets.token_hex(8)}.json"
     claim = {"pid": os.getpid(), "host": platform.node(), "system": _system()}
     ended = threading.Event()

@@ -84,7 +84,10 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 
 def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
-    """Return the SHA-256 of a file (hexadecimal); calls `advance` with the number of bytes read since the last call."""
+    """Return the SHA-256 of a file (hexadecimal).
+
+    Calls `advance` with the number of bytes read since the last call.
+    """
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(_CHUNK_BYTES):
@@ -149,7 +152,10 @@ def _without_links(path: Path) -> Path:
 
 
 def check_plain_file(path: Path) -> int:
-    """Return the size of a file, bytes. Raises UserError on pipes, devices and other types: opening them may block."""
+    """Return the size of a file, bytes.
+
+    Raises UserError on pipes, devices and other types: opening them may block.
+    """
     try:
         state = path.lstat()
     except (OSError, ValueError):

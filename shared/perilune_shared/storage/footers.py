@@ -1,4 +1,7 @@
-"""Check the sizes in the footer of a Parquet file, before anything is decompressed. The footer is untrusted."""
+"""Check the sizes in the footer of a Parquet file, before anything is decompressed.
+
+The footer is untrusted.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,16 +43,16 @@ def check_footer(
     if a row group has other columns than the file.
     """
     limits = limits or DATASET_LIMITS
-    most_rows = min(limits.rows, limits.spare_rows + n_bytes // limits.bytes_per_row)
-    most_group_rows = min(limits.group_rows, most_rows)
+    max_rows = min(limits.rows, limits.spare_rows + n_bytes // limits.bytes_per_row)
+    max_group_rows = min(limits.group_rows, max_rows)
     n_uncompressed, n_rows = 0, 0
     n_nested: dict[str, int] = {}
     for group in range(footer.num_row_groups):
         rows = footer.row_group(group)
         in_group = rows.num_rows
         n_rows += in_group
-        if not 0 <= in_group <= most_group_rows:
-            expected = f"at most {most_group_rows} for {n_bytes} bytes"
+        if not 0 <= in_group <= max_group_rows:
+            expected = f"at most {max_group_rows} for {n_bytes} bytes"
             raise UserError(address, "rows", f"{in_group} in a row group", expected)
         if rows.num_columns != footer.num_columns:
             raise ValueError(f"a row group of {rows.num_columns} columns, expected {footer.num_columns}")
@@ -60,13 +63,13 @@ def check_footer(
             if path.startswith(_NESTED_ROWS):
                 # Each value is a row of a table, so the limit of rows applies.
                 n_nested[path] = n_nested.get(path, 0) + n_values
-                if n_values > limits.group_rows or n_nested[path] > most_rows:
-                    raise UserError(address, path, f"{n_values} values", f"at most {most_rows} for {n_bytes} bytes")
+                if n_values > limits.group_rows or n_nested[path] > max_rows:
+                    raise UserError(address, path, f"{n_values} values", f"at most {max_rows} for {n_bytes} bytes")
             # In other columns the longest list is a quaternion.
             elif n_values > 4 * in_group:
                 raise UserError(address, path, f"{n_values} values", "at most 4 per row")
-    if footer.num_rows != n_rows or n_rows > most_rows:
-        expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {n_bytes} bytes"
+    if footer.num_rows != n_rows or n_rows > max_rows:
+        expected = f"{n_rows}, the sum of the row groups, at most {max_rows} for {n_bytes} bytes"
         raise UserError(address, "rows", footer.num_rows, expected)
     most = min(_MAX_BYTES, _SPARE_BYTES + _MAX_COMPRESSION * n_bytes)
     if n_uncompressed > most:

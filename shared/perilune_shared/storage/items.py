@@ -60,7 +60,10 @@ def object_items(objects: Mapping[str, Any], prefix: str, address: str) -> Itera
 
 
 def checked_size(size: object, where: str) -> int:
-    """Return the size that a store states for an object, bytes. Raises UserError if it is not a valid size."""
+    """Return the size that a store states for an object, bytes.
+
+    Raises UserError if it is not a valid size.
+    """
     if isinstance(size, bool) or not isinstance(size, int) or not 0 <= size < 2**53:
         raise UserError(where, "size", repr(size), "the size of an object, bytes")
     return size

@@ -50,7 +50,10 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove temporary files of killed writers at any depth. Call it only if no other process writes in the folder."""
+    """Remove temporary files of killed writers at any depth.
+
+    Call it only if no other process writes in the folder.
+    """
     for root, _, names in os.walk(folder):
         for name in filter(TEMPORARY_FILE.fullmatch, names):
             Path(root, name).unlink(missing_ok=True)
@@ -59,12 +62,12 @@ def remove_temporary_files(folder: Path) -> None:
 @contextlib.contextmanager
 def lock(path: Path, folder: Path) -> Iterator[None]:
     """Hold the lock file `path`, which protects `folder`. Raises UserError if another process holds it."""
-    held, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
+    file_lock, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
         try:
             # An interrupt within `acquire` would leave the lock file behind.
             with interrupts_held():
-                held.acquire(timeout=0)
+                file_lock.acquire(timeout=0)
         except Timeout:
             raise _locked_error(folder, _read(record), "a free folder: wait until that process ends") from None
         seconds_left = _seconds_left(record)
@@ -75,18 +78,19 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
         with unfinished(path, record), _recorded(record):
             yield
     finally:
-        if held.is_locked:
+        if file_lock.is_locked:
             # Remove the file before releasing the lock: later it may be the lock of another process.
             if not held_elsewhere:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
-            held.release()
+            file_lock.release()
 
 
 def _seconds_left(record: Path) -> float:
-    """Return the seconds until the record of a process on another machine expires; 0 if there is no such record.
+    """Return the seconds until the record of a process on another machine expires.
 
-    A record from this machine is ignored: since the lock was free, that process has ended.
+    Returns 0 if there is no such record. A record from this machine is ignored: since the lock was free, that process
+    has ended.
     """
     holder = _read(record)
     if holder is None or holder.get("boot_id") == _boot_id():

@@ -22,7 +22,10 @@ _CREDENTIALS = {
 
 
 def file_system(kind: str, address: str) -> Any:
-    """Return fsspec's file system for a kind of store; listings are not cached, since other processes may write."""
+    """Return fsspec's file system for a kind of store.
+
+    Listings are not cached, since other processes may write.
+    """
     import fsspec
 
     options: dict[str, Any] = {} if kind == "memory" else {"use_listings_cache": False}
@@ -44,9 +47,10 @@ def is_missing_bucket(error: Exception) -> bool:
 
 @contextlib.contextmanager
 def store_faults(address: str) -> Iterator[None]:
-    """Convert any exception of an object store to a UserError that names `address`; the library has retried before.
+    """Convert any exception of an object store to a UserError that names `address`.
 
-    FileExistsError and FileNotFoundError about a single object are not converted, since callers handle them.
+    The library has already retried the request. FileExistsError and FileNotFoundError about a single object are not
+    converted, since callers handle them.
     """
     try:
         yield

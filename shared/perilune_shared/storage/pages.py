@@ -27,7 +27,10 @@ class Pages:
 
 
 def range_of(column: Any) -> tuple[int, int]:
-    """Return the byte range (start, end) of a column's pages in the file; `column` is pyarrow's column metadata."""
+    """Return the byte range (start, end) of a column's pages in the file.
+
+    `column` is pyarrow's column metadata.
+    """
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
         start = column.dictionary_page_offset

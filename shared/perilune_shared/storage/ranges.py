@@ -13,7 +13,10 @@ _MARGIN_BYTES = 2**14
 
 
 class Ranges(io.RawIOBase):
-    """A stored object as a read-only file. Bytes that are neither kept nor fetched are read in blocks of 4 MiB."""
+    """A stored object as a read-only file.
+
+    Bytes that are neither kept nor fetched are read in blocks of 4 MiB.
+    """
 
     def __init__(self, read: Callable[[int, int], bytes], size_bytes: int):
         """`read` returns the bytes [start, end) of the object, with one request."""

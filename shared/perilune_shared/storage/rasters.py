@@ -185,11 +185,11 @@ def _expected(drivers: Sequence[str]) -> str:
 def _hint(path: Path, head: bytes) -> str:
     """Return advice for a file of another format."""
     if b"<VRTDataset" in head[: 2**16]:
-        return f"; make one of it with: gdal_translate {path.name} {path.stem}.tif, or list its tiles in vrt_files"
+        return f"; convert it with: gdal_translate {path.name} {path.stem}.tif, or list its tiles in vrt_files"
     for suffix in (".lbl", ".LBL", ".xml"):
         label = path.with_suffix(suffix)
         if label != path and label.is_file():
-            return f"; the data of a label are opened by the label, {label.name}"
+            return f"; open the data through their label, {label.name}"
     return ""
 
 
@@ -205,7 +205,7 @@ def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[st
     if not complete:
         raise UserError(path, field, "a label without an end", f"a label of at most {_LARGEST_LABEL_BYTES} bytes")
     if "/vsi" in label.lower():
-        raise UserError(path, field, "a label with '/vsi', which GDAL takes for an address", "names of files")
+        raise UserError(path, field, "a label with '/vsi', which GDAL reads as an address", "names of files")
     if driver == "PDS" and re.search(r"=\s*\"?COMPRESSED_FILE", label, re.I):
         raise UserError(path, field, "compressed data behind a label", "uncompressed PDS3 data")
     if driver == "ISIS3" and re.search(r"Format\s*=\s*\"?GeoTIFF", label, re.I):
@@ -243,7 +243,10 @@ def _vrt_files(path: Path, head: bytes, field: str, tiles: Sequence[str]) -> Ras
 
 
 def _beside(path: Path, name: str, field: str) -> Path | None:
-    """Return the file that a label names, in the folder of the label, ignoring letter case; None if it is missing."""
+    """Return the file that a label names, in the folder of the label, ignoring letter case.
+
+    Returns None if it is missing.
+    """
     folder = path.resolve().parent
     beside = path.parent / name
     if not beside.exists():
@@ -253,7 +256,7 @@ def _beside(path: Path, name: str, field: str) -> Path | None:
     if not beside.exists():
         return None  # GDAL reports missing data; other pointers may name documents that were not downloaded
     if not beside.is_file():
-        raise UserError(beside, field, "a folder, a pipe or a device", f"a file, as {path.name} says")
+        raise UserError(beside, field, "a folder, a pipe or a device", f"a regular file, which {path.name} names")
     if not beside.resolve().is_relative_to(folder):
         raise UserError(beside, field, "a link that leaves the folder", f"a file beside {path.name}")
     return beside
@@ -271,10 +274,10 @@ def _world_file(path: Path) -> list[Path]:
 
 def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> None:
     """Raise UserError if an open raster refers to other files, or if one of its blocks is too large."""
-    if found := raster.tags(ns="OVERVIEWS"):
-        raise UserError(path, field, f"tags that name another file: {found}", "a raster that refers to no other")
+    if tags := raster.tags(ns="OVERVIEWS"):
+        raise UserError(path, field, f"tags that name another file: {tags}", "a raster that refers to no other file")
     if any(not Path(file).is_relative_to(folder) for file in raster.files):
-        raise UserError(path, field, "a file that refers to one elsewhere", "data in the folder of their label")
+        raise UserError(path, field, "a reference to a file in another folder", "data in the folder of their label")
     if raster.crs is not None:
         refuse_grids(path, raster.crs)
     rows, columns = raster.block_shapes[0]
@@ -286,5 +289,5 @@ def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> Non
 
 def refuse_grids(where: object, crs: Any) -> None:
     """Raise UserError if a coordinate reference system (`rasterio.crs.CRS`) names files, which PROJ would open."""
-    if found := re.search(r"nadgrids|geoidgrids|\+grids|PARAMETERFILE", crs.to_wkt(), re.I):
-        raise UserError(where, "projection", f"{found[0]}, which names a file", "a projection without grids")
+    if grid := re.search(r"nadgrids|geoidgrids|\+grids|PARAMETERFILE", crs.to_wkt(), re.I):
+        raise UserError(where, "projection", f"{grid[0]}, which names a file", "a projection without grids")

@@ -47,44 +47,44 @@ def replaceable(
         for path in folder.parent.iterdir():
             if leftover.fullmatch(path.name):
                 shutil.rmtree(path, ignore_errors=True)
-        made = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.new")
-        with unfinished(made):
+        new = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.new")
+        with unfinished(new):
             try:
-                yield type(out)(made)
-                if made.exists():
-                    _replace(folder, made)
+                yield type(out)(new)
+                if new.exists():
+                    _replace(folder, new)
             finally:
-                shutil.rmtree(made, ignore_errors=True)
+                shutil.rmtree(new, ignore_errors=True)
 
 
 def _check_replaceable(
     folder: Path, out: str | Path, known_by: tuple[str, ...], inputs: tuple[str | Path, ...]
 ) -> None:
     if folder.is_symlink() or not all(any(folder.glob(pattern)) for pattern in known_by):
-        expected = "a folder that this command has written, with " + " and ".join(known_by)
+        expected = "a folder that this command wrote, with " + " and ".join(known_by)
         raise UserError(out, "--overwrite", "another folder", expected)
-    place = folder.resolve()
-    if Path.cwd().is_relative_to(place):
-        raise UserError(out, "--overwrite", "the current folder, or one that has it", "another folder")
+    resolved = folder.resolve()
+    if Path.cwd().is_relative_to(resolved):
+        raise UserError(out, "--overwrite", "the current folder or a parent of it", "another folder")
     for read in inputs:
         source = open_store(read).folder
-        if source is not None and source.resolve().is_relative_to(place):
-            raise UserError(out, "--overwrite", f"a folder that holds the input {read}", "another folder")
+        if source is not None and source.resolve().is_relative_to(resolved):
+            raise UserError(out, "--overwrite", f"a folder that contains the input {read}", "another folder")
 
 
-def _replace(folder: Path, made: Path) -> None:
+def _replace(folder: Path, new: Path) -> None:
     """Replace a folder by another one and delete the old one."""
     with interrupts_held():
-        if not _exchanged(folder, made):
-            old = made.with_suffix(".old")
+        if not _exchanged(folder, new):
+            old = new.with_suffix(".old")
             folder.rename(old)
             try:
-                made.rename(folder)
+                new.rename(folder)
             except OSError:
                 old.rename(folder)
                 raise
-            made = old
-    shutil.rmtree(made, ignore_errors=True)
+            new = old
+    shutil.rmtree(new, ignore_errors=True)
 
 
 def _exchanged(folder: Path, other: Path) -> bool:

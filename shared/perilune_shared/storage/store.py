@@ -65,7 +65,10 @@ class Store(abc.ABC):
         return self.size(path) is not None
 
     def plain_size(self, path: str) -> int:
-        """Return the size of a file, bytes. Raises UserError if it is missing, a link, a folder, a pipe or a device."""
+        """Return the size of a file, bytes.
+
+        Raises UserError if it is missing, a link, a folder, a pipe or a device.
+        """
         size = self.size(path)
         if size is None:
             raise _missing(self, path)
@@ -90,15 +93,24 @@ class Store(abc.ABC):
 
     @abc.abstractmethod
     def size(self, path: str) -> int | None:
-        """Return the size of a file, bytes; None if it is missing. Raises UserError if it is not a regular file."""
+        """Return the size of a file, bytes; None if it is missing.
+
+        Raises UserError if it is not a regular file.
+        """
 
     @abc.abstractmethod
     def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
-        """Return the bytes [start, end) of a file. Raises UserError if it is missing, or larger than `most_bytes`."""
+        """Return the bytes [start, end) of a file.
+
+        Raises UserError if it is missing, or larger than `most_bytes`.
+        """
 
     @abc.abstractmethod
     def open(self, path: str) -> BinaryIO:
-        """Open a file for reading; only the ranges that are read are fetched. Raises UserError if it is missing."""
+        """Open a file for reading; only the ranges that are read are fetched.
+
+        Raises UserError if it is missing.
+        """
 
     @abc.abstractmethod
     def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
@@ -178,7 +190,10 @@ class LocalStore(Store):
         return (self.folder / path).open("rb")
 
     def _plain_or_linked(self, path: str) -> int:
-        """Return the size of a file, bytes; it may be a link within the folder. Raises UserError if it is missing."""
+        """Return the size of a file, bytes; it may be a link within the folder.
+
+        Raises UserError if it is missing.
+        """
         size = self.size(path)
         if size is None:
             raise _missing(self, path)
@@ -287,10 +302,10 @@ class ObjectStore(Store):
                 self._system.pipe_file(self._key(path), content, mode="create")
             except Exception:
                 # If the answer to a first request was lost, its repetition finds the object that the first one wrote.
-                found = self.size(path)
-                if found is None:
+                size = self.size(path)
+                if size is None:
                     raise
-                if found != len(content) or self.read(path) != content:
+                if size != len(content) or self.read(path) != content:
                     raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), self.at(path)) from None
 
     def replace(self, path: str, content: bytes, *, durable: bool = True) -> None:
@@ -315,7 +330,9 @@ class ObjectStore(Store):
 
 
 def open_store(address: Address) -> Store:
-    """Open the store at a path, s3://bucket/prefix, gs://bucket/prefix or memory://name; nothing is read or written.
+    """Open the store at a path, s3://bucket/prefix, gs://bucket/prefix or memory://name.
+
+    Nothing is read or written.
 
     An open store is returned unchanged. Raises UserError on another kind of address and if its library is not
     installed.

@@ -11,7 +11,10 @@ Fields = dict[int, Any]
 
 
 def parse(buffer: bytes, start: int = 0) -> tuple[Fields, int]:
-    """Parse the struct at an offset; return it and the offset after it. Raises ValueError if the struct is damaged."""
+    """Parse the struct at an offset; return it and the offset after it.
+
+    Raises ValueError if the struct is damaged.
+    """
     try:
         fields, end = _struct(buffer, start, 0)
     except IndexError:

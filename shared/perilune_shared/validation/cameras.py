@@ -43,7 +43,7 @@ def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault
         yield Fault.of(where, None, "position_m+rotation_wxyz", found, expected)
     splits = rows["split"].to_numpy()
     for row in np.flatnonzero(splits != splits[first])[:1]:
-        yield Fault.of(where, None, "split", splits[row], f"{splits[first[row]]}, as of {rows['frame_id'][first[row]]}")
+        yield Fault.of(where, None, "split", splits[row], f"{splits[first[row]]}, as in {rows['frame_id'][first[row]]}")
 
 
 def _body_poses(dataset: Dataset, rows: pd.DataFrame) -> np.ndarray:

@@ -70,7 +70,7 @@ _RANGES = {
     "ellipse_theta_rad": (0, np.pi),
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
-MOST_OF_COLUMN = 1000
+MAX_PER_COLUMN = 1000
 """Maximum number of listed faults of one column; further faults are only counted."""
 _MAX_PLAUSIBLE = 1e12
 """Largest plausible value of any length, time or size, far above the values of any trajectory."""
@@ -111,7 +111,7 @@ class Fault:
 
 
 class FaultList:
-    """Collects the first fault of each file and column, at most MOST_OF_COLUMN per column, and counts the others.
+    """Collects the first fault of each file and column, at most MAX_PER_COLUMN per column, and counts the others.
 
     This limits memory for datasets with a fault in each of millions of files.
     """
@@ -125,14 +125,14 @@ class FaultList:
         key = fault.file, fault.column, fault.row is None
         if key in self._first:
             return
-        found = self._n_of_column.get(fault.column, 0)
-        self._n_of_column[fault.column] = found + fault.n_faults
-        if found < MOST_OF_COLUMN and fault.n_faults == 1:
+        n_earlier = self._n_of_column.get(fault.column, 0)
+        self._n_of_column[fault.column] = n_earlier + fault.n_faults
+        if n_earlier < MAX_PER_COLUMN and fault.n_faults == 1:
             self._first[key] = fault
 
     def add_made(self, column: str, make: Callable[[], Fault]) -> None:
         """Add a fault of a column; `make` creates it and is called only if the fault is listed."""
-        if self._n_of_column.get(column, 0) < MOST_OF_COLUMN:
+        if self._n_of_column.get(column, 0) < MAX_PER_COLUMN:
             self.add(make())
         else:
             self._n_of_column[column] += 1
@@ -156,7 +156,7 @@ class FaultList:
 
 def more_faults(column: str, n_faults: int) -> Fault:
     """Return a fault that summarises the faults of a column that are not listed."""
-    return Fault("...", None, column, f"{n_faults} more faults", "none; the first ones are listed", n_faults)
+    return Fault("...", None, column, f"{n_faults} more faults", "no faults; only the first ones are listed", n_faults)
 
 
 def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:

@@ -22,7 +22,7 @@ from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SUFFIXE
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE
-from perilune_shared.validation.faults import MOST_OF_COLUMN, Fault, FaultList, more_faults
+from perilune_shared.validation.faults import MAX_PER_COLUMN, Fault, FaultList, more_faults
 
 EXTRA_NAMES = frozenset(
     {
@@ -100,10 +100,10 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
         rows = rows.filter(pc.invert(pc.is_in(rows["path"], frames["path"].combine_chunks())))
         by_format = pa.array({*_named_by_format(dataset), *of_scenes["path"].to_pylist()}, pa.string())
         odd = rows["path"].filter(pc.invert(pc.is_in(rows["path"], by_format)))
-        for path in odd[:MOST_OF_COLUMN].to_pylist():
+        for path in odd[:MAX_PER_COLUMN].to_pylist():
             yield Fault.of(path, None, "file", "an unexpected file", "only files of the dataset format")
-        if len(odd) > MOST_OF_COLUMN:
-            yield more_faults("file", len(odd) - MOST_OF_COLUMN)
+        if len(odd) > MAX_PER_COLUMN:
+            yield more_faults("file", len(odd) - MAX_PER_COLUMN)
     yield from _hash_faults(dataset, rows, sizes, progress)
 
 
@@ -180,14 +180,16 @@ def _cure(path: str) -> str:
     if path in EXTRA_NAMES:
         return "a file in the index; `perilune-manifest card` on the dataset adds it, or delete it"
     if path.startswith(f"{index.FOLDER}/") or TEMPORARY_FILE.fullmatch(name):
-        return "none: a stopped command left it; `perilune-manifest card` on the dataset removes it, or delete it"
+        return (
+            "no such file: a stopped command left it; `perilune-manifest card` on the dataset removes it, or delete it"
+        )
     return "only files of the dataset format (docs/reference/validation.md)"
 
 
 def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]:
-    """Compare path, size and hash in the index with the table frames or scenes; yield the first difference of each.
+    """Compare path, size and hash in the index with the table frames or scenes.
 
-    These faults name the index folder as their file.
+    Yields the first difference of each. These faults name the index folder as their file.
     """
     rows_in_index = pc.index_in(named["path"], rows["path"].combine_chunks())
     if rows_in_index.null_count:
@@ -214,7 +216,7 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
     for path, n_bytes, sha256 in _rows_of(rows):
         if path not in sizes:
             n_missing += 1
-            if n_missing > MOST_OF_COLUMN:
+            if n_missing > MAX_PER_COLUMN:
                 continue
             yield Fault.of(path, None, _HASH, "no such file", f"the file with SHA-256 {sha256}, {_IN_INDEX}")
             continue
@@ -227,8 +229,8 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
                 yield Fault.of(path, None, _HASH, "a different SHA-256", f"SHA-256 {sha256}, {_IN_INDEX}")
         except UserError as error:
             yield Fault.of(path, None, _HASH, error.found, error.expected)
-    if n_missing > MOST_OF_COLUMN:
-        yield more_faults(_HASH, n_missing - MOST_OF_COLUMN)
+    if n_missing > MAX_PER_COLUMN:
+        yield more_faults(_HASH, n_missing - MAX_PER_COLUMN)
     progress.update(task, completed=total)
 
 

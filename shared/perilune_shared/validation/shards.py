@@ -47,11 +47,11 @@ def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     names = defaultdict(list)
     for path in shards:
         names[split_of(path)].append(path)
-    for split, found in names.items():
-        expected = [shard_name(split, number, len(found)) for number in range(len(found))]
-        if found != expected:
-            odd = next(name for name in found if name not in expected)
-            yield Fault.of(odd, None, "name", f"one of {len(found)} shards of {split}", expected[0])
+    for split, shard_names in names.items():
+        expected = [shard_name(split, number, len(shard_names)) for number in range(len(shard_names))]
+        if shard_names != expected:
+            odd = next(name for name in shard_names if name not in expected)
+            yield Fault.of(odd, None, "name", f"one of {len(shard_names)} shards of {split}", expected[0])
 
 
 def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_row: int) -> Iterator[Fault]:
@@ -61,10 +61,10 @@ def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_
     frames = frames.take(pc.index_in(known["frame_id"], frames["frame_id"].combine_chunks()))
     expected = packed_rows(frames, labels, [None] * len(frames))
     for name in expected.column_names:
-        found = known[name] if name != "image" else pc.struct_field(known[name], "path")
+        packed = known[name] if name != "image" else pc.struct_field(known[name], "path")
         right = expected[name] if name != "image" else frames["png_path"]
-        if not found.equals(right.cast(found.type)):
-            pairs = enumerate(zip(found.to_pylist(), right.to_pylist(), strict=True), first_row)
+        if not packed.equals(right.cast(packed.type)):
+            pairs = enumerate(zip(packed.to_pylist(), right.to_pylist(), strict=True), first_row)
             row, (value, other) = next((row, pair) for row, pair in pairs if pair[0] != pair[1])
             column = "image.path" if name == "image" else name
             table = "labels" if name == "labels" else "frames"

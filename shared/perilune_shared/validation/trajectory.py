@@ -126,7 +126,7 @@ def _labels(
         wrong = np.flatnonzero(~np.asarray(pc.equal(labels[name], expected), bool) & (frame_of >= 0))
         if len(wrong):
             row = int(wrong[0])
-            yield Fault.of(where, row, name, labels[name][row].as_py(), f"{expected[row].as_py()}, as of its frame")
+            yield Fault.of(where, row, name, labels[name][row].as_py(), f"{expected[row].as_py()}, as in its frame")
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
@@ -214,10 +214,10 @@ def _vectors(column: pa.ChunkedArray) -> Array:
 
 
 def measurement_faults(table: str, rows: pa.Table, trajectory: dict) -> Iterator[Fault]:
-    """Yield the faults of a trajectory's rows of `inertial` or `ranges`; `trajectory` is the row of the trajectory.
+    """Yield the faults of a trajectory's rows of `inertial` or `ranges`.
 
-    For each grade, times must increase and lie between 0 and the duration of the trajectory. The intervals of inertial
-    measurements must follow each other without gaps.
+    `trajectory` is the row of the trajectory. For each grade, times must increase and lie between 0 and the duration of
+    the trajectory. The intervals of inertial measurements must follow each other without gaps.
     """
     where, key = f"manifest/{table}", f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
     grades = rows["grade"].unique().to_pylist() if "grade" in rows.column_names else [None]

@@ -80,5 +80,5 @@ def test_a_distorted_camera_sees_a_pinholes_rendering():
 
 
 def test_an_engine_that_sees_less_than_the_camera_is_refused():
-    with pytest.raises(ValueError, match="expected one that covers"):
+    with pytest.raises(ValueError, match="expected a camera that covers"):
         source_of(exr_camera=replace(CAMERA, width_px=95))

@@ -9,14 +9,14 @@ from tests.render.server.native_running import NativeRunning
 
 from perilune_render.flight.plan import make_plan
 from perilune_render.poses.plan import scene_seed
-from perilune_render.server.grounds import MOST_KEPT, Grounds, served_scene
+from perilune_render.server.grounds import MAX_KEPT, Grounds, served_scene
 from perilune_render.server.simulation import SimulatedScene
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.client import SceneClient
 from perilune_shared.errors import UserError
 
 DOWN = (0.0, 1.0, 0.0, 0.0)
-N_SCENES = MOST_KEPT + 3
+N_SCENES = MAX_KEPT + 3
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +88,9 @@ def test_clients_on_other_scenes_do_not_change_a_clients_frames(address, grounds
             image(second, scene)
             assert (image(first, 0) == plain).all()
         # By now scene 1 was forgotten, and is generated again.
-        assert len(grounds._kept) == MOST_KEPT and 1 not in grounds._kept
+        assert len(grounds._kept) == MAX_KEPT and 1 not in grounds._kept
         assert (image(first, 1) == own).all()
-        assert len(grounds._kept) == MOST_KEPT
+        assert len(grounds._kept) == MAX_KEPT
 
 
 def test_a_client_has_one_scene_in_the_queue(simulated):

@@ -152,7 +152,7 @@ def test_a_place_is_freed_by_idling(simulated):
 
 
 def test_a_full_queue_of_scenes_is_a_reason_to_ask_again(simulated, monkeypatch):
-    monkeypatch.setattr("perilune_render.server.grounds.MOST_WAITING", 1)
+    monkeypatch.setattr("perilune_render.server.grounds.MAX_WAITING", 1)
     begin = threading.Event()
     grown = Grounds._grown
 

@@ -85,7 +85,7 @@ def test_wear_lowers_rim_and_fills_bowl():
 def test_depth_left_agrees_with_published_degradation(wear, low, high):
     # Bounds: the fit of cratermaker and Gaussian blurring of the profile, which differ by about a tenth.
     tables = profile.profile_tables()
-    row = np.log(wear / profile.LEAST_WEAR) / np.log(profile.MOST_WEAR / profile.LEAST_WEAR) * (profile.N_WEAR - 1)
+    row = np.log(wear / profile.MIN_WEAR) / np.log(profile.MAX_WEAR / profile.MIN_WEAR) * (profile.N_WEAR - 1)
     shape = (0.0368 * tables.rim + 0.2 * tables.bowl)[round(row)]
     fresh = (0.0368 * tables.rim + 0.2 * tables.bowl)[0]
     at_rim = round(1 / (profile.REACH / 300))

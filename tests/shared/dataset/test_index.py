@@ -53,7 +53,7 @@ def test_a_written_index_is_read_again(tmp_path, info):
 
 
 def test_a_long_index_has_several_parts(tmp_path, info, monkeypatch):
-    monkeypatch.setattr(index, "MOST_ROWS", 2)
+    monkeypatch.setattr(index, "MAX_ROWS", 2)
     monkeypatch.setattr(index, "_ROWS_PER_GROUP", 1)
     store = open_store(tmp_path)
     written = seal(store, info, _ROWS)

@@ -11,7 +11,7 @@ from perilune_shared.storage.store import open_store
 
 def test_rows_continue_in_further_parts(little, tmp_path):
     source, store = open_dataset(little), open_store(tmp_path / "set")
-    tables = WholeTables(store, most_rows=5)
+    tables = WholeTables(store, max_rows=5)
     for scene_id in source.scene_ids():
         for name, rows in source.scene(scene_id).items():
             tables.add(name, rows)

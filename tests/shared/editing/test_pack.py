@@ -47,7 +47,7 @@ def test_unpacking_restores_the_dataset(drawn, packed, tmp_path):
 def test_large_tables_become_several_readable_parts(little, tmp_path, monkeypatch):
     source = open_dataset(little)
     assert source.info.counts.craters == 600
-    pack(source, tmp_path / "p", most_rows=100, most_frames=2)
+    pack(source, tmp_path / "p", max_rows=100, max_frames=2)
     original = footers.DATASET_LIMITS
     monkeypatch.setattr(footers, "DATASET_LIMITS", footers.FooterLimits(rows=100))
     with pytest.raises(UserError, match="rows"):

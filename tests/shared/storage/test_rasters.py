@@ -53,7 +53,7 @@ def test_the_data_behind_a_label_belong_to_the_raster(tmp_path):
 
 def test_the_data_of_a_label_are_opened_by_the_label(tmp_path):
     pds3(tmp_path, GROUND)
-    with pytest.raises(UserError, match=r"the data of a label are opened by the label, ground\.LBL"):
+    with pytest.raises(UserError, match=r"open the data through their label, ground\.LBL"):
         raster_files(tmp_path / "ground.IMG")
 
 

@@ -82,8 +82,8 @@ def test_a_new_folder_is_written_in_its_place(tmp_path, overwrite):
 def test_no_other_folder_is_deleted(tmp_path, monkeypatch):
     write(tmp_path / "out", "old")
     for out, known_by, message in (
-        (str(tmp_path / "out"), ("picture",), "got another folder, expected a folder that this command has written"),
-        (str(tmp_path / "out"), ("table", "*.png"), r"has written, with table and \*.png"),
+        (str(tmp_path / "out"), ("picture",), "got another folder, expected a folder that this command wrote"),
+        (str(tmp_path / "out"), ("table", "*.png"), r"wrote, with table and \*.png"),
         ("s3://bucket/prefix", ("table",), "got an address"),
         (str(tmp_path / "out"), ("table",), "got the current folder"),
     ):
@@ -100,7 +100,7 @@ def test_no_folder_that_is_read_is_deleted(tmp_path, read):
     (tmp_path / "link").symlink_to(tmp_path / "out")
     inputs = ("memory://dataset", str(tmp_path / read))
     with (
-        pytest.raises(UserError, match="got a folder that holds the input"),
+        pytest.raises(UserError, match="got a folder that contains the input"),
         replaceable(tmp_path / "out", ("table",), overwrite=True, inputs=inputs),
     ):
         pytest.fail("not refused")

@@ -48,7 +48,7 @@ def test_many_unknown_files_do_not_hide_an_unknown_part(victim, tmp_path):
 
 
 def test_an_index_has_a_maximum_of_all_rows(victim, monkeypatch):
-    monkeypatch.setattr(index, "MOST_ROWS_IN_ALL", 5)
+    monkeypatch.setattr(index, "MAX_TOTAL_ROWS", 5)
     dataset = open_dataset(victim)
     with pytest.raises(UserError, match="rows: got more than 5"):
         read_index(dataset.store, dataset.info)

@@ -202,7 +202,7 @@ def test_a_trajectory_developed_twice_is_one_trajectory(drawn, tmp_path):
 @pytest.mark.parametrize("inside", ["", "frames", "new/folder"])
 def test_no_dataset_is_written_into_another(drawn, inside):
     before = sorted(drawn.rglob("*"))
-    with pytest.raises(UserError, match="one outside the dataset"):
+    with pytest.raises(UserError, match="a folder outside the dataset"):
         subset(open_dataset(drawn), drawn / inside)
     assert sorted(drawn.rglob("*")) == before
 

@@ -12,7 +12,7 @@ def _one_core() -> Iterator[None]:
 
     Blender sizes its pool of threads by the cores that it may use when it starts. Each thread of the pool without work
     spins while Cycles renders, so a rendering by one thread would occupy all cores. A pool for one core has no such
-    threads; Cycles still adds those of its own setting.
+    threads; Cycles still starts the number of threads in its settings.
     """
     if not hasattr(os, "sched_setaffinity"):
         yield

@@ -32,7 +32,7 @@ from perilune_shared.threads import usable_cores
 _FAR_M = 1e9
 BAND_PX = 0.2
 """Largest image motion between two neighbouring bands of rows, which have one pose each, pixels."""
-_LEAST_FREE_BYTES = 16_000_000
+_MIN_FREE_BYTES = 16_000_000
 _LIT = 1e-4
 """Sunlight above which a pixel counts as sunlit; in shadow, sunlight is 0 and earthshine gives less than this."""
 
@@ -42,11 +42,11 @@ _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 
 
 class Renderer:
-    """Renders frames of one scene. Use as a context manager: it holds a temporary folder and Blender's only scene.
+    """Renders frames of one scene.
 
-    If the ground is too large for one mesh, a frame shows the level (`perilune_render.terrain.levels`) of its
-    trajectory that is made for the height of the camera. Blender holds the mesh of one level at a time, so render
-    frames in an order with few changes of level.
+    Use as a context manager: it holds a temporary folder and Blender's only scene. If the ground is too large for one
+    mesh, a frame shows the level (`perilune_render.terrain.levels`) of its trajectory that is made for the height of
+    the camera. Blender holds the mesh of one level at a time, so render frames in an order with few changes of level.
 
     It is an `Engine` of `perilune_render.engines.frame_source`: `camera` has no distortion, `sun` (3,) is the unit
     vector towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only
@@ -103,7 +103,10 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Remove the temporary folder and release Blender for another Renderer. `render` then raises RuntimeError."""
+        """Remove the temporary folder and release Blender for another Renderer.
+
+        `render` then raises RuntimeError.
+        """
         self._folder.cleanup()
         _open.discard(self)
 
@@ -167,7 +170,7 @@ class Renderer:
                 yield path
         except (UserError, RuntimeError) as error:
             # Blender reports a failed write only in its log, and the file is then missing or truncated.
-            full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
+            full = shutil.disk_usage(path.parent).free < _MIN_FREE_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, f"no frame ({error})", str(path.parent)) from None
 
 

@@ -1,1 +1,4 @@
-"""A second renderer: rays cast over the ground as a height field, without Blender. Plain NumPy and numba."""
+"""A second renderer: rays cast over the ground as a height field, without Blender.
+
+Plain NumPy and numba.
+"""

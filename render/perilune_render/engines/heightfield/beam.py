@@ -1,4 +1,4 @@
-"""Where the rays of a block of pixels begin: the height above which no ray hits anything, and the mesh part below.
+"""Find where the rays of a block of pixels may begin, and the part of the mesh below.
 
 A raster of squares stores the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays
 of a block of pixels fill a pyramid. The search follows it downwards, layer by layer: as long as the ground and the
@@ -23,7 +23,7 @@ _LAYERS = 16
 """Largest number of layers that are tried."""
 _THINNEST_M = 0.5
 """Thickness of a layer below which the search ends."""
-_LEAST_FALL = -1e-3
+_MIN_FALL = -1e-3
 """Vertical component above which a ray, with component 1 along the camera's axis, may fail to fall."""
 _MARGIN_M = 0.01
 """Margin of heights and positions for rounding errors of the rays, metres."""
@@ -106,17 +106,17 @@ def _highest(tops, x0, x1, y0, y1):
 
 @njit(**WITHOUT_COUNTS)
 def begin_m(tops, ground, origin, basis, rectangle):
-    """Height at which the rays through a rectangle of the image may begin, metres; inf if not all rays fall.
+    """Height at which the rays through a rectangle of the image may begin, metres.
 
-    The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above this height no ray through the
-    rectangle (u0, u1, v0, v1), pixels, hits anything.
+    Returns inf if not all rays fall. The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above
+    this height no ray through the rectangle (u0, u1, v0, v1), pixels, hits anything.
     """
     u0, u1, v0, v1 = rectangle
     x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf
     for k in range(4):
         u, v = u0 if k & 1 == 0 else u1, v0 if k & 2 == 0 else v1
         dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
-        if dz > _LEAST_FALL:
+        if dz > _MIN_FALL:
             return np.inf
         # Horizontal distance that the ray covers per metre of height.
         x = (u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]) / dz
@@ -153,7 +153,7 @@ def only_part(ground, origin, basis, rectangle, begin):
     for k in range(4):
         u, v = u0 if k & 1 == 0 else u1, v0 if k & 2 == 0 else v1
         dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
-        if dz > _LEAST_FALL:
+        if dz > _MIN_FALL:
             return -1
         for height in (begin - origin[2], ground.lowest_m - origin[2]):
             x = origin[0] + height * ((u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]) / dz)

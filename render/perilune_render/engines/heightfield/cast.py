@@ -232,10 +232,10 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
 
 @njit(**INLINED)
 def first_hit(ground, rocks, horizon, ray, span):
-    """The first hit of a ray within span, (t0, t1): its parameter t and the facet; inf and `NO_FACET` without a hit.
+    """The first hit of a ray within span, (t0, t1): its parameter t and the facet.
 
-    For a ray to the Sun's disc, `horizon` may be the Sun's horizon; for other rays it is None. If such a ray reaches a
-    point that is surely lit, no hit lies ahead, and t is -inf.
+    Returns inf and `NO_FACET` without a hit. For a ray to the Sun's disc, `horizon` may be the Sun's horizon; for other
+    rays it is None. If such a ray reaches a point that is surely lit, no hit lies ahead, and t is -inf.
     """
     (x, y, z, dx, dy, dz, _), (t0, t1) = ray, span
     half, outer = ground.half_widths_m[0], ground.half_widths_m[-1]

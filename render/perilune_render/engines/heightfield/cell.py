@@ -54,9 +54,9 @@ class Ray(NamedTuple):
 
 @njit(**WITHOUT_COUNTS)
 def enters_rock(rows, planes, k, ray, span):
-    """Parameter at which a ray enters boulder k within span, (t0, t1), and the face there; inf and -1 if it does not.
+    """Parameter at which a ray enters boulder k within span, (t0, t1), and the face there.
 
-    `rows` and `planes` are the fields of `Rocks`.
+    Returns inf and -1 if it does not. `rows` and `planes` are the fields of `Rocks`.
     """
     dx, dy, dz = ray.dx, ray.dy, ray.dz
     # First test a sphere around the boulder: most rays miss it.
@@ -96,7 +96,10 @@ def enters_rock(rows, planes, k, ray, span):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def first_rock(rocks, cell, ray, span):
-    """First boulder of a cell that a ray enters: parameter, boulder and face; inf, -1 and -1 if there is none."""
+    """First boulder of a cell that a ray enters: parameter, boulder and face.
+
+    Returns inf, -1 and -1 if there is none.
+    """
     best, rock, face = np.inf, -1, -1
     for index in range(rocks.cell_start[cell], rocks.cell_start[cell + 1]):
         k = rocks.cell_rock[index]
@@ -110,7 +113,10 @@ def first_rock(rocks, cell, ray, span):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def crossing(above_0, above_1, t0, t1):
-    """Parameter at which a height above a triangle, linear from t0 to t1, changes sign; inf if it does not."""
+    """Parameter at which a height above a triangle, linear from t0 to t1, changes sign.
+
+    Returns inf if it does not.
+    """
     if (above_0 > 0) == (above_1 > 0):
         return np.inf
     return t0 + (t1 - t0) * above_0 / (above_0 - above_1)
@@ -118,9 +124,9 @@ def crossing(above_0, above_1, t0, t1):
 
 @njit(**INLINED)
 def cross_inner(ground, row, column, ray, span):
-    """Where a ray crosses the triangles of a cell of the inner square: parameter and triangle; inf and -1 if nowhere.
+    """Where a ray crosses the triangles of a cell of the inner square: parameter and triangle.
 
-    `ray` is in cells: x is a column, y a row, z a height in metres.
+    Returns inf and -1 if nowhere. `ray` is in cells: x is a column, y a row, z a height in metres.
     """
     vertex, n, (t0, t1) = ground.vertex, ground.n_half, span
     p0, dp, q0, dq = ray.x, ray.dx, ray.y, ray.dy

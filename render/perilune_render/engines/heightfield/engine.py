@@ -35,9 +35,9 @@ _RAYS_PER_VERTEX = 0.3
 
 
 class HeightfieldEngine:
-    """Renders frames of one scene; an `Engine` of `perilune_render.engines.frame_source`. Several may be open.
+    """Renders frames of one scene; an `Engine` of `perilune_render.engines.frame_source`.
 
-    Raises UserError if the configuration asks for light that this engine does not render.
+    Several may be open. Raises UserError if the configuration asks for light that this engine does not render.
     """
 
     def __init__(
@@ -89,7 +89,10 @@ class HeightfieldEngine:
         return image
 
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
-        """Render one frame with a pose for each row of the sensor; depth is along the camera's axis at this pose."""
+        """Render one frame with a pose for each row of the sensor.
+
+        Depth is along the camera's axis at this pose.
+        """
         shape = self.camera.height_px, self.camera.width_px
         whole, band = Radiance.empty(shape), Radiance.empty(shape)
         drawn, horizon = self._drawn(seed), self._horizon_now()
@@ -140,7 +143,10 @@ class HeightfieldEngine:
             cast(each)
 
     def _horizon_now(self) -> Horizon:
-        """The horizon for a frame; `NOWHERE` until computing it saves time. Frames do not depend on the choice."""
+        """The horizon for a frame; `NOWHERE` until computing it saves time.
+
+        Frames do not depend on the choice.
+        """
         self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
         if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
             self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))

@@ -16,7 +16,7 @@ from perilune_render.engines.heightfield.surface import WITHOUT_COUNTS, Ground, 
 from perilune_render.provenance.kernels import njit
 from perilune_shared.geometry.frames import Array
 
-_MOST_SQUARES = 2048
+_MAX_SQUARES = 2048
 """Largest number of squares along an axis."""
 _CELLS = 4
 """Smallest width of a square, in cells of the inner square of the ground."""
@@ -66,7 +66,7 @@ def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
         return NOWHERE
     along_x, along_y = float(sun[0]) / level, float(sun[1]) / level
     edge_m = float(ground.half_widths_m[-1]) * (abs(along_x) + abs(along_y)) + 1.0
-    pitch_m = max(2 * edge_m / _MOST_SQUARES, _CELLS * float(ground.half_widths_m[0]) / ground.n_half)
+    pitch_m = max(2 * edge_m / _MAX_SQUARES, _CELLS * float(ground.half_widths_m[0]) / ground.n_half)
     n = int(np.ceil(2 * edge_m / pitch_m))
     empty = Horizon(np.full((n, n), -np.inf, np.float32), along_x, along_y, edge_m, 1 / pitch_m)
     steep = np.zeros((n, n), np.bool_)

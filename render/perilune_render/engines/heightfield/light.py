@@ -11,7 +11,7 @@ import numpy as np
 from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS
 from perilune_render.imaging.photometry import (
     HAPKE,
-    LEAST_SINE_SQUARED,
+    MIN_SINE_SQUARED,
     HapkeParameters,
     chi_of,
     reflectance_factor,
@@ -19,7 +19,7 @@ from perilune_render.imaging.photometry import (
 )
 from perilune_render.provenance.kernels import njit
 
-_ONE, _TWO, _LEAST = np.float32(1), np.float32(2), np.float32(LEAST_SINE_SQUARED)
+_ONE, _TWO, _MIN_SINE_SQUARED = np.float32(1), np.float32(2), np.float32(MIN_SINE_SQUARED)
 
 
 class _Factors(NamedTuple):
@@ -45,7 +45,10 @@ class _Factors(NamedTuple):
 
 
 def _factors(p: HapkeParameters) -> _Factors:
-    """The constants of a parameter set. Each is computed in double precision and rounded once, as NumPy does."""
+    """The constants of a parameter set.
+
+    Each is computed in double precision and rounded once, as NumPy does.
+    """
     slope, chi, gamma = slope_of(p.theta_bar_deg), chi_of(p.theta_bar_deg), float(np.sqrt(1 - p.w))
     scale = (1 - p.b**2) / 2
     values = (
@@ -101,7 +104,7 @@ def _fill_disc(drawn, radius_rad, points):
 @njit(**INLINED)
 def _slopes(f, cosine):
     """Compiled copy of `photometry._slopes`."""
-    sine = np.sqrt(max(cosine * cosine * -_ONE + _ONE, _LEAST))
+    sine = np.sqrt(max(cosine * cosine * -_ONE + _ONE, _MIN_SINE_SQUARED))
     exponent = cosine / sine * f.exponent_1
     return sine, np.exp(exponent), np.exp(exponent * exponent * f.exponent_2)
 

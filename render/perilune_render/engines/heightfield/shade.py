@@ -183,7 +183,7 @@ def rock_normal(rocks, k, face):
 
 @njit(**INLINED)
 def _see(ground, rocks, view, tile, block, sample):
-    """Cast the ray of one sample, (s, row, column) in the tile, and its shadow ray; see the module's sketch.
+    """Cast the ray of one sample, (s, row, column) in the tile, and its shadow ray (module docstring).
 
     Returns the height of the hit, metres, or without a hit the height at which the ray begins.
     """

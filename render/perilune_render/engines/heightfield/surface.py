@@ -28,13 +28,16 @@ WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
 INLINED = WITHOUT_COUNTS | {"forceinline": True}
 """Options of kernels that are compiled into their callers: a call would pass `Ground` and `Rocks` as about 70
 numbers."""
-_MOST_LEVELS = 16
+_MAX_LEVELS = 16
 _MARGIN_M = 0.01
 """Margin between the surface and the heights where rays begin and end, so that each ray crosses the ground."""
 
 
 class Ground(NamedTuple):
-    """Arrays of the ground, as an argument of compiled functions; few arrays, since each is passed as eight numbers."""
+    """Arrays of the ground, as an argument of compiled functions.
+
+    There are few arrays, since each is passed as eight numbers.
+    """
 
     half_widths_m: Array
     """Half-widths of the inner square and the rings, ascending, metres (R + 1,)."""
@@ -79,7 +82,7 @@ def surface_of(scene: Scene) -> Surface:
     rocks, tops = rocks_of(scene)
     _raise_to_ground(height, n, *tops)
     pyramids = [_levels(tops[0][None]), _levels(tops[1])]
-    starts = np.zeros((2, _MOST_LEVELS + 1), np.int64)
+    starts = np.zeros((2, _MAX_LEVELS + 1), np.int64)
     for part, levels in enumerate(pyramids):
         before = 0 if part == 0 else sum(map(len, pyramids[0]))
         starts[part, 1 : len(levels) + 1] = before + np.cumsum([0, *map(len, levels)])[:-1]
@@ -108,7 +111,7 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
     """Levels from 1 of the largest values of `tops` (sides, rows, columns), each flat."""
     levels: list[np.ndarray] = []
     level = tops
-    while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MOST_LEVELS - 1):
+    while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MAX_LEVELS - 1):
         level = _coarser(level)
         levels.append(level.ravel())
     return levels
@@ -116,7 +119,10 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
 
 @njit()
 def _coarser(tops):
-    """The largest values in blocks of 2 x 2 of `tops` (sides, rows, columns); blocks at an odd end are smaller."""
+    """The largest values in blocks of 2 x 2 of `tops` (sides, rows, columns).
+
+    Blocks at an odd end are smaller.
+    """
     n_sides, n_rows, n_columns = tops.shape
     coarse = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
     for side in range(n_sides):

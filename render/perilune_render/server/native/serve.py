@@ -11,8 +11,8 @@ from perilune_render.server.native import zmtp
 from perilune_render.server.native.answers import ANSWERED_BY_CONNECTIONS, answer, refusal
 from perilune_render.server.serve import Interface, answers
 
-MOST_WITHOUT_PLACE = 256
-"""Largest number of clients connected beyond the limit, only to be told that the server is busy."""
+MAX_REFUSED = 256
+"""Largest number of clients connected beyond the limit; the server only replies that it is busy."""
 HEALTH = b'{"request": "health"}'
 """The health request of `perilune_shared.client`, which is also answered beyond the limit of clients."""
 _HEALTH_S = 5.0
@@ -31,7 +31,7 @@ class Native:
     grounds: Grounds
     """The scenes."""
     limits: Limits
-    """Limits on the clients. Clients above the largest number are told that the server is busy."""
+    """Limits on the clients. To clients beyond the limit, the server replies that it is busy."""
     note: Callable[[str], object]
     """Called with one line for each error that is not caused by a client."""
     interfaces: list[Interface] = field(default_factory=list)
@@ -41,10 +41,10 @@ class Native:
 
     def interface(self, host: str, port: int) -> Interface:
         """The interface at an address."""
-        connected = replace(self.limits, clients=self.limits.clients + MOST_WITHOUT_PLACE)
-        made = Interface("perilune_shared.client", host, port, self._serve, zmtp.greets, connected)
-        self.interfaces.append(made)
-        return made
+        connected = replace(self.limits, clients=self.limits.clients + MAX_REFUSED)
+        interface = Interface("perilune_shared.client", host, port, self._serve, zmtp.greets, connected)
+        self.interfaces.append(interface)
+        return interface
 
     async def _serve(self, connection: Connection) -> None:
         """Serve one client until it leaves."""

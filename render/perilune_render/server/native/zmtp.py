@@ -13,7 +13,7 @@ from perilune_render.server.connection import Connection, Dropped
 LARGEST_REQUEST_BYTES = 4_000_000
 """Largest size of one part of a message, bytes."""
 _LARGEST_COMMAND_BYTES = 4096
-_MOST_KEPT = 2
+_MAX_KEPT = 2
 _CHUNK_BYTES = 65_536
 _MORE, _LONG, _COMMAND = 1, 2, 4
 _SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
@@ -34,7 +34,10 @@ class Message(NamedTuple):
 
 
 async def greet(connection: Connection) -> None:
-    """Exchange greetings and the types of the sockets. Raises Dropped for a client that does not speak ZMTP 3."""
+    """Exchange greetings and the types of the sockets.
+
+    Raises Dropped for a client that does not speak ZMTP 3.
+    """
     signature = await connection.hello(1)
     if signature != _SIGNATURE[:1]:
         raise Dropped("not a client of ZeroMQ 4")
@@ -65,7 +68,7 @@ async def receive(connection: Connection, may_keep: Callable[[], bool]) -> Messa
         if flags & _COMMAND:
             await _obey(connection, await connection.rest(size))
             continue
-        is_wanted = len(kept) < _MOST_KEPT
+        is_wanted = len(kept) < _MAX_KEPT
         is_kept = is_wanted and (size <= _CHUNK_BYTES or may_keep())
         is_whole = is_whole and (is_kept or not is_wanted)
         if is_kept:

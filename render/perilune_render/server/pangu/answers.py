@@ -43,8 +43,8 @@ def answer(session: Session, message: m.Message, values: list, items: Array | by
         if message.effect == "read":
             return unsigned(m.OKAY)
         _check(values, items)
-        made = _ANSWERS[message.number](session, values, items)
-        return unsigned(m.OKAY) if made is None else made
+        payload = _ANSWERS[message.number](session, values, items)
+        return unsigned(m.OKAY) if payload is None else payload
     except UserError as fault:
         return error(FAULTY, f"{message.name}: {fault}")
     except ValueError as fault:

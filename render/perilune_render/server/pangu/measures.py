@@ -14,7 +14,7 @@ from perilune_shared.geometry.frames import Array
 
 RANGE_WIDTH = 256
 """Pixels of the range texture, which is a ramp of grey values."""
-_MOST_HEIGHTS = 1_000_000
+_MAX_HEIGHTS = 1_000_000
 
 
 def seen(
@@ -74,8 +74,8 @@ def surface(session: Session, boulders: bool, places_m: Array) -> Array:
 
 def _grid(nx: int, ny: int, dx: float, dy: float) -> tuple[Array, Array]:
     """Positions (ny, nx) on a grid around 0. Raises ValueError if the grid is empty or too large."""
-    if not 1 <= nx * ny <= _MOST_HEIGHTS:
-        raise ValueError(f"{nx} x {ny} heights, expected 1 to {_MOST_HEIGHTS}")
+    if not 1 <= nx * ny <= _MAX_HEIGHTS:
+        raise ValueError(f"{nx} x {ny} heights, expected 1 to {_MAX_HEIGHTS}")
     x, y = np.meshgrid((np.arange(nx) - (nx - 1) / 2) * dx, (np.arange(ny) - (ny - 1) / 2) * dy)
     return x, y
 

@@ -44,9 +44,10 @@ def sun_from_angles(azimuth_rad: float, elevation_rad: float, zero: SunZero) -> 
 
 
 def camera_from_angles(width_px: int, height_px: int, field_of_view_rad: float, aspect: float) -> Camera:
-    """A pinhole with a horizontal field of view; `aspect` is a pixel's height over its width, both at depth 1.
+    """A pinhole with a horizontal field of view.
 
-    Raises ValueError if the field of view is not between 0.01 and 170 degrees, or the aspect not between 0.1 and 10.
+    `aspect` is a pixel's height over its width, both at depth 1. Raises ValueError if the field of view is not between
+    0.01 and 170 degrees, or the aspect not between 0.1 and 10.
     """
     if not np.radians(0.01) <= field_of_view_rad <= np.radians(170):
         raise ValueError(f"a field of view of {np.degrees(field_of_view_rad):g} degrees")

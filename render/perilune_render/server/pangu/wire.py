@@ -18,7 +18,10 @@ SIZES = {"u": 4, "i": 4, "b": 1, "f": 4, "d": 8}
 
 
 def float_bytes(values: Sequence[float] | np.ndarray) -> bytes:
-    """Encode floats (N,). Values beyond the range of a float are clipped to its largest value; NaN is rejected."""
+    """Encode floats (N,). Values beyond the range of a float are clipped to its largest value.
+
+    NaN is rejected.
+    """
     array = np.asarray(values, np.float64)
     if np.isnan(array).any():
         raise ValueError("NaN cannot be sent")

@@ -38,7 +38,10 @@ class _Plane(NamedTuple):
 
 @njit(inline="always")
 def _fit_plane(height, x, y, radius, window):
-    """Fit a least-squares plane to the ground around (x, y); return whether it has enough vertices, and the plane."""
+    """Fit a least-squares plane to the ground around (x, y).
+
+    Returns whether it has enough vertices, and the plane.
+    """
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
     square_r = radius**2

@@ -7,7 +7,7 @@ fell rapidly). Equilibrium densities are counts of craters that are still visibl
 with more wear than `_LARGEST_VISIBLE_WEAR`.
 
 Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so in order of wear a large young crater
-could come before a small old one that it has removed.
+could come before a small old crater that it has removed.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from perilune_shared.geometry.frames import Array
 
 ORIGINS = ("primary", "secondary", "elevation model")
 """Values of `Craters.origin`: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
-MOST_CRATERS = 5_000_000
+MAX_CRATERS = 5_000_000
 """Largest mean number of craters in a scene; each needs about 1 kB of memory during stamping and measurement."""
 _LARGEST_VISIBLE_WEAR = 0.11
 """Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
@@ -188,8 +188,8 @@ def check_craters(config: CratersConfig, grid: Grid) -> None:
     law = Minimum(NeukumProduction(age_gyr=config.surface_age_gyr), equilibrium)
     edges, half_m = _bins(config, grid, *_sizes(config, grid))
     number = float(expected_numbers(law, edges, np.square(2 * half_m)).sum())
-    if number > MOST_CRATERS:
-        expected = f"at most {MOST_CRATERS}: lower equilibrium_share, or raise min_diameter_spacings"
+    if number > MAX_CRATERS:
+        expected = f"at most {MAX_CRATERS}: lower equilibrium_share, or raise min_diameter_spacings"
         raise UserError("dataset.terrain.craters", "number", f"about {number:.3g} in a scene", expected)
 
 

@@ -40,7 +40,7 @@ _DOMAIN, _N_RADIAL = 6.0, 600
 """Radius of the grid on which diffusion is solved, crater radii, and its number of cells."""
 _CREST = 0.036822
 """Height of Fassett & Thomson's inner polynomial at x = 0.98, where the crest begins, divided by the diameter."""
-LEAST_WEAR, MOST_WEAR, N_WEAR = 2e-4, 0.6, 56
+MIN_WEAR, MAX_WEAR, N_WEAR = 2e-4, 0.6, 56
 """Smallest and largest wear K/R^2 in the tables, and the number of rows."""
 
 
@@ -178,7 +178,7 @@ def profile_tables(profile: str = "fassett_thomson") -> ProfileTables:
         + np.diag(flow / (root[:-1] * root[1:]), -1)
     )
     rates, modes = np.linalg.eigh(operator)
-    wear = np.geomspace(LEAST_WEAR, MOST_WEAR, N_WEAR)
+    wear = np.geomspace(MIN_WEAR, MAX_WEAR, N_WEAR)
     decay = np.exp(rates[None, :] * wear[:, None])
     columns = np.linspace(0, REACH, 301)
     taper = np.clip((REACH - columns) / 0.5, 0, 1)
@@ -222,5 +222,5 @@ def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_tho
 
 def wear_row(wear: Array) -> Array:
     """Fractional row of wear K/R^2 in the tables."""
-    within = np.clip(wear, LEAST_WEAR, MOST_WEAR)
-    return np.log(within / LEAST_WEAR) / np.log(MOST_WEAR / LEAST_WEAR) * (N_WEAR - 1)
+    within = np.clip(wear, MIN_WEAR, MAX_WEAR)
+    return np.log(within / MIN_WEAR) / np.log(MAX_WEAR / MIN_WEAR) * (N_WEAR - 1)

@@ -1,4 +1,7 @@
-"""Craters of a real elevation model, read from a catalogue; they become labels, as generated craters do."""
+"""Craters of a real elevation model, read from a catalogue.
+
+They become labels, as generated craters do.
+"""
 
 import functools
 from dataclasses import dataclass, replace
@@ -79,36 +82,36 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
     n_outside = int((~near).sum())
     x, y, listed_m = x[near], y[near], listed.diameter_m[near]
     large = listed_m > smallest_m
-    shown = large.copy()
-    shown[large] = _measured(model, x[large], y[large], listed_m[large])
-    chosen = np.flatnonzero(shown)
+    covered = large.copy()
+    covered[large] = _measured(model, x[large], y[large], listed_m[large])
+    chosen = np.flatnonzero(covered)
     n_twice = int(duplicates(x[chosen], y[chosen], listed_m[chosen]).sum())
     chosen = chosen[~duplicates(x[chosen], y[chosen], listed_m[chosen])]
-    n_unmeasured, n_small = int((large & ~shown).sum()), int((~large).sum())
+    n_unmeasured, n_small = int((large & ~covered).sum()), int((~large).sum())
     x, y, listed_m = x[chosen], y[chosen], listed_m[chosen]
     diameter, rms, ratio = listed_m, np.full(len(x), np.nan), np.full(len(x), np.nan)
     if config.elevation.rims == "measured":
         crests = measure_crests(model, x, y, listed_m)
         x, y, diameter = (
-            np.where(crests.found, measured, given)
-            for measured, given in ((crests.x_m, x), (crests.y_m, y), (crests.diameter_m, listed_m))
+            np.where(crests.found, measured, listed_value)
+            for measured, listed_value in ((crests.x_m, x), (crests.y_m, y), (crests.diameter_m, listed_m))
         )
         rms, ratio = crests.rms_share, crests.axis_ratio
     # A measured rim larger than the catalogued one may extend beyond the ground or the model.
     on_grid = _inside(grid, x, y, diameter)
-    kept = on_grid.copy()
-    kept[on_grid] = _measured(model, x[on_grid], y[on_grid], diameter[on_grid])
+    usable = on_grid.copy()
+    usable[on_grid] = _measured(model, x[on_grid], y[on_grid], diameter[on_grid])
     counts = Counts(
-        used=int(kept.sum()),
-        measured=int(np.isfinite(rms[kept]).sum()),
+        used=int(usable.sum()),
+        measured=int(np.isfinite(rms[usable]).sum()),
         outside=n_outside + int((~on_grid).sum()),
-        unmeasured=n_unmeasured + int((on_grid & ~kept).sum()),
+        unmeasured=n_unmeasured + int((on_grid & ~usable).sum()),
         too_small=n_small,
         duplicate=n_twice,
     )
     if not counts.used:
         raise _nothing_used(path, listed, counts, smallest_m)
-    order = np.flatnonzero(kept)[np.argsort(-diameter[kept], kind="stable")]
+    order = np.flatnonzero(usable)[np.argsort(-diameter[usable], kind="stable")]
     unknown = np.full(len(order), np.nan)
     craters = replace(
         Craters.round(x[order], y[order], diameter[order], unknown, unknown, np.zeros(len(order))),

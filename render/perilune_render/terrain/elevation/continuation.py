@@ -57,7 +57,10 @@ def continued(height_m: Array, beyond_m: Array, margin: int, pixel_m: tuple[floa
 
 
 def plane(height_m: Array, row: Array, column: Array) -> Array:
-    """The least-squares plane through heights (rows, columns); row and column are 0 at the first pixel's centre."""
+    """The least-squares plane through heights (rows, columns).
+
+    Row and column are 0 at the first pixel's centre.
+    """
     n_rows, n_columns = height_m.shape
     i, j = np.arange(n_rows) - (n_rows - 1) / 2, np.arange(n_columns) - (n_columns - 1) / 2
     mean = height_m.mean()

@@ -1,8 +1,8 @@
 """Measure the rim crests of catalogued craters in an elevation model.
 
-A catalogue often gives the diameter at formation, or one marked by hand on an image; worn rims lie farther out. The
-crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane that
-is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
+A catalogue often gives the diameter at formation, or a diameter marked by hand on an image; worn rims lie farther out.
+The crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane
+that is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from perilune_render.terrain.elevation.model import ElevationModel, raster_places
 from perilune_shared.geometry.frames import Array
 
-LEAST_PIXELS = 8.0
+MIN_PIXELS = 8.0
 """Smallest diameter for which a crest is measured, pixels of the model."""
 _N_AZIMUTHS, _N_RADII = 36, 64
 _NEAR, _FAR = 0.5, 2.0
@@ -21,15 +21,15 @@ _SEARCH = 0.3
 """Half-width of the search for a crest, as a share of the radius at which the median profile is highest."""
 _PLANE_FROM = 1.5
 """Inner radius of the ground to which the plane is fitted, radii of the crater."""
-_LEAST_SHARE = 0.7
+_MIN_SHARE = 0.7
 """Smallest share of directions in which a crest must be found."""
 _LARGEST_RMS = 0.1
 """Largest r.m.s. distance of the crest from the ellipse, radii."""
-_LEAST_RATIO = 0.7
+_MIN_RATIO = 0.7
 """Smallest ratio of the ellipse's axes."""
 _LARGEST_SHIFT = 0.4
 """Largest distance between the catalogued and the measured centre, radii of the crater."""
-_LEAST_DEPTH = 0.02
+_MIN_DEPTH = 0.02
 """Smallest depth of the centre below the crest, diameters."""
 _OUTLIER = 2.5
 _CHUNK = 256
@@ -59,7 +59,7 @@ class Crests:
 def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> Crests:
     """Measure the crests of craters at positions (N,) in O_L with catalogued diameters (N,), metres."""
     measured = np.full((5, len(x_m)), np.nan)
-    large = np.flatnonzero(diameter_m >= LEAST_PIXELS * model.pixel_m)
+    large = np.flatnonzero(diameter_m >= MIN_PIXELS * model.pixel_m)
     for start in range(0, len(large), _CHUNK):
         chunk = large[start : start + _CHUNK]
         radius = diameter_m[chunk] / 2
@@ -109,8 +109,8 @@ def _fit(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array) -> _Fit
     rms = np.sqrt((weight * residual**2).sum(axis=1) / np.maximum(n_used, 1)) / np.maximum(mean, 1e-3)
     floor = _heights(model, x_m, y_m, radius_m, np.zeros((1, 1)), np.zeros((1, 1)))[:, 0, 0]
     rim = _rim_level(model, x_m, y_m, radius_m, terms @ shape.T, angle)
-    good = (n_used >= _LEAST_SHARE * _N_AZIMUTHS) & (rms <= _LARGEST_RMS) & (minor / major >= _LEAST_RATIO)
-    good &= (mean > _NEAR) & (mean < _FAR) & (rim - floor >= _LEAST_DEPTH * 2 * radius_m)
+    good = (n_used >= _MIN_SHARE * _N_AZIMUTHS) & (rms <= _LARGEST_RMS) & (minor / major >= _MIN_RATIO)
+    good &= (mean > _NEAR) & (mean < _FAR) & (rim - floor >= _MIN_DEPTH * 2 * radius_m)
     moved = good[:, None] * terms[:, 1:3] * radius_m[:, None]
     radius = np.where(good, np.sqrt(np.maximum(major * minor, 1e-6)), 1) * radius_m
     return _Fit(x_m + moved[:, 0], y_m + moved[:, 1], radius, rms, minor / major, good)
@@ -120,7 +120,7 @@ def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
     """Radius of the crest in each direction (N, A), shares of the crater's radius, and whether one exists (N, A).
 
     A crest is a maximum of the profile (N, A, R) inside a range around the highest point of the median profile; a
-    maximum at the end of this range is no crest.
+    maximum at the end of this range does not count.
     """
     step = share[1] - share[0]
     around = share[np.median(height_m, axis=1).argmax(axis=1)]

@@ -27,13 +27,13 @@ _UNITS = {
 }
 _LOWEST_M, _HIGHEST_M = -9_900.0, 11_500.0
 """Heights that the Moon has, above and below its mean radius, with a margin: -9.1 to 10.8 km."""
-_LEAST_RELIEF = 7e-4
+_MIN_RELIEF = 7e-4
 """Range of heights, as a share of the ground's width, below which heights without a unit may be kilometres."""
 _WIDEST_RELIEF = 25.0
 """Range of heights of the whole Moon, in kilometres, with a margin: larger ones are not kilometres."""
-_FEWEST_M = 1000.0
+_MIN_EXTENT_M = 1000.0
 """Smallest width of the ground, metres, at which heights are tested for kilometres."""
-_LEAST_PLATEAU = 4
+_MIN_PLATEAU = 4
 """Smallest number of equal values that may be fill."""
 _ISIS_SPECIAL = 3.4e38
 """Smallest absolute value of pixels without data in an ISIS cube (Null, and saturated or out of range)."""
@@ -81,11 +81,11 @@ class HeightBand:
         return height
 
     def in_metres(self, height: Array, width_m: float) -> Array:
-        """Convert heights or radii (rows, columns) to metres of height, in place; the ground is `width_m` wide.
+        """Convert heights or radii (rows, columns) to metres of height, in place.
 
-        Raises UserError if they cannot be heights on the Moon: if values are beyond the Moon's highest and lowest
-        points, if many are equal and far from the rest (undeclared fill), or if the ground is too flat for metres and
-        no unit is stated.
+        The ground is `width_m` wide. Raises UserError if they cannot be heights on the Moon: if values are beyond the
+        Moon's highest and lowest points, if many are equal and far from the rest (undeclared fill), or if the ground is
+        too flat for metres and no unit is stated.
         """
         height[np.isinf(height)] = np.nan
         known = height[np.isfinite(height)]
@@ -100,13 +100,13 @@ class HeightBand:
         self._refuse_beyond(known, low, high, metres)
         self._refuse_plateau(known)
         relief = float(known.max() - known.min()) * metres
-        flat = width_m >= _FEWEST_M and 0 < relief < min(_LEAST_RELIEF * width_m, _WIDEST_RELIEF)
+        flat = width_m >= _MIN_EXTENT_M and 0 < relief < min(_MIN_RELIEF * width_m, _WIDEST_RELIEF)
         if self.metres is None and zero == 0 and flat:
             raise UserError(
                 self.path,
                 f"{_FIELD}.height_unit",
                 f"no unit, and heights that differ by {relief:.3g} over {width_m / 1000:.3g} km",
-                "the unit of the heights, km or another: --height-unit km (m if they are metres)",
+                "--height-unit km, or m if the heights are metres",
             )
         if metres != 1:
             height *= metres
@@ -127,7 +127,7 @@ class HeightBand:
     def _refuse_plateau(self, known: Array) -> None:
         for value, apart in ((float(known.min()), 1), (float(known.max()), -1)):
             count = int((known == value).sum())
-            if count < _LEAST_PLATEAU or count == len(known):
+            if count < _MIN_PLATEAU or count == len(known):
                 continue
             rest = known[known != value]
             gap = float((rest * apart).min() - value * apart)
@@ -160,7 +160,7 @@ def height_band(path: Path, files: RasterFiles, raster: Any, config: ElevationCo
         raise UserError(path, "heights", "complex numbers", "real numbers")
     eight_bits = raster.dtypes[index - 1] in ("uint8", "int8")
     if eight_bits and unit is None and config.band is None and raster.scales[index - 1] == 1:
-        expected = f"heights; if these are some, --set {_FIELD}.band={index}"
+        expected = f"a band of heights; if these are heights, --set {_FIELD}.band={index}"
         raise UserError(path, "heights", "an 8-bit picture, such as a hillshade", expected)
     metres = None if unit is None else METRES_PER_UNIT[unit]
     return HeightBand(path, raster, index, metres, config.nodata, files.driver == "ISIS3")
@@ -195,7 +195,10 @@ def _index_of(path: Path, raster: Any, config: ElevationConfig) -> int:
 
 
 def _unit_of(path: Path, files: RasterFiles, raster: Any, index: int) -> str | None:
-    """The unit of heights that a file states: in the band, in a label, or as vertical unit; None if it states none."""
+    """The unit of heights that a file states: in the band, in a label, or as vertical unit.
+
+    Returns None if it states none.
+    """
     stated = [raster.units[index - 1] or ""]
     if files.driver == "PDS":
         label = label_text(files)

@@ -139,7 +139,10 @@ def _source_of(files: RasterFiles, used: set[str]) -> str:
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Column and row of positions (...) on O_L's plane, metres; both are 0 at the raster's top left corner."""
+    """Column and row of positions (...) on O_L's plane, metres.
+
+    Both are 0 at the raster's top left corner.
+    """
     lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
     column, row = model.raster.places(np.ravel(lat), np.ravel(lon))
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
@@ -156,7 +159,10 @@ def height_of_site_m(model: ElevationModel) -> float:
 
 
 def resolved_m(model: ElevationModel) -> float:
-    """Smallest diameter of a crater that a model shows, metres: four pixels. Smaller craters are generated."""
+    """Smallest diameter of a crater that a model shows, metres: four pixels.
+
+    Smaller craters are generated.
+    """
     return _RESOLVED_PIXELS * model.pixel_m
 
 

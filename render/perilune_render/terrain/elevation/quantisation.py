@@ -5,9 +5,9 @@ from scipy import ndimage
 
 from perilune_shared.geometry.frames import Array
 
-_LEAST_SLOPE = 1e-3
+_MIN_SLOPE = 1e-3
 """Largest step that makes no visible terraces, as a multiple of the pixel size."""
-_FEWEST_REPEATS = 4
+_MIN_REPEATS = 4
 """Smallest mean number of pixels per distinct height of quantised heights."""
 _WIDEST_TERRACE_PX = 64
 _GENTLE = 3.5
@@ -20,14 +20,14 @@ def step_of(height_m: Array, pixel_m: float) -> float:
     There is a step if heights repeat and each is within a twentieth of a step of a multiple of the step.
     """
     distinct = np.unique(height_m)
-    if len(distinct) < 3 or len(height_m) < _FEWEST_REPEATS * len(distinct):
+    if len(distinct) < 3 or len(height_m) < _MIN_REPEATS * len(distinct):
         return 0.0
     offset = distinct - distinct[0]
     gaps = np.diff(distinct)
     rounding = float(4 * np.finfo(np.float32).eps * np.abs(distinct).max())
     smallest = float(np.min(gaps[gaps > rounding])) if (gaps > rounding).any() else np.inf
     step = float(np.median(gaps[(gaps > rounding) & (gaps <= 1.5 * smallest)])) if np.isfinite(smallest) else 0.0
-    if step <= max(_LEAST_SLOPE * pixel_m, 8 * rounding):
+    if step <= max(_MIN_SLOPE * pixel_m, 8 * rounding):
         return 0.0
     # A longer range of multiples gives a more accurate step.
     for count in np.geomspace(10, max(offset[-1] / step, 10), 8):

@@ -129,14 +129,17 @@ def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
     ellipsoid = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
     radius = float(ellipsoid[2]) if ellipsoid else 0.0
     if abs(radius / MOON_RADIUS_M - 1) > 0.01:
-        name = f"{ellipsoid[1]}, radius {radius / 1000:.0f} km" if ellipsoid else "none on a sphere or ellipsoid"
+        name = f"{ellipsoid[1]}, radius {radius / 1000:.0f} km" if ellipsoid else "a system without sphere or ellipsoid"
         raise UserError(
             path, "projection", name, f"a coordinate reference system of the Moon ({MOON_RADIUS_M / 1000:.0f} km)"
         )
 
 
 def circle_of(crs: rasterio.crs.CRS) -> float | None:
-    """Width of 360 degrees in a system's coordinates; None unless meridians are vertical lines at even distances."""
+    """Width of 360 degrees in a system's coordinates.
+
+    Returns None unless meridians are vertical lines at even distances.
+    """
     import rasterio.warp
 
     if crs.is_geographic:

@@ -20,7 +20,7 @@ UNSTATED_GROUND_M = 20_000.0
 """Side of the ground for which a large model is read if the caller does not state one, metres."""
 _AROUND = 1.25
 """Half-width of a window divided by the ground's half-width; the margin serves statistics and interpolation."""
-_LEAST_PX = 64
+_MIN_PX = 64
 """Smallest number of pixels around the ground in a window."""
 _NET = 65
 _ROUGH_PX = 0.5
@@ -44,7 +44,10 @@ class Window:
 
 
 def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Window:
-    """The part of a raster to read for square ground of a side around a site, metres; None reads a usual size."""
+    """The part of a raster to read for square ground of a side around a site, metres.
+
+    None reads a part of a usual size.
+    """
     rows, columns = raster.shape
     net = np.linspace(-0.5, 0.5, 9) * (UNSTATED_GROUND_M if ground_m is None else ground_m) * _AROUND
     column, row = _places_about(raster, site, *np.meshgrid(net, net))
@@ -53,7 +56,7 @@ def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Wind
     if rows * columns <= LARGEST_PIXELS:
         left = round(site.column - around / 2) if across else 0
         return Window(0, left, (rows, around if across else columns), 1, bool(across))
-    margin = _LEAST_PX
+    margin = _MIN_PX
     top, bottom = (int(np.clip(edge, 0, rows)) for edge in (row.min() - margin, row.max() + margin + 1))
     left, right = (int(edge) for edge in (np.floor(column.min() - margin), np.ceil(column.max() + margin)))
     if not across:

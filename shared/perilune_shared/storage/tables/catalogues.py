@@ -51,7 +51,7 @@ _PATTERNS = {
     "radius_m": re.compile(r"(?:r|rad|radius)" + _UNIT.format("(?:m|meters|metres)"), re.IGNORECASE),
     "radius_km": re.compile(r"(?:r|rad|radius)" + _UNIT.format("(?:km|kilometers|kilometres)"), re.IGNORECASE),
 }
-_MOST_NEIGHBOURS = 100
+_MAX_NEIGHBOURS = 100
 """Number of craters, from west to east, with which each crater is compared; limits the time for hostile catalogues."""
 
 
@@ -133,7 +133,7 @@ def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
         high = 1.1 * 2 ** (low + 1)
         similar = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
         order = similar[np.argsort(x_m[similar], kind="stable")]
-        for step in range(1, min(len(order), _MOST_NEIGHBOURS)):
+        for step in range(1, min(len(order), _MAX_NEIGHBOURS)):
             first, second = np.sort([order[:-step], order[step:]], axis=0)
             apart = np.abs(x_m[second] - x_m[first])
             if apart.min() > 0.05 * high:

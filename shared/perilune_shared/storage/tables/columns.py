@@ -72,7 +72,10 @@ class Columns:
         return values
 
     def finite(self, name: str, low: float = -np.inf, high: float = np.inf) -> NDArray[np.float64]:
-        """Return a column of finite numbers from `low` to `high` (n,). Raises UserError about the first other value."""
+        """Return a column of finite numbers from `low` to `high` (n,).
+
+        Raises UserError about the first other value.
+        """
         values = self.numbers(name)
         self.check(name, np.isfinite(values) & (values >= low) & (values <= high), _range_text(low, high))
         return values

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 
-MOST_LINE_BYTES = 65_536
+MAX_LINE_BYTES = 65_536
 """Maximum length of a line of text, or of a row whose quoted values contain line breaks."""
-MOST_COLUMNS = 1_000
+MAX_COLUMNS = 1_000
 """Maximum number of columns of a text table."""
-MOST_VALUE_CHARACTERS = 1_000
+MAX_VALUE_CHARACTERS = 1_000
 """Maximum length of a value in a column that is read as text."""
-MOST_TEXT_CHARACTERS = 100_000_000
+MAX_TEXT_CHARACTERS = 100_000_000
 """Maximum total length of the distinct values of one column that is read as text."""
 SPARE_ROWS, BYTES_PER_ROW = 200_000, 4
 """A Parquet file of n bytes has at most SPARE_ROWS + n / BYTES_PER_ROW rows. Measurements do not compress better."""

@@ -22,17 +22,17 @@ from perilune_shared.storage.pages import pages_of
 from perilune_shared.storage.tables.columns import Columns, Kind, Texts, check_present, check_unique
 from perilune_shared.storage.tables.limits import (
     BYTES_PER_ROW,
-    MOST_TEXT_CHARACTERS,
-    MOST_VALUE_CHARACTERS,
+    MAX_TEXT_CHARACTERS,
+    MAX_VALUE_CHARACTERS,
     SPARE_ROWS,
     TableLimits,
 )
 
 _BATCH_ROWS = 65_536
 # Maximum length of lists in a footer. It also limits the depth of the schema: deep nesting can crash the process.
-_MOST_LIST = 10_000
-_MOST_FOOTER_TEXT_BYTES = 10_000_000
-_MOST_METADATA_BYTES = 100_000
+_MAX_LIST = 10_000
+_MAX_FOOTER_TEXT_BYTES = 10_000_000
+_MAX_METADATA_BYTES = 100_000
 
 
 class ParquetTable:
@@ -57,7 +57,7 @@ class ParquetTable:
         self.metadata = {
             key.decode(errors="replace"): value.decode(errors="replace")
             for key, value in (self._schema.metadata or {}).items()
-            if len(key) + len(value) <= _MOST_METADATA_BYTES
+            if len(key) + len(value) <= _MAX_METADATA_BYTES
         }
         """Metadata of the schema."""
         self.comments: list[str] = []
@@ -104,8 +104,8 @@ class ParquetTable:
                 self.path,
                 read_dictionary=list(texts),
                 pre_buffer=False,
-                thrift_string_size_limit=_MOST_FOOTER_TEXT_BYTES,
-                thrift_container_size_limit=_MOST_LIST,
+                thrift_string_size_limit=_MAX_FOOTER_TEXT_BYTES,
+                thrift_container_size_limit=_MAX_LIST,
             )
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise self._damaged(error) from None
@@ -184,8 +184,8 @@ class ParquetTable:
                     if not pa.types.is_dictionary(column.type):
                         column = column.dictionary_encode()
                     longest = pc.max(pc.binary_length(column.dictionary)).as_py() or 0
-                    if longest > MOST_VALUE_CHARACTERS:
-                        expected = f"at most {MOST_VALUE_CHARACTERS}"
+                    if longest > MAX_VALUE_CHARACTERS:
+                        expected = f"at most {MAX_VALUE_CHARACTERS}"
                         raise UserError(self.path, f"column {name}", f"a text of {longest} bytes", expected)
                     index = np.asarray(column.indices.fill_null(-1), np.int64)
                     used = np.unique(index[index >= 0])
@@ -194,9 +194,9 @@ class ParquetTable:
                         n_known = len(code_of)
                         numbers[at] = code_of.setdefault(word, n_known) if word else -1
                         n_characters += len(word) if word and numbers[at] == n_known else 0
-                    if n_characters > MOST_TEXT_CHARACTERS:
-                        found = f"more than {MOST_TEXT_CHARACTERS} characters in different values"
-                        raise UserError(self.path, f"column {name}", found, f"at most {MOST_TEXT_CHARACTERS}")
+                    if n_characters > MAX_TEXT_CHARACTERS:
+                        found = f"more than {MAX_TEXT_CHARACTERS} characters in different values"
+                        raise UserError(self.path, f"column {name}", found, f"at most {MAX_TEXT_CHARACTERS}")
                     codes[row : row + len(index)] = numbers[index]
                     row += len(index)
         return Texts(list(code_of), codes)

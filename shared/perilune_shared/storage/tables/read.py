@@ -63,6 +63,9 @@ def open_table(path: Path, limits: TableLimits, header: Sequence[str] | None = N
 def read_table(
     path: Path, limits: TableLimits, columns: Mapping[str, Kind], required: Sequence[str] | None = None
 ) -> Columns:
-    """Read columns of a table with a header. Only columns in `required` must exist; by default all of them."""
+    """Read columns of a table with a header.
+
+    Only columns in `required` must exist; by default all of them.
+    """
     with open_table(path, limits) as table:
         return table.read(columns, list(columns) if required is None else required)

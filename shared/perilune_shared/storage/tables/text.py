@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from perilune_shared.errors import UserError
 from perilune_shared.storage.tables.columns import Columns, Kind, Texts, check_present, check_unique
 from perilune_shared.storage.tables.limits import (
-    MOST_COLUMNS,
-    MOST_LINE_BYTES,
-    MOST_TEXT_CHARACTERS,
-    MOST_VALUE_CHARACTERS,
+    MAX_COLUMNS,
+    MAX_LINE_BYTES,
+    MAX_TEXT_CHARACTERS,
+    MAX_VALUE_CHARACTERS,
     TableLimits,
 )
 
 _BATCH_ROWS, _BATCH_CHARACTERS = 20_000, 2_000_000
-_MOST_COMMENTS = 1_000
-_LEAST_INTEGER, _MOST_INTEGER = -(2**63), 2**63 - 1
+_MAX_COMMENTS = 1_000
+_MIN_INTEGER, _MAX_INTEGER = -(2**63), 2**63 - 1
 Row = tuple[int, list[str]]
 """Line number from 1, and the values of a row."""
 
@@ -89,7 +89,10 @@ class TextTable:
             yield line, words
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read the given columns; columns that the table lacks are omitted. Raises UserError on an invalid value."""
+        """Read the given columns; columns that the table lacks are omitted.
+
+        Raises UserError on an invalid value.
+        """
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
@@ -111,16 +114,16 @@ class TextTable:
         """Yield the lines that are neither empty nor comments."""
         n_seen = 0
         for line in itertools.count(1):
-            text = self._stream.readline(MOST_LINE_BYTES + 1)
+            text = self._stream.readline(MAX_LINE_BYTES + 1)
             if not text:
                 return
-            if len(text) > MOST_LINE_BYTES:
-                raise UserError(f"{self.path}:{line}", "line", f"more than {MOST_LINE_BYTES} bytes", "a row of a table")
+            if len(text) > MAX_LINE_BYTES:
+                raise UserError(f"{self.path}:{line}", "line", f"more than {MAX_LINE_BYTES} bytes", "a row of a table")
             if "\0" in text:
                 raise UserError(f"{self.path}:{line}", "text", "a zero byte", f"a text file with {self._limits.kind}")
             stripped = text.strip()
             if stripped.startswith("#"):
-                if not n_seen and len(self.comments) < _MOST_COMMENTS:
+                if not n_seen and len(self.comments) < _MAX_COMMENTS:
                     self.comments.append(stripped[1:].strip())
             elif stripped:
                 n_seen += 1
@@ -158,18 +161,21 @@ class TextTable:
             self._rows = itertools.chain([first], self._rows)
             return names
         names = _without_empty_end(words, 0)
-        if len(names) > MOST_COLUMNS:
-            raise UserError(f"{self.path}:{line}", "columns", len(names), f"at most {MOST_COLUMNS}")
+        if len(names) > MAX_COLUMNS:
+            raise UserError(f"{self.path}:{line}", "columns", len(names), f"at most {MAX_COLUMNS}")
         return names
 
     def _names_in_comment(self, n_columns: int) -> list[str] | None:
-        """Return the names in the last comment if there are `n_columns` of them; 0 accepts any number above one."""
+        """Return the names in the last comment if there are `n_columns` of them.
+
+        0 accepts any number above one.
+        """
         for comment in reversed(self.comments[-1:]):
             names = (
                 comment.split() if self.separator == " " else [word.strip() for word in comment.split(self.separator)]
             )
             names = _without_empty_end(names, 0)
-            if len(names) == n_columns or (n_columns == 0 and 1 < len(names) <= MOST_COLUMNS):
+            if len(names) == n_columns or (n_columns == 0 and 1 < len(names) <= MAX_COLUMNS):
                 return names
         return None
 
@@ -190,9 +196,9 @@ class _Counted:
         self.first_line = self.first_line or self.line
         self._length += len(text)
         self.has_space = self.has_space or " " in text or "\t" in text or not text.isascii()
-        if self._length > MOST_LINE_BYTES:
-            expected = "a row of a table; is a quote without its end?"
-            raise UserError(f"{self._path}:{self.first_line}", "row", f"more than {MOST_LINE_BYTES} bytes", expected)
+        if self._length > MAX_LINE_BYTES:
+            expected = "a row of a table; a closing quote may be missing"
+            raise UserError(f"{self._path}:{self.first_line}", "row", f"more than {MAX_LINE_BYTES} bytes", expected)
         return text
 
     def begin_row(self) -> None:
@@ -256,12 +262,12 @@ class _Words:
 
     def _check(self, word: str, line: int) -> None:
         where = f"{self._path}:{line}"
-        if len(word) > MOST_VALUE_CHARACTERS:
-            raise UserError(where, self._name, f"{len(word)} characters", f"at most {MOST_VALUE_CHARACTERS}")
+        if len(word) > MAX_VALUE_CHARACTERS:
+            raise UserError(where, self._name, f"{len(word)} characters", f"at most {MAX_VALUE_CHARACTERS}")
         self._n_characters += len(word)
-        if self._n_characters > MOST_TEXT_CHARACTERS:
-            found = f"more than {MOST_TEXT_CHARACTERS} characters in different values"
-            raise UserError(where, self._name, found, f"at most {MOST_TEXT_CHARACTERS}")
+        if self._n_characters > MAX_TEXT_CHARACTERS:
+            found = f"more than {MAX_TEXT_CHARACTERS} characters in different values"
+            raise UserError(where, self._name, found, f"at most {MAX_TEXT_CHARACTERS}")
         try:
             word.encode()
         except UnicodeEncodeError:
@@ -319,4 +325,4 @@ def _integer(word: str) -> int | None:
         if not _is_number(word) or not (number := float(word)).is_integer():
             return None
         value = int(number)
-    return value if "_" not in word and _LEAST_INTEGER <= value <= _MOST_INTEGER else None
+    return value if "_" not in word and _MIN_INTEGER <= value <= _MAX_INTEGER else None

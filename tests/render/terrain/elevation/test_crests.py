@@ -8,7 +8,7 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.elevation.catalogue import read_catalogue
-from perilune_render.terrain.elevation.crests import LEAST_PIXELS, measure_crests
+from perilune_render.terrain.elevation.crests import MIN_PIXELS, measure_crests
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
@@ -54,7 +54,7 @@ def test_crests_lie_where_the_ground_is_highest(ground, growth):
     model, rng = read_elevation(path), np.random.default_rng(1)
     listed = true[:, 2] / growth
     found = measure_crests(model, *(true[:, :2] + rng.normal(0, 2, (25, 2))).T, listed)
-    large = listed >= LEAST_PIXELS * PIXEL_M
+    large = listed >= MIN_PIXELS * PIXEL_M
     assert not found.found[~large].any()
     assert found.found[large].mean() > 0.9
     own = found.found

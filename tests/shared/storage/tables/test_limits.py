@@ -13,10 +13,10 @@ def test_the_page_lists_the_limits_of_every_table():
     rows = [line for line in section.splitlines() if line.startswith("| ") and line[-3].isdigit()]
     assert rows == [f"| {kind.kind} | {kind.rows:,} | {kind.file_bytes:,} |" for kind in limits.KINDS]
     numbers = (
-        limits.MOST_LINE_BYTES,
-        limits.MOST_COLUMNS,
-        limits.MOST_VALUE_CHARACTERS,
-        limits.MOST_TEXT_CHARACTERS,
+        limits.MAX_LINE_BYTES,
+        limits.MAX_COLUMNS,
+        limits.MAX_VALUE_CHARACTERS,
+        limits.MAX_TEXT_CHARACTERS,
         limits.SPARE_ROWS,
     )
     for number in numbers:

@@ -106,7 +106,7 @@ def test_rows_and_texts_are_limited(tmp_path, monkeypatch):
         read_table(path, TableLimits("measurements", 1000, 10_000_000), {"a": "number"})
     with pytest.raises(UserError, match="size: got"):
         read_table(path, TableLimits("measurements", 1000, 1000), {"a": "number"})
-    monkeypatch.setattr(parquet, "MOST_TEXT_CHARACTERS", 1_000_000)
+    monkeypatch.setattr(parquet, "MAX_TEXT_CHARACTERS", 1_000_000)
     with pytest.raises(UserError, match="column t: got more than 1000000 characters in different values"):
         read_table(path, LIMITS, {"t": "text"})
 

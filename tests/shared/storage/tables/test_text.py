@@ -7,7 +7,7 @@ import pytest
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage.tables import text as text_module
-from perilune_shared.storage.tables.limits import MOST_LINE_BYTES, TableLimits
+from perilune_shared.storage.tables.limits import MAX_LINE_BYTES, TableLimits
 from perilune_shared.storage.tables.read import open_table, read_table
 
 LIMITS = TableLimits("measurements", 1000, 10_000_000)
@@ -86,7 +86,7 @@ REFUSED = {
     "": "{path}: columns: got no a, b; columns none, expected a, b",
     "a,b\n1,\0\n": "{path}:2: text: got a zero byte, expected a text file with measurements",
     'a,b\n1,"2\n' + "3,4\n" * 40_000: "{path}:2: row: got more than 65536 bytes, expected a row of a table; "
-    "is a quote without its end?",
+    "a closing quote may be missing",
     "a,b\n1," + "2" * 70_000: "{path}:2: line: got more than 65536 bytes, expected a row of a table",
     "a,b\n" + "1,2\n" * 1001: "{path}: rows: got more than 1000, expected at most 1000 rows of measurements",
     ",".join(f"n{n}" for n in range(1001)): "{path}:1: columns: got 1001, expected at most 1000",
@@ -118,7 +118,7 @@ def test_values_of_other_kinds_are_refused(tmp_path):
 
 
 def test_all_texts_of_a_column_together_are_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr(text_module, "MOST_TEXT_CHARACTERS", 100)
+    monkeypatch.setattr(text_module, "MAX_TEXT_CHARACTERS", 100)
     path = _file(tmp_path, "t\n" + "".join(f"{n:010}\n" for n in range(11)))
     with pytest.raises(UserError, match=r"table.csv:12: t: got more than 100 characters"):
         read_table(path, LIMITS, {"t": "text"})
@@ -154,5 +154,5 @@ def test_a_large_table_is_read_in_batches(tmp_path):
 
 
 def test_a_line_at_the_limit_is_read(tmp_path):
-    name = "x" * (MOST_LINE_BYTES - 5)
+    name = "x" * (MAX_LINE_BYTES - 5)
     assert read_table(_file(tmp_path, f"a,b,{name}\n1,2,3\n"), LIMITS, NUMBERS).numbers("b").tolist() == [2]
