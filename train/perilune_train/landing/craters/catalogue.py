@@ -11,7 +11,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.neighbours import Grid, grid_of, nearest
 
-LEAST_DIAMETER_M = 5.0
+MIN_DIAMETER_M = 5.0
 """Default smallest crater diameter, metres, in a catalogue made from a dataset."""
 Chosen = NDArray[np.integer] | NDArray[np.bool_]
 """Selection of craters: an index array or a boolean mask."""

@@ -8,23 +8,24 @@ from perilune_shared.geometry.camera import Camera
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import Fix, PosePrior, refine
 from perilune_train.landing.craters.projection import Pose
-from perilune_train.landing.craters.search import N_TESTED, Area, search
+from perilune_train.landing.craters.search import Area, search
 from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.craters.vote import SearchRange, Support, candidates, support
 
 _NEAR_PX = 6.0
 """Largest standard deviation of the expected pose, in pixels on the ground, for which no search is needed."""
-_LEAST_AGREED = 8
-_LEAST_SHARE = 0.25
-"""Smallest number of sightings, and smallest share of the tested sightings, that must agree with a hypothesis."""
-_AHEAD = 1.5
-"""Smallest ratio of agreeing sightings between the best and the second-best hypothesis."""
+_NEAR_SIGMAS, _SEARCH_SIGMAS, _SURE_SIGMAS = 5.0, 10.0, 30.0
+"""Smallest support of a fix, in standard deviations of chance: near the expected pose, and by a search. A search stops
+at the first candidate with the last support."""
+_AHEAD = 1.3
+"""Smallest ratio between the support of the best and the second-best pose of a search."""
 _SIGMAS = 3.5
 _REACHES = (1.0, 3.0)
 """Search radii, tried in turn, as multiples of the radius that the prior suggests. The larger one is tried because the
 prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
-_LEAST_MARGIN = 0.06
+_MIN_MARGIN = 0.06
 """Smallest altitude margin in a search, as a share of the altitude. It is needed because the ground is not level."""
 
 
@@ -45,45 +46,75 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     or if two poses explain them about equally well.
     """
     ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
-    altitude_m = float(prior.pose.position_m[2] - ground_m)
+    altitude_m = max(float(prior.pose.position_m[2] - ground_m), 1.0)
     sigma = np.sqrt(np.diag(prior.covariance))
-    on_ground_m = float(np.hypot(sigma[:2].max(), altitude_m * sigma[3:5].max()))
-    if on_ground_m * camera.fx_px < _NEAR_PX * max(altitude_m, 1.0):
-        fix = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose)
-        if fix is not None:
+    on_ground_px = float(np.hypot(sigma[:2].max() / altitude_m, sigma[3:5].max())) * camera.fx_px
+    # Altitude and heading move the edges of the frame.
+    edge_px = float(np.hypot(sigma[2] / altitude_m, sigma[5])) * camera.width_px / 2
+    start_px = float(np.hypot(on_ground_px, edge_px))
+    if start_px < _NEAR_PX:
+        fix = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose, start_px)
+        if fix is not None and support(sightings, catalogue, camera, fix.pose).sigmas >= _NEAR_SIGMAS:
             return Located(fix, searched=False)
-    margin = max(_SIGMAS * float(sigma[2]) / max(altitude_m, 1.0), _LEAST_MARGIN)
-    reach_m = max(_SIGMAS * on_ground_m, 20 * altitude_m / camera.fx_px)
-    altitudes = altitude_m * max(1 - margin, 0.2), altitude_m * (1 + margin)
-    heading = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
+    margin = max(_SIGMAS * float(sigma[2]) / altitude_m, _MIN_MARGIN)
+    log_altitude = np.log(max(1 - margin, 0.2)), np.log(1 + margin)
+    heading_rad = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
     for factor in _REACHES:
-        area = Area(prior.pose.position_m[:2], factor * reach_m, altitudes, heading)
-        searched = lost_in_space(sightings, catalogue, camera, prior, area)
-        if searched is not None:
-            return searched
+        shift_px = factor * max(_SIGMAS * on_ground_px, 20.0)
+        limits = SearchRange(shift_px, log_altitude, heading_rad)
+        poses = candidates(sightings, catalogue, camera, prior.pose, ground_m, limits)
+        fix = _best(sightings, catalogue, camera, poses)
+        if fix is not None:
+            return Located(fix, searched=True)
     return None
 
 
 def lost_in_space(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
 ) -> Located | None:
-    """Search an area for the pose of a frame whose tilt is known to about 1 degree; None if uncertain."""
-    hypotheses = search(sightings, catalogue, camera, prior.pose.rotation_camera_from_site, area)
-    least = max(_LEAST_AGREED, _LEAST_SHARE * min(len(sightings), N_TESTED))
-    if not hypotheses or hypotheses[0].n_agreed < least:
-        return None
-    if (
-        len(hypotheses) > 1
-        and hypotheses[0].n_agreed < _AHEAD * hypotheses[1].n_agreed
-        and not _same(hypotheses[0].pose, hypotheses[1].pose)
-    ):
-        return None
-    fix = refine(sightings, catalogue, camera, _around(hypotheses[0].pose), hypotheses[0].pose)
+    """Search an area for the pose of a frame whose tilt is known to about 1 degree; None if uncertain.
+
+    Pairs of the largest craters come first, because they are fast. If they lead to no fix, all craters vote.
+    """
+    rotation_camera_from_site = prior.pose.rotation_camera_from_site
+    hypotheses = search(sightings, catalogue, camera, rotation_camera_from_site, area)
+    fix = _best(sightings, catalogue, camera, [hypothesis.pose for hypothesis in hypotheses])
+    if fix is None and len(sightings):
+        ground_m = catalogue.ground_m(area.centre_m, _NEAREST)
+        low, high = area.altitude_m
+        middle_m = float(np.sqrt(low * high))
+        middle = Pose(np.array([*area.centre_m, ground_m + middle_m]), rotation_camera_from_site)
+        limits = SearchRange(
+            area.reach_m / low * camera.fx_px, (np.log(low / middle_m), np.log(high / middle_m)), area.heading_rad
+        )
+        poses = candidates(sightings, catalogue, camera, middle, ground_m, limits)
+        fix = _best(sightings, catalogue, camera, poses)
     return Located(fix, searched=True) if fix is not None else None
 
 
+def _best(sightings: Sightings, catalogue: Catalogue, camera: Camera, poses: list[Pose]) -> Fix | None:
+    """The fix with the most support among those that start at some poses; None if it may be chance."""
+    fixes: list[tuple[Support, Fix]] = []
+    for pose in poses:
+        fix = refine(sightings, catalogue, camera, _around(pose), pose)
+        if fix is None:
+            continue
+        agreed = support(sightings, catalogue, camera, fix.pose)
+        if agreed.sigmas >= _SURE_SIGMAS:
+            return fix
+        fixes.append((agreed, fix))
+    if not fixes:
+        return None
+    fixes.sort(key=lambda pair: -pair[0].excess)
+    best, fix = fixes[0]
+    others = (other.excess for other, later in fixes[1:] if not _same(later.pose, fix.pose))
+    if best.sigmas < _SEARCH_SIGMAS or best.excess < _AHEAD * max(others, default=0.0):
+        return None
+    return fix
+
+
 def _same(first: Pose, second: Pose) -> bool:
-    """Whether two hypotheses differ by no more than the error expected of one hypothesis."""
+    """Whether two fixes are one pose: closer than an error of a fix."""
     return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 

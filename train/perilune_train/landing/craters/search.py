@@ -27,14 +27,14 @@ _N_PAIRED = 18
 """Number of sightings that form pairs, the largest ones, since large craters are rare."""
 _N_FIRST, N_TESTED = 24, 60
 """Numbers of sightings, largest first, that test every placement and that test the best placements."""
-_LEAST_SEPARATION = 0.1
+_MIN_SEPARATION = 0.1
 """Smallest separation of a pair, divided by the width of the image."""
 _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
 """Standard deviation of the logarithm of a size; number of standard deviations at an area's limits of
 altitude and heading; largest distance, in standard deviations, between a pair of sightings and a pair of craters."""
 _TEST_PX, _TEST_SIZE = 4.0, 0.35
 """Largest distance, and largest difference of the logarithms of the sizes, at which a sighting agrees with a crater."""
-_MOST_PAIRED, _MOST_HITS, _MOST_TESTED, _MOST_RETURNED = 800, 150, 1000, 5
+_MAX_PAIRED, _MAX_HITS, _MAX_TESTED, _MAX_RETURNED = 800, 150, 1000, 5
 """Limits on the time: craters that form pairs, the largest first; placements for a pair of sightings; placements that
 are tested on more sightings; hypotheses that are returned."""
 
@@ -77,7 +77,7 @@ def search(
         return []
     paired = _in_reach(catalogue, camera, sightings.radius_px[:_N_PAIRED], area)
     local = _in_reach(catalogue, camera, sightings.radius_px[:N_TESTED], area)
-    paired = paired.part(np.argsort(-paired.radius_m, kind="stable")[:_MOST_PAIRED])
+    paired = paired.part(np.argsort(-paired.radius_m, kind="stable")[:_MAX_PAIRED])
     if len(paired) < 3:
         return []
     placements = _placements(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
@@ -85,7 +85,7 @@ def search(
         return []
     # All placements are tested on some sightings, the best on more.
     agreed = _agreed(placements, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
-    placements = placements.part(np.argsort(-agreed, kind="stable")[:_MOST_TESTED])
+    placements = placements.part(np.argsort(-agreed, kind="stable")[:_MAX_TESTED])
     agreed = _agreed(placements, offset[:N_TESTED], size[:N_TESTED], local, camera)
     ground_m = float(np.median(local.centre_m[:, 2]))
     best: list[Hypothesis] = []
@@ -98,7 +98,7 @@ def search(
         heading = np.eye(3)
         heading[:2, :2] = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
         best.append(Hypothesis(Pose(position, rotation_camera_from_site @ heading), int(agreed[k])))
-        if len(best) == _MOST_RETURNED:
+        if len(best) == _MAX_RETURNED:
             break
     return best
 
@@ -180,21 +180,19 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     none = _Placements(np.zeros(0), np.zeros(0), np.zeros((0, 2)))
     low, high = area.altitude_m
     width = camera.width_px / camera.fx_px
-    sighting_pairs = _Pairs.of(offset, size, _LEAST_SEPARATION * width, 2 * width)
+    sighting_pairs = _Pairs.of(offset, size, _MIN_SEPARATION * width, 2 * width)
     sighting_pairs = sighting_pairs.part(sighting_pairs.index[:, 0] < sighting_pairs.index[:, 1])
     if not len(sighting_pairs.index):
         return none
     most = np.exp(sighting_pairs.separation.max()) * high
-    catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _LEAST_SEPARATION * width * low, most)
+    catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _MIN_SEPARATION * width * low, most)
     if not len(catalogue_pairs.index):
         return none
     # Scale the sightings to the middle altitude: their separations are then wrong by at most half of the range.
     middle = replace(sighting_pairs, separation=sighting_pairs.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
     tree = KDTree(catalogue_pairs.places(log_range, area.heading_rad))
-    distance, second = tree.query(
-        middle.places(log_range, area.heading_rad), _MOST_HITS, distance_upper_bound=_FARTHEST
-    )
+    distance, second = tree.query(middle.places(log_range, area.heading_rad), _MAX_HITS, distance_upper_bound=_FARTHEST)
     first, hit = np.nonzero(np.isfinite(distance))
     second = second[first, hit]
     if not len(first):

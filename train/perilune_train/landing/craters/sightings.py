@@ -13,7 +13,9 @@ share of the radius."""
 _PER_SCORE, _USUAL_SCORE = 1.5, 0.8
 """The logarithm of the error that differs from frame to frame grows by this much per unit of decreasing score, and has
 the value stated above at this score."""
-_SIZE_SHARE = 0.1
+MAX_SIGHTINGS = 500
+"""Largest number of craters of a frame that are matched, which limits the time of a step."""
+_SIZE_SHARE = 0.15
 """Standard deviation of a detected radius, as a share of the radius."""
 
 
@@ -30,11 +32,18 @@ class Sightings:
 
     @classmethod
     def of_boxes(cls, boxes: Array, scores: Array) -> "Sightings":
-        """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius."""
+        """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius.
+
+        If there are more than `MAX_SIGHTINGS`, those with the highest scores are kept.
+        """
+        scores = np.asarray(scores)
+        if len(scores) > MAX_SIGHTINGS:
+            best = np.argsort(-scores, kind="stable")[:MAX_SIGHTINGS]
+            boxes, scores = boxes[best], scores[best]
         size = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None)
         radius = np.sqrt(size.prod(axis=1)) / 2
         order = np.argsort(-radius)
-        return cls((boxes[order, :2] + boxes[order, 2:]) / 2, radius[order], np.asarray(scores)[order])
+        return cls((boxes[order, :2] + boxes[order, 2:]) / 2, radius[order], scores[order])
 
     def __len__(self) -> int:
         return len(self.radius_px)

@@ -20,7 +20,7 @@ from perilune_train.landing.filter.state import (
 )
 from perilune_train.landing.filter.update import passes_gate, updated
 
-_LEAST_WEIGHT = 0.1
+_MIN_WEIGHT = 0.1
 """Matches with a smaller weight in the fix are ignored."""
 _ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
 """Parts of the error state that displace every sighting."""
@@ -63,7 +63,7 @@ def craters_update(
     The measurement is linearised about the fix, which is closer to the true pose than the state is (iterated filter,
     Bell & Cathey 1993, doi 10.1109/9.250476).
     """
-    used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
+    used = np.flatnonzero(fix.weight > _MIN_WEIGHT)
     sighting, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
     unmatched = np.setdiff1d(state.craters, crater)
     unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]

@@ -32,8 +32,20 @@ COMMON, GROUND = slice(15, 20), slice(20, 21)
 N_ERRORS = 21
 """Number of elements of the error state without craters and kept poses."""
 
-_COMMON_SIGMAS_PX = np.array([0.08, 0.08, 0.15, 0.2, 0.2])
-"""Standard deviations of the shared image error, pixels, measured on the validation scenes of `shipped-nav`."""
+_LOW_SUN_DEG, _HIGH_SUN_DEG = 35.0, 60.0
+_LOW_SUN_SIGMAS_PX = np.array([0.06, 0.06, 0.1, 0.13, 0.13])
+_HIGH_SUN_SIGMAS_PX = np.array([0.1, 0.1, 0.2, 0.3, 0.3])
+"""Standard deviations of the shared image error at and below the low Sun, and at and above the high Sun, measured on
+the validation scenes of `shipped-nav` and on two synthetic elevation models. Under a high Sun the detector sees rims by
+their albedo and their slopes toward the Sun, and its centres shift more."""
+
+
+def common_sigmas_px(sun_elevation_deg: float | None) -> Array:
+    """Standard deviations (5,) of the shared image error, pixels; those of a high Sun if the elevation is unknown."""
+    if sun_elevation_deg is None:
+        return _HIGH_SUN_SIGMAS_PX
+    high_share = np.clip((sun_elevation_deg - _LOW_SUN_DEG) / (_HIGH_SUN_DEG - _LOW_SUN_DEG), 0, 1)
+    return _LOW_SUN_SIGMAS_PX + high_share * (_HIGH_SUN_SIGMAS_PX - _LOW_SUN_SIGMAS_PX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +81,22 @@ class State:
 
     @classmethod
     def starting(
-        cls, position_m: Array, velocity_mps: Array, rotation_site_from_body: Array, sigmas: Array, relief_m: float
+        cls,
+        position_m: Array,
+        velocity_mps: Array,
+        rotation_site_from_body: Array,
+        sigmas: Array,
+        relief_m: float,
+        sun_elevation_deg: float | None = None,
     ) -> "State":
         """The state at the first frame.
 
         `sigmas` (15,) are the standard deviations of the first 15 errors; `relief_m` is the standard deviation of the
-        ground's height.
+        ground's height. `sun_elevation_deg` is the elevation of the Sun above the site, None if it is unknown; it sets
+        the expected error that all sightings share.
         """
         none = np.zeros(3)
-        covariance = np.diag(np.square(np.concatenate([sigmas, _COMMON_SIGMAS_PX, [relief_m]])))
+        covariance = np.diag(np.square(np.concatenate([sigmas, common_sigmas_px(sun_elevation_deg), [relief_m]])))
         return cls(
             0.0, position_m, velocity_mps, rotation_site_from_body, none, none,
             np.zeros(5), 0.0, np.zeros(0, int), np.zeros((0, 2)), covariance,

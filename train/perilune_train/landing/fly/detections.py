@@ -1,7 +1,6 @@
 """Crater detections in the frames of a descent, from the network of a run, a user's function or a table."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.tables.columns import Kind
 from perilune_shared.storage.tables.limits import DETECTIONS
 from perilune_shared.storage.tables.read import read_table
+from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.images.predict import above
@@ -21,6 +21,7 @@ from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.landing.craters.sightings import MAX_SIGHTINGS
 from perilune_train.training.runs import RunFolder
 
 Detect = Callable[[Path], Detections]
@@ -30,9 +31,11 @@ Detector = Callable[[NDArray[np.uint8]], ArrayLike | Any]
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 _COLUMNS: dict[str, Kind] = {"image": "text", **dict.fromkeys((*_BOX, "score"), "number")}
 _ROW = ("x", "y", "width", "height", "score")
+_SCALES, _TILE_PX = (1.0, 2.0), 512
+"""Factors by which frames are resized, and the side of a tile: a frame of 256 px at scale 2 is one tile."""
 _FAR_PX = 1e6
 """Largest coordinate of a box, pixels."""
-_MOST_PER_FRAME = 10_000
+_MAX_PER_FRAME = 10_000
 """Maximum number of craters in a frame. Matching needs only a few dozen."""
 
 
@@ -40,11 +43,22 @@ class UnreadableFrame(UserError):
     """An image cannot be decoded. The flight continues without craters from this frame."""
 
 
+def flight_config(run: Path) -> DetectConfig:
+    """The settings of a detect run, with the scales at which the filter needs detections.
+
+    At scale 2 the detector finds two to four times as many craters, and their centres are more accurate. Where the
+    catalogue lacks the largest craters of the frame, these small ones carry the fix.
+    """
+    config = config_of_run(run)
+    evaluation = config.evaluation.model_copy(update={"scales": _SCALES, "max_detections": MAX_SIGHTINGS})
+    return config.model_copy(update={"evaluation": evaluation})
+
+
 def by_network(run: Path) -> Detect:
     """Detect craters with the network of a detect run, at the threshold that the run chose."""
-    config, threshold = config_of_run(run), chosen_threshold(run)
+    config, threshold = flight_config(run), chosen_threshold(run)
     detector = open_detector(RunFolder(run).best, config)
-    tiling = replace(Tiling(), scales=tuple(config.evaluation.scales))
+    tiling = Tiling(_TILE_PX, scales=_SCALES)
     return lambda path: above(detect_image(detector, _grey(path), tiling, lambda n: None), threshold)
 
 
@@ -132,5 +146,5 @@ def _checked(found: Any, path: Path) -> Detections:
 
 
 def _check_count(where: object, name: str, count: int) -> None:
-    if count > _MOST_PER_FRAME:
-        raise UserError(where, name, f"{count} craters", f"at most {_MOST_PER_FRAME} in a frame")
+    if count > _MAX_PER_FRAME:
+        raise UserError(where, name, f"{count} craters", f"at most {_MAX_PER_FRAME} in a frame")

@@ -75,6 +75,9 @@ class FlightPrior(Section):
     """Standard deviation of a crater's position in the catalogue on each axis."""
     catalogue_diameter_sigma_share: _Share = 0.03
     """Standard deviation of a crater's diameter in the catalogue, divided by the diameter."""
+    sun_elevation_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    """Elevation of the Sun above the site, degrees; the detector errs more under a high Sun, which is assumed if this
+    is absent."""
     site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     """Latitude of the origin of O_L, degrees, for a catalogue in latitude and longitude."""
     site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
@@ -119,6 +122,7 @@ class FlightPrior(Section):
             camera_from_site.T @ rotation_camera_from_body,
             start_sigmas(self.position_sigma_m, self.velocity_sigma_mps, self.attitude_sigma_deg, self.unit),
             self.relief_m,
+            self.sun_elevation_deg,
         )
 
 

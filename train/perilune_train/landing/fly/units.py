@@ -18,9 +18,9 @@ from perilune_shared.geometry.inertial_grades import STANDARD_GRAVITY_MPS2
 from perilune_train.landing.filter.propagate import Increments
 from perilune_train.landing.filter.state import State
 
-_MOST_STEPS = 400
+_MAX_STEPS = 400
 """Measurements are merged into at most this many steps, which are enough for a check."""
-_LEAST_FORCE, _MOST_FORCE = 0.3, 4.0
+_MIN_FORCE, _MAX_FORCE = 0.3, 4.0
 """Range of the mean upward specific force of a powered descent, in units of the Moon's gravity."""
 _LARGEST_RATE_RADPS = 1.0
 _STEADY_RATE_RADPS = 0.03
@@ -77,7 +77,7 @@ class _Path:
 
     @property
     def has_force(self) -> bool:
-        return _LEAST_FORCE <= self.force_mps2 / _MOON_MPS2 <= _MOST_FORCE
+        return _MIN_FORCE <= self.force_mps2 / _MOON_MPS2 <= _MAX_FORCE
 
     @property
     def is_over_ground(self) -> bool:
@@ -154,12 +154,12 @@ def _better(steps: Increments, prior: Prior, *, is_unsteady: bool) -> Iterator[s
 
 
 def _joined(measured: Increments, start_s: float, end_s: float) -> Increments | None:
-    """The measurements between two times, merged into at most _MOST_STEPS steps; None if there are no measurements."""
+    """The measurements between two times, merged into at most _MAX_STEPS steps; None if there are no measurements."""
     first, behind = np.searchsorted(measured.time_s, [start_s, end_s], side="right")
     if first >= behind:
         return None
     measured = measured.part(slice(int(first), int(behind)))
-    starts = np.unique(np.linspace(0, len(measured), min(len(measured), _MOST_STEPS), endpoint=False).astype(int))
+    starts = np.unique(np.linspace(0, len(measured), min(len(measured), _MAX_STEPS), endpoint=False).astype(int))
     weight = measured.interval_s
     total = np.add.reduceat(weight, starts)
     rate, force = (

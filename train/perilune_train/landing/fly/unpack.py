@@ -14,7 +14,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion, quate
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.storage.files import new_folder
 from perilune_train.landing.craters.catalogue import (
-    LEAST_DIAMETER_M,
+    MIN_DIAMETER_M,
     Catalogue,
     CatalogueErrors,
     exact_catalogue,
@@ -61,7 +61,7 @@ def unpack_descent(
         expected = f"inertial measurements of grade {grade}; render the dataset with dataset.nav.inertial"
         raise UserError(dataset.store, "inertial", f"none of {'/'.join(ids)}", expected)
     rng = np.random.default_rng(seed)
-    catalogue = exact_catalogue(dataset, ids[0], LEAST_DIAMETER_M)
+    catalogue = exact_catalogue(dataset, ids[0], MIN_DIAMETER_M)
     if not exact:
         catalogue = with_errors(catalogue, CatalogueErrors(), rng)
     with new_folder(out) as folder:
@@ -77,7 +77,9 @@ def unpack_descent(
         write_csv(pd.DataFrame(measured), folder / "imu.csv")
         ranges = dataset.table("ranges", list(RANGE_COLUMNS), *ids).to_pandas().sort_values("time_s")
         write_csv(ranges, folder / "ranges.csv")
+        sun_elevation_deg = dataset.table("scenes", ["sun_elevation_deg"], ids[0])["sun_elevation_deg"][0].as_py()
         prior = _prior(frames, np.array(dataset.info.camera.rotation_camera_from_body), grade, catalogue, offset, rng)
+        prior["sun_elevation_deg"] = sun_elevation_deg
         (folder / "prior.yaml").write_text(to_yaml_text(prior), encoding="utf-8")
         poses = np.column_stack([frames[name].to_pylist() for name in ("time_s", "position_m", "rotation_wxyz")])
         write_csv(pd.DataFrame(poses, columns=list(TRUTH_COLUMNS)), folder / "truth.csv")

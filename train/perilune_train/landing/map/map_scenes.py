@@ -40,7 +40,7 @@ TILING = Tiling(scales=(1.0, 0.5, 0.25, 0.125))
 _DIAMETER_SIGMA_SHARE = 0.12
 """Standard deviation of a mapped diameter as a share of the diameter, measured on validation scenes of `shipped-nav`
 for craters of 3 to 20 m."""
-_LEAST_SIGMA_M = 0.05
+_MIN_SIGMA_M = 0.05
 _WINDOW_PX = 1000
 _BOTH, _ONE = (227, 211, 25), (60, 60, 230)
 """Cyan and red, in OpenCV's channel order (blue, green, red)."""
@@ -113,7 +113,7 @@ def _scene_map(
         raise UserError(dataset.store, f"{scene_id}: craters in both images", 0, "at least one")
     chosen = chosen[np.argsort(-both.radius_m[chosen], kind="stable")]
     level = np.tile([0.0, 0.0, 1.0], (len(chosen), 1))
-    sigma = max(_LEAST_SIGMA_M, float(np.median(np.abs(both.apart_m[chosen]))) * 1.4826 / 2)
+    sigma = max(_MIN_SIGMA_M, float(np.median(np.abs(both.apart_m[chosen]))) * 1.4826 / 2)
     catalogue = Catalogue(both.centre_m[chosen], level, both.radius_m[chosen], sigma, _DIAMETER_SIGMA_SHARE)
     covered = np.abs(catalogue.centre_m[:, :2]).max(axis=0)
     errors = measured(catalogue, exact_catalogue(dataset, scene_id, DIAMETERS_M[0] / 2), covered)

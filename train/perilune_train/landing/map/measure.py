@@ -12,7 +12,7 @@ from perilune_train.landing.craters.catalogue import Catalogue
 DIAMETERS_M = (3.0, 5.0, 7.0, 10.0, 20.0, 40.0, 100.0, np.inf)
 """Limits of the diameter bins, metres."""
 _CANDIDATES = 12
-_MOST_APART = 0.8
+_MAX_APART = 0.8
 """Largest cost of a match between a mapped and a true crater. The cost is their distance in radii of the mapped crater
 plus twice the absolute difference of the logarithms of the radii."""
 
@@ -29,7 +29,7 @@ def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFr
     by_size = np.log(mapped.radius_m[:, None] / exact.radius_m[index])
     cost = distance_m / mapped.radius_m[:, None] + 2 * np.abs(by_size)
     rows, best = np.arange(len(mapped)), cost.argmin(axis=1)
-    nearest, by_size, true = index[rows, best], by_size[rows, best], cost[rows, best] < _MOST_APART
+    nearest, by_size, true = index[rows, best], by_size[rows, best], cost[rows, best] < _MAX_APART
     error_m = mapped.centre_m - exact.centre_m[nearest]
     is_found = np.zeros(len(exact), bool)
     is_found[nearest[true]] = True

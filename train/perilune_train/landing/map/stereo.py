@@ -17,7 +17,7 @@ _CLASSES_PX = (30.0, 12.0, 5.0, 0.0)
 next."""
 _RELIEF_M = 30.0
 """Standard deviation of heights, metres, assumed before any crater is matched."""
-_LEAST_RELIEF_M = 1.0
+_MIN_RELIEF_M = 1.0
 _SIZE_SIGMA = 0.15
 """Standard deviation of the logarithm of the ratio between two measured radii of one crater."""
 _GATE = 3.0
@@ -188,7 +188,7 @@ def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
     position = start[0][:2] + rays[0][:, :2] * (start[0][2] - height)[:, None]
     raw = Ground(position, height)
     off = height - raw.at(position, without_nearest=True)
-    sigma = max(1.4826 * float(np.median(np.abs(off))), _LEAST_RELIEF_M) if len(off) > _NEIGHBOURS else _RELIEF_M
+    sigma = max(1.4826 * float(np.median(np.abs(off))), _MIN_RELIEF_M) if len(off) > _NEIGHBOURS else _RELIEF_M
     good = np.abs(off) < 4 * sigma
     kept = Ground(position[good], height[good], sigma)
     return Ground(position, np.where(good, height, kept.at(position)), sigma)

@@ -9,7 +9,7 @@ import pandas as pd
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_train.landing.craters.catalogue import (
-    LEAST_DIAMETER_M,
+    MIN_DIAMETER_M,
     Catalogue,
     CatalogueErrors,
     exact_catalogue,
@@ -37,7 +37,7 @@ class Catalogues:
 
 def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, Catalogue]) -> Catalogues:
     """The catalogues of the given scenes. Raises UserError if the map lacks one of them."""
-    exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in scene_ids}
+    exact = {scene: exact_catalogue(dataset, scene, MIN_DIAMETER_M) for scene in scene_ids}
     rough = {
         scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(number))
         for number, scene in enumerate(scene_ids)

@@ -111,7 +111,8 @@ def lander_of(
     error = start.error
     pose = descent.true[0].changed(np.concatenate([error[:3], rotation_camera_from_body @ error[6:]]))
     attitude = pose.rotation_camera_from_site.T @ rotation_camera_from_body
-    state = State.starting(pose.position_m, descent.velocity_mps + error[3:6], attitude, start.sigmas, RELIEF_M)
+    velocity_mps = descent.velocity_mps + error[3:6]
+    state = State.starting(pose.position_m, velocity_mps, attitude, start.sigmas, RELIEF_M, descent.sun_elevation_deg)
     surroundings = Surroundings(descent.camera, rotation_camera_from_body, catalogue, RANGE_SIGMA_M, RELIEF_M)
     return Lander(state, InertialNoise.of(GRADES[start.grade]), surroundings, keep_poses=smooth)
 

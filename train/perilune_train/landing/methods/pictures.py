@@ -17,7 +17,7 @@ from perilune_train.landing.methods.flights import BAND
 from perilune_train.landing.methods.seen import SeenDescent
 from perilune_train.records.pictures import save_figure
 
-_MOST_DESCENTS = 8
+_MAX_DESCENTS = 8
 _ALTITUDES_M = np.array([200, 300, 400, 600, 800, 1000, 1300, 1600])
 _ENLARGED = 4
 
@@ -52,7 +52,7 @@ def draw_by_altitude(path: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 def draw_flights(path: Path, flown: pd.DataFrame) -> None:
     """Draw the errors of the filter along at most eight descents, with bands of three standard deviations."""
-    groups = list(flown.groupby(["scene_id", "trajectory_id"]))[:_MOST_DESCENTS]
+    groups = list(flown.groupby(["scene_id", "trajectory_id"]))[:_MAX_DESCENTS]
     figure = Figure(figsize=(14, 2.2 * len(groups) + 0.6), layout="constrained")
     axes = figure.subplots(len(groups), 3, squeeze=False, sharex=True)
     for row, (ids, flight) in zip(axes, groups, strict=True):

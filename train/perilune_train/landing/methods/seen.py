@@ -10,12 +10,13 @@ from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_at_scales
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.fly.detections import flight_config
 from perilune_train.motion.data.trajectories import Trajectory
 from perilune_train.training.runs import RunFolder
 
@@ -40,11 +41,15 @@ class SeenDescent:
     """Attitude (3, 3) of the camera when the lander is level with heading 0."""
     sightings: list[Sightings]
     """Detected craters of each frame (n)."""
+    sun_elevation_deg: float | None = None
+    """Elevation of the Sun above the site, degrees; None if it is unknown."""
 
 
 def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
     """Descents with the craters that the detector of a run finds, and the detection time, seconds per frame."""
-    detector, threshold = open_detector(RunFolder(run).best, config_of_run(run)), chosen_threshold(run)
+    detector, threshold = open_detector(RunFolder(run).best, flight_config(run)), chosen_threshold(run)
+    scenes = dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist()
+    sun_elevation_deg = {row["scene_id"]: row["sun_elevation_deg"] for row in scenes}
     descents, seconds = [], 0.0
     n_frames = sum(len(trajectory.images) for trajectory in trajectories)
     with progress_bar() as progress:
@@ -65,6 +70,15 @@ def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -
             first = np.array(rows["velocity_mps"][0].as_py())
             level = trajectory.nominal_rotation_camera_from_site
             descents.append(
-                SeenDescent(trajectory.ids, trajectory.camera, rows["time_s"].to_numpy(), true, first, level, sightings)
+                SeenDescent(
+                    trajectory.ids,
+                    trajectory.camera,
+                    rows["time_s"].to_numpy(),
+                    true,
+                    first,
+                    level,
+                    sightings,
+                    sun_elevation_deg[trajectory.ids[0]],
+                )
             )
     return descents, seconds / n_frames

@@ -22,7 +22,7 @@ from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_shared.threads import usable_cores
 from perilune_train.landing.craters.catalogue import (
-    LEAST_DIAMETER_M,
+    MIN_DIAMETER_M,
     Catalogue,
     CatalogueErrors,
     exact_catalogue,
@@ -118,7 +118,7 @@ def sites_of(dataset: Dataset, split: str, detector: Path, address: Address) -> 
     references = {trajectory.ids: _reference(dataset, trajectory.ids, address) for trajectory in trajectories}
     descents, _ = seen_descents(dataset, trajectories, detector)
     exact = {
-        scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {descent.ids[0] for descent in descents}
+        scene: exact_catalogue(dataset, scene, MIN_DIAMETER_M) for scene in {descent.ids[0] for descent in descents}
     }
     return [Site(descent, references[descent.ids], exact[descent.ids[0]]) for descent in descents]
 

@@ -32,7 +32,7 @@ _CAPTIONS = {
     "errors.png": "Position error over all draws: median, 95th percentile, maximum; dashed: median stated 3 sigma",
     "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is correct",
 }
-_MOST_COLUMNS = 3
+_MAX_COLUMNS = 3
 _QUANTILES = (0.5, 0.95, 1.0)
 
 
@@ -135,7 +135,7 @@ def draw_consistency(path: Path, rows: pd.DataFrame) -> None:
 
 
 def _panels(count: int):
-    n_columns = min(count, _MOST_COLUMNS)
+    n_columns = min(count, _MAX_COLUMNS)
     n_rows = -(-count // n_columns)
     figure = Figure(figsize=(max(5 * n_columns, 8), 3.2 * n_rows + 0.6), layout="constrained")
     axes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()

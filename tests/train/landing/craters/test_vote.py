@@ -1,0 +1,76 @@
+"""Search by votes, and the support of a pose."""
+
+import numpy as np
+import pytest
+from tests.train.landing.craters.crater_world import CAMERA, nearby, pose, sighted, world
+
+from perilune_train.landing.craters.catalogue import CatalogueErrors, with_errors
+from perilune_train.landing.craters.fix import PosePrior, refine
+from perilune_train.landing.craters.locate import locate
+from perilune_train.landing.craters.sightings import Sightings
+from perilune_train.landing.craters.vote import SearchRange, candidates, support
+
+WORLD = world()
+CATALOGUE = with_errors(WORLD, CatalogueErrors(), np.random.default_rng(9))
+SMALL = CATALOGUE.part(CATALOGUE.radius_m < 12)
+"""Without the craters that are the largest of a frame, as over an elevation model."""
+
+
+@pytest.mark.parametrize("altitude_m", [600.0, 1000.0, 1400.0])
+@pytest.mark.parametrize("catalogue", [CATALOGUE, SMALL], ids=["all", "small"])
+def test_a_pose_is_found_with_and_without_the_largest_craters(catalogue, altitude_m):
+    sigma = np.array([100.0] * 3 + [np.radians(1.0)] * 3)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        true = pose(rng, altitude_m, heading_rad=0.0)
+        seen = sighted(WORLD, true, rng, most=500)
+        prior = PosePrior(true.changed(sigma * rng.normal(size=6)), np.diag(sigma**2))
+        located = locate(seen, catalogue, CAMERA, prior)
+        assert located is not None and located.searched
+        assert np.linalg.norm(located.fix.pose.position_m - true.position_m) * CAMERA.fx_px / altitude_m < 5
+
+
+def test_candidates_contain_shift_altitude_and_heading():
+    rng = np.random.default_rng(2)
+    true = pose(rng, 900.0, tilt_deg=0.0, heading_rad=0.3)
+    seen = sighted(WORLD, true, rng, most=300)
+    turned = np.concatenate([[30.0, -50.0, 80.0], np.radians([0.0, 0.0, 5.0])])
+    poses = candidates(
+        seen, CATALOGUE, CAMERA, true.changed(turned), 0.0, SearchRange(60.0, (-0.2, 0.2), np.radians(8))
+    )
+    distance_m = [np.linalg.norm(found.position_m - true.position_m) for found in poses]
+    assert len(poses) == 8 and distance_m[0] < 30
+
+
+def test_support_is_large_at_the_true_pose_and_chance_elsewhere():
+    rng = np.random.default_rng(3)
+    true = pose(rng, 900.0)
+    seen = sighted(WORLD, true, rng, most=300)
+    assert support(seen, CATALOGUE, CAMERA, true).sigmas > 30
+    shifted = [
+        support(seen, CATALOGUE, CAMERA, true.changed(np.r_[x, y, 0, 0, 0, 0])) for x in (-90, 70) for y in (60, -80)
+    ]
+    assert all(agreed.sigmas < 5 for agreed in shifted)
+    assert support(Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0)), CATALOGUE, CAMERA, true).n_agreed == 0
+
+
+def test_dense_craters_do_not_pull_a_fix_away():
+    """From the true pose, and from an error of 5 px; with twice as many craters as sightings."""
+    dense = world(seed=3, least_m=6.0, per_m2=0.15)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        true = pose(rng, 1200.0)
+        seen = sighted(dense, true, rng, found_share=0.5, false_share=0.6, most=300)
+        for shift_m in (0.0, 18.0):
+            prior = nearby(true, [shift_m, -shift_m, 0.0], [0, 0, 0.2])
+            fix = refine(seen, dense, CAMERA, prior, prior.pose)
+            assert np.linalg.norm(fix.pose.position_m - true.position_m) * CAMERA.fx_px / 1200 < 3
+
+
+@pytest.mark.parametrize("height_m", [-500.0, 0.0, 30.0, 1e6])
+def test_an_absurd_prior_takes_bounded_memory(height_m):
+    rng = np.random.default_rng(4)
+    true = pose(rng, 300.0)
+    seen = sighted(WORLD, true, rng)
+    off = true.changed(np.r_[0, 0, height_m - 300.0, 0, 0, 0])
+    locate(seen, CATALOGUE, CAMERA, PosePrior(off, np.diag(np.square([1000.0] * 3 + [1.0] * 3))))

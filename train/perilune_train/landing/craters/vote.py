@@ -1,0 +1,279 @@
+"""Search for a pose near an expected one, by votes of all pairs of a sighting and a crater of similar size.
+
+An error of the expected pose shifts, scales and turns the image of the catalogue. For each altitude and heading of a
+grid, every pair votes for the shift that maps its crater onto its sighting. The correct pairs vote for one shift, and
+all other pairs spread over the whole range. No single crater has to be both detected and in the catalogue, so the
+search also works where the largest sightings have no counterpart in the catalogue.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_train.compiled import compiled
+from perilune_train.landing.craters.catalogue import Catalogue
+from perilune_train.landing.craters.projection import Pose, projected
+from perilune_train.landing.craters.sightings import Sightings
+
+_BIN_PX, _STEP = 1.5, 0.03
+"""Size of a bin, pixels, and step of the logarithm of the altitude and of the heading, radians. Half a step moves the
+corner of a frame of 256 px by 2.7 px; votes are summed over three bins, 4.5 px."""
+_WIDE_RAD, _COARSER, _MAX_BINS = 0.5, 2.0, 100
+"""Searches over a larger range of headings than this use bins and steps that are coarser by this factor. Searches over
+larger shifts use at most this number of bins on each side of zero, unless a bin would be more than twice as large."""
+_MAX_SHIFT_PX = 2000.0
+"""Larger shifts are not searched. This limits memory and time if the expected altitude is wrong."""
+_SIZE_TOLERANCE = 0.35
+"""Largest difference of the logarithms of the radii of a pair that votes."""
+_MAX_PAIRS, _MIN_VOTERS = 200_000, 120
+"""Sightings of the rarest sizes vote: as many as have this number of pairs altogether, but at least this number."""
+_N_PEAKS = 8
+"""Number of candidates that a search returns."""
+_APART_PX = 6.0
+"""Candidates at one altitude and heading are at least this far apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchRange:
+    """Largest differences between the expected pose and the true pose."""
+
+    shift_px: float
+    """Shift of the image along each axis, pixels."""
+    log_altitude: tuple[float, float]
+    """Smallest and largest logarithm of the altitude divided by the expected altitude."""
+    heading_rad: float
+    """Heading, radians; pi if it is unknown."""
+
+
+def candidates(
+    sightings: Sightings,
+    catalogue: Catalogue,
+    camera: Camera,
+    expected: Pose,
+    ground_m: float,
+    limits: SearchRange,
+) -> list[Pose]:
+    """At most eight poses with the most significant peaks of votes, most significant first.
+
+    `ground_m` is the height of the ground below. The shift of the image becomes a horizontal displacement of the
+    camera. The tilt of `expected` stays.
+    """
+    range_px = min(limits.shift_px, _MAX_SHIFT_PX)
+    coarser = float(np.clip(range_px / _BIN_PX / _MAX_BINS, 1.0, 2.0))
+    coarser *= _COARSER if limits.heading_rad > _WIDE_RAD else 1.0
+    bin_px, step = coarser * _BIN_PX, coarser * _STEP
+    low, high = limits.log_altitude
+    log_altitudes = np.linspace(low, high, 1 + int(np.ceil((high - low) / step)))
+    n_headings = 1 + 2 * int(np.ceil(limits.heading_rad / step))
+    headings = np.linspace(-limits.heading_rad, limits.heading_rad, n_headings)
+    size = np.log(sightings.radius_px)
+    altitude_m = float(expected.position_m[2]) - ground_m
+    reach = max(1, int(np.ceil(range_px / bin_px)))
+    smallest_px = float(np.exp(size.min() - _SIZE_TOLERANCE)) if len(size) else 1.0
+    peaks: list[tuple[float, float, float, float, float]] = []
+    for log_altitude in log_altitudes:
+        higher = altitude_m * (np.exp(log_altitude) - 1)
+        pose = Pose(expected.position_m + np.array([0.0, 0.0, higher]), expected.rotation_camera_from_site)
+        view = projected(catalogue, camera, pose, range_px, smallest_px)
+        order = np.argsort(view.radius_px)
+        known_size = np.log(view.radius_px[order])
+        first = np.searchsorted(known_size, size - _SIZE_TOLERANCE)
+        last = np.searchsorted(known_size, size + _SIZE_TOLERANCE)
+        voters = _rarest(last - first)
+        middle = np.array([camera.cx_px, camera.cy_px])
+        shifts = _peaks(
+            sightings.centre_px[voters] - middle,
+            view.centre_px[order] - middle,
+            first[voters],
+            last[voters],
+            headings,
+            (bin_px, reach),
+        )
+        peaks += [
+            (significance, log_altitude, heading, right, down) for significance, heading, right, down in shifts.tolist()
+        ]
+    best: list[tuple[float, float, float, float, float]] = []
+    for peak in sorted(peaks, reverse=True):
+        if all(_differ(peak, better, 2.5 * step) for better in best):
+            best.append(peak)
+        if len(best) == _N_PEAKS:
+            break
+    return [_pose_of(peak, expected, altitude_m, camera) for peak in best]
+
+
+def _rarest(n_pairs: NDArray[np.integer]) -> NDArray[np.integer]:
+    """The sightings that vote, from the number of craters of similar size of each sighting (M,)."""
+    order = np.argsort(n_pairs, kind="stable")
+    enough = int(np.searchsorted(np.cumsum(n_pairs[order]), _MAX_PAIRS, side="right"))
+    return order[: max(enough, _MIN_VOTERS)]
+
+
+@compiled
+def _peaks(
+    seen_px: Array,
+    known_px: Array,
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    headings: Array,
+    grid: tuple[float, int],
+) -> Array:
+    """The two best peaks at each heading (2 H, 4): significance, heading, and shift to the right and down, pixels.
+
+    `seen_px` (M, 2) and `known_px` (N, 2) are relative to the principal point. Sighting i forms pairs with the craters
+    from `first[i]` to before `last[i]`. `grid` holds the size of a bin and the number of bins on each side of zero.
+    """
+    bin_px, reach = grid
+    side = 2 * reach + 1
+    peaks = np.zeros((2 * len(headings), 4))
+    votes = np.empty((side, side))
+    turned = np.empty_like(known_px)
+    for h in range(len(headings)):
+        cos, sin = np.cos(headings[h]), np.sin(headings[h])
+        for j in range(len(known_px)):
+            turned[j, 0] = cos * known_px[j, 0] - sin * known_px[j, 1]
+            turned[j, 1] = sin * known_px[j, 0] + cos * known_px[j, 1]
+        votes[:] = 0.0
+        n_votes = 0
+        for i in range(len(seen_px)):
+            for j in range(first[i], last[i]):
+                column = int(np.floor((seen_px[i, 0] - turned[j, 0]) / bin_px + reach + 0.5))
+                row = int(np.floor((seen_px[i, 1] - turned[j, 1]) / bin_px + reach + 0.5))
+                if 0 <= column < side and 0 <= row < side:
+                    votes[row, column] += 1.0
+                    n_votes += 1
+        expected = max(9.0 * n_votes / side**2, 0.5)
+        best, best_row, best_column = -1.0, 0, 0
+        second, second_row, second_column = -1.0, 0, 0
+        for row in range(side):
+            for column in range(side):
+                if votes[row, column] == 0.0:
+                    continue
+                count = 0.0
+                for r in range(max(row - 1, 0), min(row + 2, side)):
+                    for c in range(max(column - 1, 0), min(column + 2, side)):
+                        count += votes[r, c]
+                if count > best:
+                    if max(abs(row - best_row), abs(column - best_column)) > 3:
+                        second, second_row, second_column = best, best_row, best_column
+                    best, best_row, best_column = count, row, column
+                elif count > second and max(abs(row - best_row), abs(column - best_column)) > 3:
+                    second, second_row, second_column = count, row, column
+        for k in range(2):
+            count, row, column = (best, best_row, best_column) if k == 0 else (second, second_row, second_column)
+            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law.
+            peaks[2 * h + k, 0] = count * np.log(max(count, 1.0) / expected) - (count - expected)
+            peaks[2 * h + k, 1] = headings[h]
+            peaks[2 * h + k, 2] = (column - reach) * bin_px
+            peaks[2 * h + k, 3] = (row - reach) * bin_px
+    return peaks
+
+
+def _differ(first: tuple[float, ...], second: tuple[float, ...], near: float) -> bool:
+    """Whether two peaks are different poses, and not neighbours of one peak."""
+    turn = (first[2] - second[2] + np.pi) % (2 * np.pi) - np.pi
+    shift_px = max(abs(first[3] - second[3]), abs(first[4] - second[4]))
+    return shift_px > _APART_PX or abs(first[1] - second[1]) > near or abs(turn) > near
+
+
+def _pose_of(peak: tuple[float, ...], expected: Pose, altitude_m: float, camera: Camera) -> Pose:
+    """The pose of a peak: altitude, then heading about the optical axis, then a horizontal displacement."""
+    _, log_altitude, heading, right, down = peak
+    cos, sin = np.cos(heading), np.sin(heading)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    rotation = turn @ expected.rotation_camera_from_site
+    scaled_m = altitude_m * np.exp(log_altitude)
+    # The image moves opposite to the camera.
+    across = np.array([-right / camera.fx_px, -down / camera.fy_px, 0.0]) * scaled_m
+    position = expected.position_m + np.array([0.0, 0.0, scaled_m - altitude_m])
+    shift = rotation.T @ across
+    return Pose(position + shift * [1.0, 1.0, 0.0], rotation)
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """How many sightings agree with a pose, and how many would agree by chance."""
+
+    n_agreed: int
+    """Number of sightings near a crater of similar size."""
+    n_by_chance: float
+    """Mean of this number for displaced images of the catalogue."""
+    sigma_by_chance: float
+    """Standard deviation of this number for displaced images, at least 1."""
+
+    @property
+    def excess(self) -> float:
+        """Number of agreeing sightings beyond chance."""
+        return self.n_agreed - self.n_by_chance
+
+    @property
+    def sigmas(self) -> float:
+        """Excess in standard deviations of chance."""
+        return self.excess / self.sigma_by_chance
+
+
+_DISPLACED = np.array(
+    [
+        [radius * np.cos(angle), radius * np.sin(angle)]
+        for radius, phase in ((9.0, 0.0), (14.0, 0.4), (21.0, 0.8))
+        for angle in phase + np.arange(8) * np.pi / 4
+    ]
+)
+"""Displacements (24, 2), pixels, at which agreement is chance."""
+_AGREE_SIGMAS, _AGREE_SIZE = 2.5, 0.35
+"""Largest distance, in standard deviations, and largest difference of the logarithms of the radii of a sighting and a
+crater that agree."""
+
+
+def support(sightings: Sightings, catalogue: Catalogue, camera: Camera, pose: Pose) -> Support:
+    """Count the sightings that agree with a pose, and those that agree by chance near it."""
+    if not len(sightings):
+        return Support(0, 0.0, 1.0)
+    size = np.log(sightings.radius_px)
+    view = projected(catalogue, camera, pose, 30.0, float(np.exp(size.min() - _AGREE_SIZE)))
+    if not len(view.index):
+        return Support(0, 0.0, 1.0)
+    placed_px = camera.fx_px / float(np.median(view.depth_m)) * catalogue.position_sigma_m
+    reach_px = _AGREE_SIGMAS * np.sqrt(sightings.noise_px**2 + sightings.static_px**2 + placed_px**2)
+    order = np.argsort(view.centre_px[:, 0])
+    counts = _agreed(
+        sightings.centre_px,
+        size,
+        reach_px,
+        view.centre_px[order],
+        np.log(view.radius_px[order]),
+        np.concatenate([np.zeros((1, 2)), _DISPLACED]),
+        _AGREE_SIZE,
+    )
+    mean = float(counts[1:].mean())
+    return Support(int(counts[0]), mean, float(max(counts[1:].std(), np.sqrt(mean), 1.0)))
+
+
+@compiled
+def _agreed(
+    seen_px: Array,
+    seen_size: Array,
+    reach_px: Array,
+    known_px: Array,
+    known_size: Array,
+    displaced: Array,
+    size_tolerance: float,
+) -> NDArray[np.int64]:
+    """Number of sightings (D,) with a crater of similar size within reach, for each displacement (D, 2) of the craters.
+
+    The craters are sorted by their first coordinate.
+    """
+    counts = np.zeros(len(displaced), np.int64)
+    for d in range(len(displaced)):
+        for i in range(len(seen_px)):
+            x, y = seen_px[i, 0] - displaced[d, 0], seen_px[i, 1] - displaced[d, 1]
+            j = np.searchsorted(known_px[:, 0], x - reach_px[i])
+            while j < len(known_px) and known_px[j, 0] <= x + reach_px[i]:
+                apart = (known_px[j, 0] - x) ** 2 + (known_px[j, 1] - y) ** 2
+                if apart <= reach_px[i] ** 2 and abs(known_size[j] - seen_size[i]) <= size_tolerance:
+                    counts[d] += 1
+                    break
+                j += 1
+    return counts
