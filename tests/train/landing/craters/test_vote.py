@@ -8,7 +8,7 @@ from perilune_train.landing.craters.catalogue import CatalogueErrors, with_error
 from perilune_train.landing.craters.fix import PosePrior, refine
 from perilune_train.landing.craters.locate import locate
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.craters.vote import SearchRange, candidates, support
+from perilune_train.landing.craters.vote import QUICK, THOROUGH, SearchRange, candidates, support
 
 WORLD = world()
 CATALOGUE = with_errors(WORLD, CatalogueErrors(), np.random.default_rng(9))
@@ -30,16 +30,15 @@ def test_a_pose_is_found_with_and_without_the_largest_craters(catalogue, altitud
         assert np.linalg.norm(located.fix.pose.position_m - true.position_m) * CAMERA.fx_px / altitude_m < 5
 
 
-def test_candidates_contain_shift_altitude_and_heading():
+@pytest.mark.parametrize("effort", [QUICK, THOROUGH], ids=["quick", "thorough"])
+def test_candidates_contain_shift_altitude_and_heading(effort):
     rng = np.random.default_rng(2)
     true = pose(rng, 900.0, tilt_deg=0.0, heading_rad=0.3)
     seen = sighted(WORLD, true, rng, most=300)
-    turned = np.concatenate([[30.0, -50.0, 80.0], np.radians([0.0, 0.0, 5.0])])
-    poses = candidates(
-        seen, CATALOGUE, CAMERA, true.changed(turned), 0.0, SearchRange(60.0, (-0.2, 0.2), np.radians(8))
-    )
-    distance_m = [np.linalg.norm(found.position_m - true.position_m) for found in poses]
-    assert len(poses) == 8 and distance_m[0] < 30
+    expected = true.changed(np.concatenate([[30.0, -50.0, 80.0], np.radians([0.0, 0.0, 5.0])]))
+    limits = SearchRange(0.0, 60.0, (-0.2, 0.2), np.radians(8))
+    poses = candidates(seen, CATALOGUE, CAMERA, expected, limits, effort)
+    assert len(poses) == 8 and np.linalg.norm(poses[0].position_m - true.position_m) < 50
 
 
 def test_support_is_large_at_the_true_pose_and_chance_elsewhere():

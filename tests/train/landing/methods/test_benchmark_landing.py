@@ -40,10 +40,12 @@ def test_figures_are_those_of_the_frames(places, tmp_path):
     assert set(flown["scene_id"]) == {"benchmark-nav-highland/scene-0000"}
     right = frames[(frames["method"] == "fix") & (frames["error_px"] < 5)]
     assert figures["fix/right_share"] == pytest.approx(len(right) / (frames["method"] == "fix").sum())
+    assert figures["fix/same_frames/n_frames"] == len(right)
     page = (out / "benchmark.md").read_text(encoding="utf-8")
     assert "`benchmark-nav-highland`: all frames" in page
     assert "`benchmark-nav-mare`: **not scored**" in page
     assert "`filter, map`" not in page
+    assert "## Fixes and filter on the same frames" in page
     assert (out / "altitude.png").stat().st_size > 10_000
 
 

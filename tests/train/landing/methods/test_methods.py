@@ -9,6 +9,7 @@ from tests.helpers import in_process
 
 from perilune_shared.storage.files import sha256_of
 from perilune_train.cli.main import main
+from perilune_train.landing.methods.absolute import on_the_same_frames
 
 
 def methods(*arguments):
@@ -64,3 +65,15 @@ def test_mistakes_get_one_line(tmp_path):
         assert len(done.stderr.strip().splitlines()) == 1
         assert all(word in done.stderr for word in words)
         assert not (tmp_path / "out").exists()
+
+
+def test_fixes_and_filter_are_compared_on_equal_frames():
+    frames = {"scene_id": ["a"] * 4, "trajectory_id": ["t"] * 4}
+    fix = pd.DataFrame({**frames, "error_m": [3.0, np.nan, 4.0, 90.0], "error_px": [1.0, np.nan, 1.0, 30.0]})
+    flown = pd.DataFrame({**frames, "error_m": [1.0, 50.0, 5.0, 2.0]})
+    (compared,) = on_the_same_frames({"fix": fix, "filter": flown}).values()
+    assert compared["n_frames"] == 2
+    assert compared["fix_rmse_m"] == pytest.approx(np.sqrt((9 + 16) / 2))
+    assert compared["filter_rmse_m"] == pytest.approx(np.sqrt((1 + 25) / 2))
+    assert compared["filter_better_share"] == 0.75
+    assert on_the_same_frames({"fix": fix}) == {}

@@ -10,7 +10,7 @@ from perilune_train.landing.craters.fix import Fix, PosePrior, refine
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.search import Area, search
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.craters.vote import SearchRange, Support, candidates, support
+from perilune_train.landing.craters.vote import QUICK, THOROUGH, SearchRange, Support, candidates, support
 
 _NEAR_PX = 6.0
 """Largest standard deviation of the expected pose, in pixels on the ground, for which no search is needed."""
@@ -61,11 +61,12 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     heading_rad = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
     for factor in _REACHES:
         shift_px = factor * max(_SIGMAS * on_ground_px, 20.0)
-        limits = SearchRange(shift_px, log_altitude, heading_rad)
-        poses = candidates(sightings, catalogue, camera, prior.pose, ground_m, limits)
-        fix = _best(sightings, catalogue, camera, poses)
-        if fix is not None:
-            return Located(fix, searched=True)
+        limits = SearchRange(ground_m, shift_px, log_altitude, heading_rad)
+        for effort in (QUICK, THOROUGH):
+            poses = candidates(sightings, catalogue, camera, prior.pose, limits, effort)
+            fix = _best(sightings, catalogue, camera, poses)
+            if fix is not None:
+                return Located(fix, searched=True)
     return None
 
 
@@ -84,10 +85,9 @@ def lost_in_space(
         low, high = area.altitude_m
         middle_m = float(np.sqrt(low * high))
         middle = Pose(np.array([*area.centre_m, ground_m + middle_m]), rotation_camera_from_site)
-        limits = SearchRange(
-            area.reach_m / low * camera.fx_px, (np.log(low / middle_m), np.log(high / middle_m)), area.heading_rad
-        )
-        poses = candidates(sightings, catalogue, camera, middle, ground_m, limits)
+        log_altitude = np.log(low / middle_m), np.log(high / middle_m)
+        limits = SearchRange(ground_m, area.reach_m / low * camera.fx_px, log_altitude, area.heading_rad)
+        poses = candidates(sightings, catalogue, camera, middle, limits, THOROUGH)
         fix = _best(sightings, catalogue, camera, poses)
     return Located(fix, searched=True) if fix is not None else None
 

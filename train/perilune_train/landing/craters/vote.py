@@ -28,8 +28,8 @@ _MAX_SHIFT_PX = 2000.0
 """Larger shifts are not searched. This limits memory and time if the expected altitude is wrong."""
 _SIZE_TOLERANCE = 0.35
 """Largest difference of the logarithms of the radii of a pair that votes."""
-_MAX_PAIRS, _MIN_VOTERS = 200_000, 120
-"""Sightings of the rarest sizes vote: as many as have this number of pairs altogether, but at least this number."""
+_MIN_VOTERS = 120
+"""Smallest number of sightings that vote, if there are as many."""
 _N_PEAKS = 8
 """Number of candidates that a search returns."""
 _APART_PX = 6.0
@@ -37,9 +37,24 @@ _APART_PX = 6.0
 
 
 @dataclass(frozen=True, slots=True)
-class SearchRange:
-    """Largest differences between the expected pose and the true pose."""
+class Effort:
+    """How thorough a search is."""
 
+    coarser: float
+    """Factor of the bins and steps."""
+    max_pairs: int
+    """Sightings of the rarest sizes vote, as many as have this number of pairs altogether."""
+
+
+QUICK, THOROUGH = Effort(2.0, 40_000), Effort(1.0, 200_000)
+
+
+@dataclass(frozen=True, slots=True)
+class SearchRange:
+    """Height of the ground, and largest differences between the expected pose and the true pose."""
+
+    ground_m: float
+    """Height of the ground below the expected pose, metres, O_L."""
     shift_px: float
     """Shift of the image along each axis, pixels."""
     log_altitude: tuple[float, float]
@@ -53,24 +68,24 @@ def candidates(
     catalogue: Catalogue,
     camera: Camera,
     expected: Pose,
-    ground_m: float,
     limits: SearchRange,
+    effort: Effort,
 ) -> list[Pose]:
     """At most eight poses with the most significant peaks of votes, most significant first.
 
-    `ground_m` is the height of the ground below. The shift of the image becomes a horizontal displacement of the
+    The shift of the image becomes a horizontal displacement of the
     camera. The tilt of `expected` stays.
     """
     range_px = min(limits.shift_px, _MAX_SHIFT_PX)
     coarser = float(np.clip(range_px / _BIN_PX / _MAX_BINS, 1.0, 2.0))
-    coarser *= _COARSER if limits.heading_rad > _WIDE_RAD else 1.0
+    coarser = max(coarser, effort.coarser) * (_COARSER if limits.heading_rad > _WIDE_RAD else 1.0)
     bin_px, step = coarser * _BIN_PX, coarser * _STEP
     low, high = limits.log_altitude
     log_altitudes = np.linspace(low, high, 1 + int(np.ceil((high - low) / step)))
     n_headings = 1 + 2 * int(np.ceil(limits.heading_rad / step))
     headings = np.linspace(-limits.heading_rad, limits.heading_rad, n_headings)
     size = np.log(sightings.radius_px)
-    altitude_m = float(expected.position_m[2]) - ground_m
+    altitude_m = float(expected.position_m[2]) - limits.ground_m
     reach = max(1, int(np.ceil(range_px / bin_px)))
     smallest_px = float(np.exp(size.min() - _SIZE_TOLERANCE)) if len(size) else 1.0
     peaks: list[tuple[float, float, float, float, float]] = []
@@ -82,7 +97,7 @@ def candidates(
         known_size = np.log(view.radius_px[order])
         first = np.searchsorted(known_size, size - _SIZE_TOLERANCE)
         last = np.searchsorted(known_size, size + _SIZE_TOLERANCE)
-        voters = _rarest(last - first)
+        voters = _rarest(last - first, effort.max_pairs)
         middle = np.array([camera.cx_px, camera.cy_px])
         shifts = _peaks(
             sightings.centre_px[voters] - middle,
@@ -104,10 +119,10 @@ def candidates(
     return [_pose_of(peak, expected, altitude_m, camera) for peak in best]
 
 
-def _rarest(n_pairs: NDArray[np.integer]) -> NDArray[np.integer]:
+def _rarest(n_pairs: NDArray[np.integer], max_pairs: int) -> NDArray[np.integer]:
     """The sightings that vote, from the number of craters of similar size of each sighting (M,)."""
     order = np.argsort(n_pairs, kind="stable")
-    enough = int(np.searchsorted(np.cumsum(n_pairs[order]), _MAX_PAIRS, side="right"))
+    enough = int(np.searchsorted(np.cumsum(n_pairs[order]), max_pairs, side="right"))
     return order[: max(enough, _MIN_VOTERS)]
 
 

@@ -15,7 +15,7 @@ from perilune_train.landing.craters.catalogue import (
     exact_catalogue,
     with_errors,
 )
-from perilune_train.landing.methods.fixes import fix_summary, fixes_lost_in_space, fixes_near_a_prior
+from perilune_train.landing.methods.fixes import WRONG_PX, fix_summary, fixes_lost_in_space, fixes_near_a_prior
 from perilune_train.landing.methods.flights import flight_summary, flights
 from perilune_train.landing.methods.seen import SeenDescent
 
@@ -71,3 +71,36 @@ def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: C
 def absolute_summary(method: str, errors: pd.DataFrame) -> dict[str, float]:
     """Metrics of a method, from its table in `absolute_errors`."""
     return fix_summary(errors) if method.startswith(("fix", "lost")) else flight_summary(errors)
+
+
+def on_the_same_frames(errors: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, float]]:
+    """Compare fixes and filter on equal frames, one entry per kind of catalogue; keys are the methods of the fixes.
+
+    The rows of fixes contain correct fixes only, and fixes are rarely correct where frames are hard. So the RMSE of the
+    fixes and of the filter are comparable only on the frames with a correct fix. `filter_better_share` is the share of
+    all frames in which the filter's error is smaller; a frame without a fix counts for the filter.
+    """
+    compared = {}
+    for fix in ("fix", "fix, exact catalogue", "fix, map"):
+        flown = fix.replace("fix", "filter")
+        if fix not in errors or flown not in errors:
+            continue
+        # Both tables have one row per frame, in the order of time in each trajectory.
+        pair = _by_frame(errors[fix]).join(_by_frame(errors[flown])[["error_m"]], lsuffix="_fix", rsuffix="_filter", how="inner")
+        right = pair[pair["error_px"] < WRONG_PX]
+        worse = ~(pair["error_m_fix"] <= pair["error_m_filter"])
+        compared[fix] = {
+            "n_frames": float(len(right)),
+            "fix_rmse_m": float(np.sqrt(np.mean(np.square(right["error_m_fix"])))),
+            "filter_rmse_m": float(np.sqrt(np.mean(np.square(right["error_m_filter"])))),
+            "filter_better_share": float(worse.mean()),
+        }
+    return compared
+
+
+def _by_frame(table: pd.DataFrame) -> pd.DataFrame:
+    """The errors of a method, indexed by scene, trajectory and number of the frame."""
+    keys = ["scene_id", "trajectory_id"]
+    number = table.groupby(keys).cumcount()
+    columns = [name for name in ("error_m", "error_px") if name in table]
+    return table.assign(frame=number).set_index([*keys, "frame"])[columns]

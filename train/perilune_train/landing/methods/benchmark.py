@@ -10,9 +10,14 @@ from perilune_shared.export.foreign_text import code_span
 from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_train.landing.map.files import read_maps
-from perilune_train.landing.methods.absolute import absolute_errors, absolute_summary, catalogues_of
+from perilune_train.landing.methods.absolute import (
+    absolute_errors,
+    absolute_summary,
+    catalogues_of,
+    on_the_same_frames,
+)
 from perilune_train.landing.methods.fixes import WRONG_PX
-from perilune_train.landing.methods.page import COLUMNS_ABSOLUTE, cell
+from perilune_train.landing.methods.page import COLUMNS_ABSOLUTE, cell, same_frames_section
 from perilune_train.landing.methods.pictures import draw_by_altitude
 from perilune_train.landing.methods.seen import seen_descents
 from perilune_train.motion.data.trajectories import load_split
@@ -68,6 +73,8 @@ def score_landing(
             for region, rows in rows_of_method.groupby("region"):
                 summary = absolute_summary(method, rows)
                 figures |= {f"{method}/region/{region}/{key}": value for key, value in summary.items()}
+        for method, compared in on_the_same_frames(by_method).items():
+            figures |= {f"{method}/same_frames/{key}": value for key, value in compared.items()}
         frames.to_parquet(folder / FRAMES, index=False)
         draw_by_altitude(
             folder / PICTURE, {name: rows_of_method for name, rows_of_method in by_method.items() if "lost" not in name}
@@ -120,6 +127,7 @@ def _page(detector: Path, by_method: dict[str, pd.DataFrame], figures: Metrics) 
         rows.append([f"`{method}`", spread, *(cell(key, values.get(key, np.nan)) for key in used)])
     lines += [*table(["method", COLUMNS_ABSOLUTE[POSITION], *used.values()], rows), ""]
     lines += ["In brackets: 95 % intervals over scenes, or the value of each scene if there are fewer than five.", ""]
+    lines += same_frames_section(on_the_same_frames(by_method))
     regions = sorted({region for rows_of_method in by_method.values() for region in rows_of_method["region"]})
     for key, title in ((POSITION, "Position RMSE (m)"), ("position_end_rmse_m", "Position RMSE at the end (m)")):
         lines += [f"## {title} by region", ""]

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import open_single
+from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_shared.geometry.frames import Array
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import new_folder, write_text
@@ -14,7 +15,12 @@ from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import PosePrior
 from perilune_train.landing.craters.locate import locate
 from perilune_train.landing.map.files import read_maps
-from perilune_train.landing.methods.absolute import absolute_errors, absolute_summary, catalogues_of
+from perilune_train.landing.methods.absolute import (
+    absolute_errors,
+    absolute_summary,
+    catalogues_of,
+    on_the_same_frames,
+)
 from perilune_train.landing.methods.page import page_of
 from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
@@ -80,7 +86,8 @@ def fly_methods(
             draw_flights(folder / PICTURES[1], errors["filter"])
         _draw_matches(folder, trajectories[0], descents[0], catalogues.rough[descents[0].ids[0]])
         drawn = [name for name in PICTURES if (folder / name).is_file()]
-        write_markdown(folder / PAGE, page_of(dataset, split, rows, descents, detection_s, drawn))
+        source = f"Dataset {code_span(dataset.info.name)}, split {for_markdown(split)}"
+        write_markdown(folder / PAGE, page_of(source, rows, descents, detection_s, drawn, on_the_same_frames(errors)))
         for check in checks:
             mark_files(folder, (PAGE, TABLE, FRAMES, *drawn), str(check.metrics()["terrain/mark"]))
         write_text(folder / "inputs.json", json.dumps(hashes_of({"dataset": address, **best}), indent=2) + "\n")

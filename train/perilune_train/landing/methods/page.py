@@ -1,12 +1,10 @@
 """Write the page of all methods: what each method knows, its errors, and pictures."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_train.landing.methods.seen import SeenDescent
 from perilune_train.records.markdown import number, table
 
@@ -58,20 +56,19 @@ _CAPTIONS = {
 
 
 def page_of(
-    dataset: Dataset,
-    split: str,
+    source: str,
     rows: pd.DataFrame,
     descents: list[SeenDescent],
     detection_s: float,
     pictures: Sequence[str],
+    compared: Mapping[str, Mapping[str, float]],
 ) -> str:
-    """The results page as Markdown."""
+    """The results page as Markdown; `source` names the dataset and the split, as Markdown."""
     scenes = {descent.ids[0] for descent in descents}
     lines = [
         "# Navigation methods",
         "",
-        f"Dataset {code_span(dataset.info.name)}, split {for_markdown(split)}: "
-        f"{len(descents)} descents over {len(scenes)} scenes.",
+        f"{source}: {len(descents)} descents over {len(scenes)} scenes.",
         f"Detection takes {detection_s:.3f} s per frame, which every absolute method needs besides its own time.",
         "",
         "## Motion between consecutive frames",
@@ -87,10 +84,33 @@ def page_of(
         "Errors of the filter are those of all frames.",
         "",
         *_table(rows[rows["kind"] == "absolute"], COLUMNS_ABSOLUTE),
+        "",
+        *same_frames_section(compared),
     ]
     for name in pictures:
         lines += ["", f"![{_CAPTIONS[name]}]({name})", "", f"*{_CAPTIONS[name]}.*"]
     return "\n".join(lines) + "\n"
+
+
+def same_frames_section(compared: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """The lines that compare fixes and filter on equal frames, from `on_the_same_frames`."""
+    if not compared:
+        return []
+    titles = {
+        "n_frames": "frames with a right fix",
+        "fix_rmse_m": "RMSE of the fix (m)",
+        "filter_rmse_m": "RMSE of the filter (m)",
+        "filter_better_share": "filter better, share of all frames",
+    }
+    rows = [[f"`{method}`", *(cell(key, values[key]) for key in titles)] for method, values in compared.items()]
+    return [
+        "## Fixes and filter on the same frames",
+        "",
+        "A frame without a fix counts for the filter in the last column.",
+        "",
+        *table(["method", *titles.values()], rows),
+        "",
+    ]
 
 
 def _table(rows: pd.DataFrame, columns: dict[str, str]) -> list[str]:
