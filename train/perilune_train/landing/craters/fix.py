@@ -40,7 +40,8 @@ COMMON_PX = 0.08
 """Standard deviation, pixels, of the error that all centres in a frame share."""
 _MIN_SIZE_RATIO = 0.7
 """Radius of the smallest crater to match, as a share of the radius of the smallest sighting."""
-_MIN_MATCHES = 6
+MIN_MATCHES = 6
+"""Smallest number of sightings with which a fix is possible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ def refine(
         seen_circles = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
         expected_circles = Circles(expected.centre_px, np.log(expected.radius_px), placed_px)
         sighting, crater, error = matched(seen_circles, expected_circles, size_sigma**2, _GATE_SIGMAS)
-        if len(sighting) < _MIN_MATCHES:
+        if len(sighting) < MIN_MATCHES:
             return None
         centre_sigma = np.hypot(noise_px[sighting], placed_px[crater])
         weight, normal, gradient = _normal_equations(

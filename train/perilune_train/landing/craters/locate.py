@@ -6,7 +6,7 @@ import numpy as np
 
 from perilune_shared.geometry.camera import Camera
 from perilune_train.landing.craters.catalogue import Catalogue
-from perilune_train.landing.craters.fix import Fix, PosePrior, refine
+from perilune_train.landing.craters.fix import MIN_MATCHES, Fix, PosePrior, refine
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.search import Area, search
 from perilune_train.landing.craters.sightings import Sightings
@@ -19,10 +19,13 @@ _NEAR_SIGMAS, _SEARCH_SIGMAS, _SURE_SIGMAS = 5.0, 10.0, 30.0
 at the first candidate with the last support."""
 _AHEAD = 1.3
 """Smallest ratio between the support of the best and the second-best pose of a search."""
+_MAX_TILT_RAD = float(np.radians(5))
+"""A search knows the tilt to about a degree. Fixes with a tilt that differs by more than this are wrong: over level
+ground, a tilt has nearly the effect of a displacement, and some craters agree."""
 _SIGMAS = 3.5
-_REACHES = (1.0, 3.0)
-"""Search radii, tried in turn, as multiples of the radius that the prior suggests. The larger one is tried because the
-prior may be wrong."""
+_ATTEMPTS = ((1.0, QUICK), (1.0, THOROUGH), (3.0, QUICK))
+"""Searches, tried in turn: search radius, as a multiple of the radius that the prior suggests, and effort. The larger
+radius is tried because the prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
 _MIN_MARGIN = 0.06
@@ -45,6 +48,8 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     Searches if the expected pose is too uncertain or no fix is found near it. Returns None if too few sightings match,
     or if two poses explain them about equally well.
     """
+    if len(sightings) < MIN_MATCHES:
+        return None
     ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
     altitude_m = max(float(prior.pose.position_m[2] - ground_m), 1.0)
     sigma = np.sqrt(np.diag(prior.covariance))
@@ -59,14 +64,13 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     margin = max(_SIGMAS * float(sigma[2]) / altitude_m, _MIN_MARGIN)
     log_altitude = np.log(max(1 - margin, 0.2)), np.log(1 + margin)
     heading_rad = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
-    for factor in _REACHES:
+    for factor, effort in _ATTEMPTS:
         shift_px = factor * max(_SIGMAS * on_ground_px, 20.0)
         limits = SearchRange(ground_m, shift_px, log_altitude, heading_rad)
-        for effort in (QUICK, THOROUGH):
-            poses = candidates(sightings, catalogue, camera, prior.pose, limits, effort)
-            fix = _best(sightings, catalogue, camera, poses)
-            if fix is not None:
-                return Located(fix, searched=True)
+        poses = candidates(sightings, catalogue, camera, prior.pose, limits, effort)
+        fix = _best(sightings, catalogue, camera, poses)
+        if fix is not None:
+            return Located(fix, searched=True)
     return None
 
 
@@ -80,7 +84,7 @@ def lost_in_space(
     rotation_camera_from_site = prior.pose.rotation_camera_from_site
     hypotheses = search(sightings, catalogue, camera, rotation_camera_from_site, area)
     fix = _best(sightings, catalogue, camera, [hypothesis.pose for hypothesis in hypotheses])
-    if fix is None and len(sightings):
+    if fix is None and len(sightings) >= MIN_MATCHES:
         ground_m = catalogue.ground_m(area.centre_m, _NEAREST)
         low, high = area.altitude_m
         middle_m = float(np.sqrt(low * high))
@@ -97,7 +101,7 @@ def _best(sightings: Sightings, catalogue: Catalogue, camera: Camera, poses: lis
     fixes: list[tuple[Support, Fix]] = []
     for pose in poses:
         fix = refine(sightings, catalogue, camera, _around(pose), pose)
-        if fix is None:
+        if fix is None or _tilt(fix.pose, pose) > _MAX_TILT_RAD:
             continue
         agreed = support(sightings, catalogue, camera, fix.pose)
         if agreed.sigmas >= _SURE_SIGMAS:
@@ -111,6 +115,12 @@ def _best(sightings: Sightings, catalogue: Catalogue, camera: Camera, poses: lis
     if best.sigmas < _SEARCH_SIGMAS or best.excess < _AHEAD * max(others, default=0.0):
         return None
     return fix
+
+
+def _tilt(first: Pose, second: Pose) -> float:
+    """Angle between the optical axes of two poses, radians."""
+    cos = float(first.rotation_camera_from_site[2] @ second.rotation_camera_from_site[2])
+    return float(np.arccos(np.clip(cos, -1.0, 1.0)))
 
 
 def _same(first: Pose, second: Pose) -> bool:

@@ -21,7 +21,7 @@ from perilune_train.landing.craters.sightings import Sightings
 _BIN_PX, _STEP = 1.5, 0.03
 """Size of a bin, pixels, and step of the logarithm of the altitude and of the heading, radians. Half a step moves the
 corner of a frame of 256 px by 2.7 px; votes are summed over three bins, 4.5 px."""
-_WIDE_RAD, _COARSER, _MAX_BINS = 0.5, 2.0, 100
+_WIDE_RAD, _COARSER, _MAX_BINS = 0.5, 2.0, 400
 """Searches over a larger range of headings than this use bins and steps that are coarser by this factor. Searches over
 larger shifts use at most this number of bins on each side of zero, unless a bin would be more than twice as large."""
 _MAX_SHIFT_PX = 2000.0

@@ -86,7 +86,9 @@ def on_the_same_frames(errors: Mapping[str, pd.DataFrame]) -> dict[str, dict[str
         if fix not in errors or flown not in errors:
             continue
         # Both tables have one row per frame, in the order of time in each trajectory.
-        pair = _by_frame(errors[fix]).join(_by_frame(errors[flown])[["error_m"]], lsuffix="_fix", rsuffix="_filter", how="inner")
+        pair = _by_frame(errors[fix]).join(
+            _by_frame(errors[flown])[["error_m"]], lsuffix="_fix", rsuffix="_filter", how="inner"
+        )
         right = pair[pair["error_px"] < WRONG_PX]
         worse = ~(pair["error_m_fix"] <= pair["error_m_filter"])
         compared[fix] = {
