@@ -131,7 +131,7 @@ def causal(
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     if (nav_dataset is None) != (nav_counterfactual is None):
-        raise UserError("--nav-dataset", "datasets", "only one", "--nav-dataset and --nav-counterfactual together")
+        raise UserError("--nav-dataset", "", "only one", "--nav-dataset and --nav-counterfactual together")
     # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_folder, causal_run
     from perilune_train.training.begin import held

@@ -103,7 +103,7 @@ def test_boxes_can_get_a_margin(detector):
     plain, larger = (detect_image(blobs, image, Tiling(box_margin_px=margin)) for margin in (0.0, 1.5))
     assert len(plain.boxes) > 20
     assert larger.boxes == pytest.approx(plain.boxes + np.array([-1.5, -1.5, 1.5, 1.5]))
-    with pytest.raises(UserError, match=r"--box-margin: pixels: got -1, expected 0 to 10"):
+    with pytest.raises(UserError, match=r"--box-margin: got -1, expected 0 to 10"):
         Tiling(box_margin_px=-1).check()
 
 

@@ -63,7 +63,7 @@ def read_images(source: Path, request: Request = Request()) -> ImageSet:
     else:
         raise UserError(source, "--images", "no such folder", "a folder of images with labels, or a label file")
     if request.split is not None and not split:
-        raise UserError("--split", "split", request.split, f"a source with splits; {source.name} has none")
+        raise UserError("--split", "", request.split, f"a source with splits; {source.name} has none")
     if split:
         say(f"{source.name}: {split}")
     return replace(image_set(label_file, request.categories), split=split)

@@ -154,7 +154,7 @@ def choose_categories(
     known = ", ".join(names.values())
     for name, original in zip(asked, wanted, strict=True):
         if name not in {key.lower() for key in names} | {other.lower() for other in names.values()}:
-            raise UserError("--category", "name", original, f"one of {known}" if names else "a category of the labels")
+            raise UserError("--category", "", original, f"one of {known}" if names else "a category of the labels")
     among = asked or _CRATER_NAMES
     chosen = {key for key, name in names.items() if name.lower() in among or key.lower() in asked}
     if not chosen:
