@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import answer
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.images.find import load_detector
@@ -40,4 +41,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command_line(one_command(main))

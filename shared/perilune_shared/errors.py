@@ -33,7 +33,9 @@ class UserError(Exception):
         # These texts may come from untrusted files and have any length.
         self.where = shortened(where, 4200)
         self.field, self.found, self.expected = shortened(field), shortened(found), shortened(expected, 500)
-        place = f"{self.where}: {self.field}" if self.field else self.where
+        # A field may repeat its option: `--camera-axes` and `camera axes`.
+        repeated = self.where.startswith("--") and self.where[2:].replace("-", " ") == self.field
+        place = f"{self.where}: {self.field}" if self.field and not repeated else self.where
         super().__init__(one_line(f"{place}: got {self.found}, expected {self.expected}"))
 
     def __reduce__(self) -> tuple:

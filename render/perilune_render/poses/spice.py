@@ -253,7 +253,7 @@ def _fixed_frame(spice: Any, name: str | None) -> str:
 
 def _check_frame(spice: Any, option: str, name: str) -> None:
     if spice.namfrm(name) == 0:
-        raise UserError(option, "frame", name, "a frame that the kernels (FK) define")
+        raise UserError(option, "", name, "a frame that the kernels (FK) define")
 
 
 def _body(spice: Any, name: str) -> str:

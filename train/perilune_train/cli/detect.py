@@ -320,7 +320,7 @@ def predict(
         raise UserError("--min-score", "", min_score, "above 0, at most 1")
     for option, pixels in (("--min-radius-px", min_radius_px), ("--min-size", min_size)):
         if not 0 <= pixels < float("inf"):
-            raise UserError(option, "pixels", pixels, "at least 0")
+            raise UserError(option, "", pixels, "at least 0")
     if min_radius_px and min_size:
         raise UserError("--min-size", "options", "together with --min-radius-px", "only one of them")
     check_nodata(nodata)

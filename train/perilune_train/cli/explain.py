@@ -66,7 +66,7 @@ def explain(
     name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
     for given, option, other in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
         if given is not None and task == other:
-            raise UserError(option, "option", str(given), f"no {option} with --task {other}")
+            raise UserError(option, "", str(given), f"no {option} with --task {other}")
     if task != "navigate" and detector is None:
         run_folder = runs / "detect" / name
         detector = RunFolder(shipped_run("detect") if task == "detect" and not run_folder.is_dir() else run_folder).best
