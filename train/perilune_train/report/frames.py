@@ -21,9 +21,9 @@ from perilune_train.report.pictures import image_uri, png_uri
 
 MASKS_FILE = "masks_detect.npz"
 _MATCH_IOU = 0.5
-_MOST_FRAMES = 60
-_LARGEST_SIDE_PX = 512
-_LARGEST_MASKS_BYTES = 2**28
+_MAX_FRAMES = 60
+_MAX_SIDE_PX = 512
+_MAX_MASKS_BYTES = 2**28
 _KINDS = {FOUND: "matched", FALSE: "false"}
 
 
@@ -115,10 +115,10 @@ def labelled_frames(split: DetectSplit, found: list[Detections] | None, provenan
 
 def frame_uri(image: NDArray[np.uint8]) -> str:
     """A frame as a data URI: a lossless PNG up to 512 px; larger frames are reduced to 512 px, as WebP."""
-    if max(image.shape) <= _LARGEST_SIDE_PX:
+    if max(image.shape) <= _MAX_SIDE_PX:
         return _png(Image.fromarray(image))
     picture = Image.fromarray(image)
-    picture.thumbnail((_LARGEST_SIDE_PX, _LARGEST_SIDE_PX))
+    picture.thumbnail((_MAX_SIDE_PX, _MAX_SIDE_PX))
     return image_uri(picture)
 
 
@@ -137,8 +137,8 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
             raise UserError(masks, "frame_ids", first, "a test frame of the detection dataset")
         trajectory = facts_of(frames.split.frames).trajectory[names.index(first)]
     places = frames.places_of(trajectory)
-    if len(places) > _MOST_FRAMES:
-        places = [places[k] for k in np.linspace(0, len(places) - 1, _MOST_FRAMES).astype(int)]
+    if len(places) > _MAX_FRAMES:
+        places = [places[k] for k in np.linspace(0, len(places) - 1, _MAX_FRAMES).astype(int)]
     chosen = [names[place] for place in places]
     stacks = () if content is None else tuple(_stacks(content, chosen))
     sources = [frames.provenance, *([mask_provenance] if stacks and mask_provenance else [])]
@@ -153,8 +153,8 @@ def read_masks(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(item.file_size for item in archive.infolist())
-        if size > _LARGEST_MASKS_BYTES:
-            raise UserError(path, "size", f"{size} bytes", f"at most {_LARGEST_MASKS_BYTES} bytes")
+        if size > _MAX_MASKS_BYTES:
+            raise UserError(path, "size", f"{size} bytes", f"at most {_MAX_MASKS_BYTES} bytes")
         with np.load(path, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:

@@ -19,7 +19,7 @@ Kind = Literal["demo", "paper", "benchmark"]
 SCORE_FILE = "benchmark.json"
 INSTALLED = "-installed"
 """End of the folder name of an evaluation of the installed detector. This folder has no settings and no threshold."""
-LARGEST_JSON_BYTES = 16 * 2**20
+MAX_JSON_BYTES = 16 * 2**20
 """Largest size of a JSON file that is read, bytes."""
 
 
@@ -164,8 +164,8 @@ def provenance_of_dataset(dataset: Dataset) -> Provenance:
 
 def read_json(path: Path) -> Any:
     """Read a JSON file of a run. Raises UserError if it is damaged or too large."""
-    if path.stat().st_size > LARGEST_JSON_BYTES:
-        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_JSON_BYTES} bytes")
+    if path.stat().st_size > MAX_JSON_BYTES:
+        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {MAX_JSON_BYTES} bytes")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

@@ -21,7 +21,7 @@ import torch
 
 from perilune_shared.errors import UserError
 
-MOST_WEIGHT_BYTES, MOST_STATE_BYTES = 2 * 2**30, 12 * 2**30
+MAX_WEIGHT_BYTES, MAX_STATE_BYTES = 2 * 2**30, 12 * 2**30
 """Maximum sizes of a file of weights and of a training state. The weights of a network of width 2 take half of the
 first limit; a training state contains four tensors for each weight tensor."""
 _MAX_PICKLE_BYTES = 4_000_000
@@ -71,14 +71,14 @@ class _Storage:
     """Number of stored numbers."""
 
 
-def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
+def load_checked(path: Path, field: str, expected: str, max_bytes: int) -> Any:
     """Load a checkpoint on the CPU. Raises UserError on anything that perilune does not write.
 
-    Memory and time are bounded by the size of the file, which is at most `most_bytes`.
+    Memory and time are bounded by the size of the file, which is at most `max_bytes`.
     """
     size = path.stat().st_size
-    if size > most_bytes:
-        raise UserError(path, field, f"{size} bytes", f"at most {most_bytes}")
+    if size > max_bytes:
+        raise UserError(path, field, f"{size} bytes", f"at most {max_bytes}")
     with path.open("rb") as stream:
         try:
             _check(_read_records(stream, size))

@@ -11,10 +11,10 @@ from safetensors.torch import load, save
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
-from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
+from perilune_train.training.checkpoint_file import MAX_WEIGHT_BYTES
 
 SUFFIX = ".safetensors"
-_MOST_HEADER_BYTES = 8_000_000
+_MAX_HEADER_BYTES = 8_000_000
 _DTYPES = {"F16", "F32", "F64", "I64", "I32", "I8", "BOOL"}
 _STEP = "#step"
 """Suffix in the name of the tensor that holds the quantisation steps of an 8-bit tensor."""
@@ -129,7 +129,7 @@ def _check_header(path: Path, expected: str) -> None:
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = int.from_bytes(stream.read(8), "little")
-    if size > MOST_WEIGHT_BYTES:
-        raise UserError(path, "weights", f"{size} bytes", f"at most {MOST_WEIGHT_BYTES}")
-    if header > min(_MOST_HEADER_BYTES, size):
+    if size > MAX_WEIGHT_BYTES:
+        raise UserError(path, "weights", f"{size} bytes", f"at most {MAX_WEIGHT_BYTES}")
+    if header > min(_MAX_HEADER_BYTES, size):
         raise UserError(path, "weights", f"a header of {header} bytes", expected)

@@ -398,7 +398,7 @@ def test_label_files_that_two_pictures_share_are_refused(tmp_path):
 def test_large_and_deep_label_files_are_refused(tmp_path, monkeypatch):
     picture(tmp_path / "a.png")
     texts = sys.modules["perilune_train.detect.images.labels.texts"]
-    monkeypatch.setattr(texts, "_MOST_BRACKETS", 100)
+    monkeypatch.setattr(texts, "_MAX_BRACKETS", 100)
     written(tmp_path / "annotations.json", "[" + "[]," * 200 + "[]]")
     with pytest.raises(UserError, match="more than 100 lists and objects"):
         read_images(tmp_path)
