@@ -30,7 +30,7 @@ def usage_line(error: Any) -> str:
         return _got(name, "nothing", f"a value{_help_hint(error)}")
     if kind == "BadParameter" and name:
         return _got(name, *_wrong_value(error))
-    if kind == "BadOptionUsage":
+    if kind == "BadOptionUsage" and name:
         return _got(name, *(("a value", "none") if "not take" in error.message else ("nothing", "a value")))
     if unknown := re.match(r"No such command '(.*?)'\.", f"{error.message}."):
         return _unknown("command", unknown[1], list(getattr(command, "commands", ())), error)

@@ -35,7 +35,7 @@ Scales = Annotated[
     typer.Option(
         "--scale",
         help="Factor by which images are resized before detection. Repeatable; detections at all scales are merged."
-        " [default: those of the run]",
+        " [default: the run's scales]",
     ),
 ]
 TileSide = Annotated[
@@ -51,7 +51,7 @@ BoxMargin = Annotated[
 NoData = Annotated[
     float | None,
     typer.Option(
-        help="Value of pixels without data, if the files do not declare it. [default: found where it stands apart]"
+        help="Value of pixels without data, if the files do not declare it. [default: values far from all others]"
     ),
 ]
 Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels.")]
@@ -60,7 +60,7 @@ Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels
 def check_nodata(value: float | None) -> None:
     """Raise UserError if the value of pixels without data is not a finite number."""
     if value is not None and not abs(value) < float("inf"):
-        raise UserError("--nodata", "", value, "a finite number; others are always taken as no data")
+        raise UserError("--nodata", "", value, "a finite number; infinite values and NaN always count as no data")
 
 
 @app.command("train")
@@ -125,7 +125,7 @@ def evaluate(
         bool,
         typer.Option(
             "--choose-threshold",
-            help="Choose a new threshold on the validation split, for settings other than those of the run.",
+            help="Choose a new threshold on the validation split, for settings other than the run's.",
         ),
     ] = False,
     out: Annotated[
@@ -208,9 +208,9 @@ def evaluate(
         say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return
     if scale:
-        own = config.model_dump(mode="json")
-        own["evaluation"]["scales"] = scale
-        config = resolve_over(DetectConfig, "detect", "--scale", own)
+        values = config.model_dump(mode="json")
+        values["evaluation"]["scales"] = scale
+        config = resolve_over(DetectConfig, "detect", "--scale", values)
     # Importing torch takes seconds; check the settings first.
     from perilune_train.detect.evaluate_runs import evaluate_again
     from perilune_train.records.provenance import EvaluatedSplit
@@ -301,7 +301,7 @@ def predict(
     ] = 0.0,
     min_size: Annotated[float, typer.Option(help="Twice --min-radius-px: minimum sqrt(w h), pixels.")] = 0.0,
     top: Annotated[
-        int | None, typer.Option(min=1, help="Maximum number of craters in an image: those of the highest scores.")
+        int | None, typer.Option(min=1, help="Maximum number of craters in an image; the highest scores are kept.")
     ] = None,
     nodata: NoData = None,
     scale: Scales = None,

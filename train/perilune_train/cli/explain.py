@@ -157,5 +157,5 @@ def causal(
 
 def _chosen_gate(explained: Path) -> str:
     """The gate that an explain run chose on validation frames; without such a run B_11, the paper's first gate."""
-    found = read_metrics(explained).get("detect/strongest_gate") if (explained / METRICS_FILE).is_file() else None
-    return found if isinstance(found, str) else "B_11"
+    gate = read_metrics(explained).get("detect/strongest_gate") if (explained / METRICS_FILE).is_file() else None
+    return gate if isinstance(gate, str) else "B_11"

@@ -302,10 +302,10 @@ def monte_carlo(
     from perilune_train.landing.monte_carlo.fly_draws import PAGE, fly_draws
     from perilune_train.records.provenance import EvaluatedSplit
 
-    own = detector or shipped_run("detect")
+    network = detector or shipped_run("detect")
     drawn = Draws(scenario, draws, attitude_deg, seed)
-    with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, own)) as folder:
-        fly_draws(EvaluatedSplit(dataset, split, allow_overlap), own, folder, drawn, workers)
+    with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, network)) as folder:
+        fly_draws(EvaluatedSplit(dataset, split, allow_overlap), network, folder, drawn, workers)
     say(f"{out / PAGE}: table and pictures; draws.parquet")
 
 

@@ -126,14 +126,14 @@ def svg_of(figure: Drawing, description: str) -> Markup:
 
 def _presentation(style: str) -> dict[str, str]:
     """Convert a CSS style to presentation attributes. Of `font`, only the size is kept."""
-    found = {}
+    attributes = {}
     for part in style.split(";"):
         name, _, value = (text.strip() for text in part.partition(":"))
         if name == "font" and (size := _FONT.search(value)):
-            found["font-size"] = size.group(1)
+            attributes["font-size"] = size.group(1)
         elif name and name != "font":
-            found[name] = value
-    return found
+            attributes[name] = value
+    return attributes
 
 
 def png_uri(content: bytes) -> str:
@@ -206,7 +206,7 @@ def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     """
     _, parts, facts, _ = cv2.connectedComponentsWithStats((colours.min(axis=2) >= _WHITE).astype(np.uint8))
     area = facts[:, cv2.CC_STAT_AREA]
-    area[0] = 0  # all that is not white
+    area[0] = 0  # component 0: all pixels that are not white
     known = area >= _MIN_PAPER_SHARE * parts.size
     if not known.any():
         return None

@@ -106,8 +106,8 @@ def check_weights(path: Path, field: str, state: object) -> None:
             raise UserError(path, f"{field}.{name}", type(tensor).__name__, "a tensor")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             wrong = tensor[~torch.isfinite(tensor)]
-            found = f"{wrong.numel()} of {tensor.numel()} numbers are not finite; the first is {float(wrong[0])}"
-            raise UserError(path, f"{field}.{name}", found, expected)
+            got = f"{wrong.numel()} of {tensor.numel()} numbers are not finite; the first is {float(wrong[0])}"
+            raise UserError(path, f"{field}.{name}", got, expected)
         if name.endswith("running_var") and tensor.numel() and float(tensor.min()) < 0:
             raise UserError(path, f"{field}.{name}", float(tensor.min()), "a variance of at least 0")
 
@@ -223,7 +223,7 @@ def _ordered() -> OrderedDict:
     return OrderedDict()
 
 
-# The parameters are those of torch's `_rebuild_tensor_v2`, which the pickle calls.
+# Takes the arguments of torch's `_rebuild_tensor_v2`, which the pickle calls.
 def _tensor(
     storage: _Storage, offset: int, shape: tuple, strides: tuple, grad: bool, hooks: dict, _: object = None
 ) -> TensorRecord:

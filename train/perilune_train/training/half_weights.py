@@ -100,8 +100,8 @@ def _as_float32(path: Path, tensors: dict[str, torch.Tensor]) -> dict[str, torch
         if whole is None or step is None or whole.dtype != torch.int8 or whole.ndim < 2:
             raise UserError(path, name, "integers without steps, or the reverse", "both, for a tensor of weights")
         if step.dtype != torch.float32 or step.shape != whole.shape[:1]:
-            found = f"steps of shape {list(step.shape)}, {step.dtype}"
-            raise UserError(path, name, found, f"{whole.shape[0]} of torch.float32")
+            got = f"steps of shape {list(step.shape)}, {step.dtype}"
+            raise UserError(path, name, got, f"{whole.shape[0]} of torch.float32")
         tensors[name] = whole.float() * step.view(-1, *[1] * (whole.ndim - 1))
     return {key: tensor.float() if tensor.dtype == torch.float16 else tensor for key, tensor in tensors.items()}
 

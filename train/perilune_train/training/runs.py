@@ -146,11 +146,11 @@ def read_saved(
     return content
 
 
-def check_architecture(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+def check_architecture(path: Path, got: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """Raise UserError naming the first setting of `expected` that differs in a checkpoint's architecture."""
     for key, value in expected.items():
-        if found.get(key) != value:
-            raise UserError(path, key, found.get(key), f"{value}; the checkpoint has another architecture")
+        if got.get(key) != value:
+            raise UserError(path, key, got.get(key), f"{value}; the checkpoint has another architecture")
 
 
 def load_state(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
@@ -163,10 +163,10 @@ def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Mod
     """Raise UserError naming the first tensor of a checkpoint that is missing, extra or of the wrong shape."""
     tensors = network.state_dict()
     for key in sorted(tensors.keys() | state.keys()):
-        found = tuple(state[key].shape) if key in state else "nothing"
+        got = tuple(state[key].shape) if key in state else "nothing"
         expected = str(tuple(tensors[key].shape)) if key in tensors else "no such tensor"
-        if str(found) != expected:
-            raise UserError(path, key, found, f"{expected}; the checkpoint has another architecture")
+        if str(got) != expected:
+            raise UserError(path, key, got, f"{expected}; the checkpoint has another architecture")
 
 
 def choose_device(device: str) -> str:

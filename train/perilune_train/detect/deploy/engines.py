@@ -137,7 +137,7 @@ def _check_no_other_files(path: Path) -> None:
     model = package("onnx").load(str(path), load_external_data=False)
     names = [f"a tensor in the file {each.value!r}" for tensor in _tensors(model) for each in tensor.external_data]
     if names:
-        raise UserError(path, "network", names[0], f"{_EXPECTED}, which holds its own tensors")
+        raise UserError(path, "network", names[0], f"{_EXPECTED}, which contains all its tensors")
 
 
 def _tensors(message: Any) -> Iterator[Any]:

@@ -210,8 +210,8 @@ def _from_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled:
     pictures_by_label: dict[Path, Path] = {}
     for picture, path in files.items():
         if path in pictures_by_label:
-            found = f"{path.name}, also the label file of {pictures_by_label[path].name}"
-            raise UserError(picture, "labels", found, "one image for each label file")
+            got = f"{path.name}, also the label file of {pictures_by_label[path].name}"
+            raise UserError(picture, "labels", got, "one image for each label file")
         pictures_by_label[path] = picture
     suffix = next(iter(pictures_by_label)).suffix.lower()
     notes = [f"{n_unlabelled} images without labels are left out"] if n_unlabelled else []

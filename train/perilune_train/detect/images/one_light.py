@@ -30,21 +30,21 @@ _WEIGHTS = np.stack([np.where(_IN_DISC, _STEPS, 0.0), np.where(_IN_DISC, _STEPS[
 """Weights (2, 16, 16) of the slope of grey levels along x and y in the disc inside a box."""
 
 
-def doubt_of(image: NDArray[np.uint8], found: Detections) -> str | None:
+def doubt_of(image: NDArray[np.uint8], detections: Detections) -> str | None:
     """Return a warning if a grey image (height, width) does not look like the Moon, else None."""
-    agreement, count = agreement_of_light(image, found)
+    agreement, count = agreement_of_light(image, detections)
     if count < MIN_CRATERS or agreement >= MIN_AGREEMENT:
         return None
     got = f"got {agreement:.2f}, expected at least {MIN_AGREEMENT} from one Sun; is it a picture of the Moon?"
     return f"agreement of the light on {count} craters: {got}"
 
 
-def agreement_of_light(image: NDArray[np.uint8], found: Detections) -> tuple[float, int]:
+def agreement_of_light(image: NDArray[np.uint8], detections: Detections) -> tuple[float, int]:
     """Return the agreement (0 to 1) of the light directions in the highest-scored craters, and their number."""
     height, width = image.shape
-    best = np.argsort(-found.scores, kind="stable")
-    best = best[found.scores[best] >= _MIN_SCORE]
-    boxes = np.clip(np.rint(found.boxes[best]), 0, [width, height, width, height]).astype(int)
+    best = np.argsort(-detections.scores, kind="stable")
+    best = best[detections.scores[best] >= _MIN_SCORE]
+    boxes = np.clip(np.rint(detections.boxes[best]), 0, [width, height, width, height]).astype(int)
     boxes = boxes[(boxes[:, 2:] - boxes[:, :2] >= _MIN_SIDE_PX).all(axis=1)][:_MAX_CRATERS]
     directions = []
     for x0, y0, x1, y1 in boxes:

@@ -116,8 +116,8 @@ def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> N
             grey[rows] = _grey_of(bands, picture, nodata, stretch)
         if stretch is not None and stretch.fills and not quiet:
             values = ", ".join(f"{fill:g}" for fill in stretch.fills)
-            found = f"{stretch.fill_share:.1%} of the pixels are {values}, far from all others"
-            say(f"{path.name}: {found}: taken as no data (--nodata sets the value)")
+            fills = f"{stretch.fill_share:.1%} of the pixels are {values}, far from all others"
+            say(f"{path.name}: {fills}: taken as no data (--nodata sets the value)")
         return grey if picture.is_upright else upright(grey, picture.orientation)
 
 
@@ -128,8 +128,8 @@ def grey_of_array(pixels: NDArray, where: object = "image") -> NDArray[np.uint8]
     """
     kind = pixels.dtype.kind
     if kind not in "buif" or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
-        found, expected = f"{pixels.dtype} of shape {pixels.shape}", "numbers (height, width) or (height, width, 3)"
-        raise UserError(where, "pixels", found, expected)
+        got, expected = f"{pixels.dtype} of shape {pixels.shape}", "numbers (height, width) or (height, width, 3)"
+        raise UserError(where, "pixels", got, expected)
     if pixels.size == 0 or pixels.size > MAX_PIXELS:
         raise UserError(where, "pixels", f"shape {pixels.shape}", f"1 to {MAX_PIXELS} pixels")
     bands = [pixels] if pixels.ndim == 2 else [pixels[..., k] for k in range(3 if pixels.shape[2] > 1 else 1)]

@@ -61,8 +61,8 @@ def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFr
     rows, whole = (frame_table(dataset, split) for dataset in (other, factual))
     known = whole[whole["frame_id"].isin(rows["frame_id"])].reset_index(drop=True)
     if known["frame_id"].tolist() != rows["frame_id"].tolist():
-        found = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
-        raise UserError(other.store, "frames", found, "frames of the dataset that it was rendered from")
+        got = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
+        raise UserError(other.store, "frames", got, "frames of the dataset that it was rendered from")
     return known, rows
 
 
@@ -74,7 +74,7 @@ def read_removed(address: Address) -> pd.DataFrame:
     above, _, name = f"{str(address).rstrip('/')}.removed.parquet".rpartition("/")
     store = open_store(above or ".")
     if not store.exists(name):
-        raise UserError(store.at(name), "table", "no such file", "that of `perilune-render counterfactual`")
+        raise UserError(store.at(name), "table", "no such file", "the table of `perilune-render counterfactual`")
     try:
         table = pd.read_parquet(io.BytesIO(store.read(name, most_bytes=_MAX_BYTES)), columns=_REMOVED)
     except (ValueError, OSError) as error:

@@ -168,5 +168,5 @@ def _other_size(entry: Entry, size: tuple[int, int]) -> UserError:
     width, height = (stated or side for stated, side in zip(entry.size_px, size, strict=True))
     expected = f"{width} x {height}, as stated in {entry.labels.name}"
     if (height, width) == size and stored_size(entry.path) == (width, height):
-        expected += "; the picture's EXIF orientation turns it, and labels must be those of the upright picture"
+        expected += "; the picture's EXIF orientation turns it, and labels must refer to the upright picture"
     return UserError(entry.path, "size", f"{size[0]} x {size[1]}", expected)
