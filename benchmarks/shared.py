@@ -26,7 +26,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.threads import cores_in_affinity
 
@@ -293,7 +293,7 @@ def main(
     chosen = workload or list(WORKLOADS)
     for name in chosen:
         if name not in WORKLOADS:
-            raise UserError("--workload", "name", name, ", ".join(WORKLOADS))
+            raise UserError("--workload", "", name, ", ".join(WORKLOADS))
     figures: dict[str, object] = {}
     for name in chosen:
         conditions = [one for one in CONDITIONS if name in SPINNING or not one.before]
@@ -321,4 +321,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

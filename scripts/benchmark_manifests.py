@@ -20,6 +20,8 @@ if __name__ == "__main__":
 
 import typer
 
+from perilune_shared.console.command_line import one_command, run_command_line
+
 REGIONS = ("highland", "mare")
 """Regions, named as their files in configs/."""
 OF_KIND = {
@@ -73,4 +75,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command_line(one_command(main))

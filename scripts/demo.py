@@ -26,7 +26,7 @@ import typer
 
 from perilune_render.config.dataset import DatasetConfig
 from perilune_shared.config.resolve import Section, resolve
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.errors import EXIT_INTERRUPTED, UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import write_text
@@ -203,4 +203,4 @@ def main(
 
 if __name__ == "__main__":
     # Wait longer than the commands that it starts do: they print how to resume.
-    run_command_line(lambda: typer.run(main), ended_after_s=2.5)
+    run_command_line(one_command(main), ended_after_s=2.5)

@@ -707,7 +707,7 @@ def main(
 ) -> None:
     """Run all steps."""
     if preset not in ("paper", "tiny"):
-        raise UserError("--preset", "preset", preset, "paper or tiny")
+        raise UserError("--preset", "", preset, "paper or tiny")
     if darknet is not None:
         check_start(darknet)
     if calibrate and ground == Ground.LUNAR:

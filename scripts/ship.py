@@ -103,7 +103,7 @@ def card(
 
 def _folder(name: str) -> Path:
     if name not in MAX_MB:
-        raise UserError("--name", "name", name, "one of " + ", ".join(MAX_MB))
+        raise UserError("--name", "", name, "one of " + ", ".join(MAX_MB))
     return SHIPPED / name
 
 

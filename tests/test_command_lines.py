@@ -15,7 +15,9 @@ import perilune_render.cli.main
 import perilune_shared
 import perilune_shared.cli.main
 import perilune_train.cli.main
+from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
+from tests.helpers import in_process
 
 PROGRAMS = {
     "perilune-manifest": perilune_shared.cli.main.app,
@@ -135,3 +137,54 @@ def test_commands_about_one_dataset_share_one_kind_by_default():
     assert one[0] == "detect" and kinds["preview"] == kinds["ground"] == one
     # `dataset` makes both datasets of a preset; poses that a user gives are a path, as of navigation.
     assert {name: kind[0] for name, kind in kinds.items() if kind != one} == {"dataset": "both", "frames": "nav"}
+
+
+MISTAKES = [
+    ("perilune-manifest", "validate x --mst 3", "error: no such option --mst; did you mean --most?"),
+    ("perilune-manifest", "validate x --most 0", "error: --most: got 0, expected at least 1"),
+    ("perilune-manifest", "validate x --most=3.5", "error: --most: got 3.5, expected an integer"),
+    ("perilune-manifest", "validate x --most", "error: --most: got nothing, expected a value"),
+    ("perilune-manifest", "validate x --help=1", "error: --help: got a value, expected none"),
+    (
+        "perilune-manifest",
+        "validate",
+        "error: dataset: got nothing, expected a value; see `perilune-manifest validate --help`",
+    ),
+    ("perilune-manifest", "validate x y z", "error: validate: got y z, expected no further argument"),
+    (
+        "perilune-manifest",
+        "export x --format foo",
+        "error: --format: got foo, expected one of coco, yolo, tum, kitti, croissant, huggingface",
+    ),
+    ("perilune-manifest", "-x", "error: no such option -x; see `perilune-manifest --help`"),
+    ("perilune-manifest", "valdate x", "error: no such command valdate; did you mean validate?"),
+    ("perilune-render", "nothing", "error: no such command nothing; see `perilune-render --help`"),
+    (
+        "perilune-render",
+        "develop --dataset x",
+        "error: --out: got nothing, expected a value; see `perilune-render develop --help`",
+    ),
+    ("perilune-train", "detect --x", "error: no such option --x; see `perilune-train detect --help`"),
+    ("perilune-train", "detect trian", "error: no such command trian; did you mean train?"),
+    (
+        "perilune-train",
+        "explain --preset",
+        "error: --preset: got nothing, expected a value",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("program", "words", "line"), MISTAKES, ids=[f"{mistake[0]} {mistake[1]}" for mistake in MISTAKES]
+)
+def test_a_wrong_option_prints_one_line(program, words, line, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    ended = in_process.call(lambda: run_command_line(PROGRAMS[program]), *words.split(), program=program)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", line + "\n")
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_program_without_a_command_prints_its_help_once(program):
+    ended = in_process.call(lambda: run_command_line(PROGRAMS[program]), program=program)
+    # The exit code depends on Typer's version.
+    assert ended.stderr == "" and ended.stdout.count("Usage:") == 1

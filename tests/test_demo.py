@@ -131,7 +131,7 @@ def test_a_failed_command_ends_the_demo_with_its_code(script, tmp_path, capfd):
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        (("--preset", "tny"), "error: --preset: preset: got tny, expected tiny (nearest known)"),
+        (("--preset", "tny"), "error: --preset: got tny, expected tiny (nearest known)"),
         (("--set", "explain.n_frame=4"), "error: --set: explain.n_frame: got an unknown key, expected n_frames"),
         (("--config", "nowhere.yaml"), "error: nowhere.yaml: configuration: got no such file"),
     ],

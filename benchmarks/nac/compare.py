@@ -28,7 +28,7 @@ from perilune_render.labels.frame_labels import RimCircles, label_frame
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.config.resolve import resolve
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
@@ -273,4 +273,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

@@ -23,7 +23,7 @@ from perilune_render.config.terrain import TerrainConfig
 from perilune_render.terrain.elevation.catalogue import RealCraters, read_catalogue
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_render.terrain.grid import Grid
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, selenographic_from_site
 
@@ -148,4 +148,4 @@ def _crest_m(height_m: Array, x_m: float, y_m: float, radius_m: float) -> float 
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(bench))
+    run_command_line(one_command(bench))

@@ -20,7 +20,7 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.geometry.frames import Array
 from perilune_shared.labels.selection import limited_contrast, read_labels, selected
@@ -171,4 +171,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

@@ -16,7 +16,7 @@ import typer
 from matplotlib.figure import Figure
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.detect.finished_run import config_of_run
@@ -24,7 +24,7 @@ from perilune_train.detect.inference.detector import open_detector
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.inputs import labelled_frames
 from perilune_train.explain.maps.masks import detector_masks
-from perilune_train.explain.page.claims import LEAST_DEVIATION
+from perilune_train.explain.page.claims import MIN_DEVIATION
 from perilune_train.records.pictures import save_figure
 from perilune_train.training.runs import RunFolder
 
@@ -49,7 +49,7 @@ def point(dataset: Dataset, root: Path, n_frames: int) -> dict[str, Any]:
     detector = open_detector(RunFolder(root).best, config)
     masks = detector_masks(detector.network, frames.images, RunFolder(root).best)
     deviations = {block: round(float(mask.std()), 5) for block, mask in masks.items()}
-    constant = sum(value < LEAST_DEVIATION for value in deviations.values())
+    constant = sum(value < MIN_DEVIATION for value in deviations.values())
     return own | {"deviations": deviations, "constant": constant, "least_deviation": min(deviations.values())}
 
 
@@ -79,8 +79,8 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
             right.plot(place, list(one["deviations"].values()), ".-", color=colour, linewidth=0.8)
     left.set(xlabel="constant gates, of 23", ylabel="AP, strict scoring rule, validation split")
     left.legend(fontsize=8)
-    right.axhline(LEAST_DEVIATION, color="black", linestyle="--", linewidth=0.8)
-    right.set_yscale("symlog", linthresh=LEAST_DEVIATION)
+    right.axhline(MIN_DEVIATION, color="black", linestyle="--", linewidth=0.8)
+    right.set_yscale("symlog", linthresh=MIN_DEVIATION)
     right.set(ylabel="standard deviation of the mask", ylim=(0, None))
     right.set_xticks(range(len(blocks)), blocks)
     right.tick_params(axis="x", rotation=60)
@@ -102,8 +102,8 @@ def main(
     forms = by_form(points)
     first = next(iter(forms.values()))
     gain = {form: own["ap_strict"] - first["ap_strict"] for form, own in forms.items()}
-    write_figures(out / "gates.json", {"runs": points, "forms": forms, "gain": gain, "limit": LEAST_DEVIATION})
+    write_figures(out / "gates.json", {"runs": points, "forms": forms, "gain": gain, "limit": MIN_DEVIATION})
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

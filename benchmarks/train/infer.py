@@ -18,7 +18,7 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import progress_bar
 from perilune_train.detect.deploy.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.export import load_trained
@@ -167,4 +167,4 @@ def print_table(rows: list[dict]) -> None:
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

@@ -20,7 +20,7 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_train.detect.deploy.engines import has_bf16, openvino_core
 from perilune_train.detect.deploy.files import FlightDetector, write_onnx
 from perilune_train.detect.deploy.int8 import quantise
@@ -146,4 +146,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

@@ -17,7 +17,7 @@ import torch
 import typer
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import open_single
 from perilune_train.landing.methods.flights import default_sigmas, mounting_of
 from perilune_train.landing.monte_carlo.fly_draws import GRADE, Job, all_draws, sites_of
@@ -61,4 +61,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

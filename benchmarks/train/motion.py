@@ -19,7 +19,7 @@ import typer
 from matplotlib.figure import Figure
 
 from benchmarks.figures import write_figures
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.motion.classical.alignment import aligned_trajectory
@@ -130,4 +130,4 @@ def draw(path: Path, figures: dict[str, float], methods: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

@@ -10,10 +10,11 @@ from typing import Annotated
 
 import typer
 
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import answer
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.images.find import load_detector
-from perilune_train.detect.images.one_light import LEAST_AGREEMENT, LEAST_CRATERS, agreement_of_light
+from perilune_train.detect.images.one_light import MIN_AGREEMENT, MIN_CRATERS, agreement_of_light
 from perilune_train.detect.images.pictures import pictures_of
 
 
@@ -33,11 +34,11 @@ def main(
                 boxes = craters.table[["x0_px", "y0_px", "x1_px", "y1_px"]].to_numpy()
                 values.append(agreement_of_light(craters.image, Detections(boxes, craters["score"])))
         for half, label in ((values[::2], "chosen on"), (values[1::2], "tested on")):
-            judged = [agreement for agreement, count in half if count >= LEAST_CRATERS]
-            doubted = sum(agreement < LEAST_AGREEMENT for agreement in judged)
+            judged = [agreement for agreement, count in half if count >= MIN_CRATERS]
+            doubted = sum(agreement < MIN_AGREEMENT for agreement in judged)
             text = f"{min(judged):.2f} to {max(judged):.2f}" if judged else "none"
             answer(f"{name}, {label}: {len(half)} pictures, {len(judged)} judged, agreement {text}, {doubted} doubted")
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command_line(one_command(main))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_train.detect.deploy.export import load_trained
@@ -82,4 +82,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

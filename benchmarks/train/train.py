@@ -29,7 +29,7 @@ from torch.utils.data import DataLoader
 
 from benchmarks.figures import write_figures
 from perilune_shared.config.resolve import resolve
-from perilune_shared.console.command_line import run_command_line
+from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.threads import usable_cores
 from perilune_train.detect.config import DetectConfig
@@ -189,4 +189,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run_command_line(lambda: typer.run(main))
+    run_command_line(one_command(main))

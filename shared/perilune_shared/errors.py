@@ -27,13 +27,16 @@ DISK_FAULTS = (
 
 
 class UserError(Exception):
-    """An error in the user's input: file or place, field, value found, and value expected."""
+    """An error in the user's input: file or option, field or "", value found, and value expected."""
 
     def __init__(self, where: object, field: str, found: object, expected: str):
         # These texts may come from untrusted files and have any length.
         self.where = shortened(where, 4200)
         self.field, self.found, self.expected = shortened(field), shortened(found), shortened(expected, 500)
-        super().__init__(one_line(f"{self.where}: {self.field}: got {self.found}, expected {self.expected}"))
+        # A field may repeat its option: `--camera-axes` and `camera axes`.
+        repeated = self.where.startswith("--") and self.where[2:].replace("-", " ") == self.field
+        place = f"{self.where}: {self.field}" if self.field and not repeated else self.where
+        super().__init__(one_line(f"{place}: got {self.found}, expected {self.expected}"))
 
     def __reduce__(self) -> tuple:
         """Pickle the constructor's arguments, so that a worker process can send the error."""

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from unittest import mock
 
 
-def call(main: Callable[[], None], *arguments: object) -> subprocess.CompletedProcess:
+def call(main: Callable[[], None], *arguments: object, program: str = "command") -> subprocess.CompletedProcess:
     """Run `main` with these arguments; return exit code, standard output and standard error."""
     given = [str(argument) for argument in arguments]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with (
-        mock.patch.object(sys, "argv", ["command", *given]),
+        mock.patch.object(sys, "argv", [program, *given]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

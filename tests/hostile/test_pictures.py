@@ -22,10 +22,10 @@ from perilune_shared.errors import UserError
 from perilune_train.cli.main import main
 from perilune_train.detect.benchmark.submission import read_submission
 from perilune_train.detect.images.labelled import read_images
-from perilune_train.detect.images.read import LARGEST_PIXELS, read_grey
+from perilune_train.detect.images.read import MAX_PIXELS, read_grey
 from tests.hostile.measured import accepted, refused
 
-SIDE = int(LARGEST_PIXELS**0.5)
+SIDE = int(MAX_PIXELS**0.5)
 READ_MB = 2000
 """Memory that README and SECURITY promise for a picture of any depth."""
 

@@ -102,7 +102,7 @@ def _table_beside(out: str) -> tuple[Store, str]:
     else:
         above, name = str(Path(out).parent), Path(out).name
     if not name or above.endswith(":/"):
-        raise UserError("--out", "address", out, "a folder, or an address below its bucket")
+        raise UserError("--out", "", out, "a folder, or an address below its bucket")
     return open_store(above), f"{name}.removed.parquet"
 
 

@@ -80,11 +80,11 @@ class JobOptions:
         matched = re.fullmatch(r"([1-9]\d{0,6})/([1-9]\d{0,6})", shard) if shard is not None else None
         numbers = (int(matched[1]), int(matched[2])) if matched is not None else None
         if shard is not None and (numbers is None or numbers[0] > numbers[1]):
-            raise UserError("--shard", "shard", shard, "its number and the count of shards, from 1/64 to 64/64")
+            raise UserError("--shard", "", shard, "its number and the count of shards, from 1/64 to 64/64")
         if address is not None and executor != "ray":
-            raise UserError("--address", "executor", executor, "--executor ray, which connects to that cluster")
+            raise UserError("--address", "", executor, "--executor ray, which connects to that cluster")
         if workers == 0 and executor == "ray":
-            raise UserError("--workers", "workers", workers, "1 or more with --executor ray")
+            raise UserError("--workers", "", workers, "1 or more with --executor ray")
         return cls(executor, address, workers, threads, numbers, finish, dry_run)
 
 
@@ -254,7 +254,7 @@ def _executor(options: JobOptions, early: "Worker | None") -> "MakeExecutor":
         try:
             from perilune_render.jobs.ray_actors import RayActors
         except ModuleNotFoundError:
-            raise UserError("--executor", "ray", "not installed", "pip install 'perilune-render[ray]'") from None
+            raise UserError("--executor", "", "not installed", "pip install 'perilune-render[ray]'") from None
         return partial(RayActors, n_workers=options.workers, address=options.address)
     from perilune_render.jobs.local import LocalWorkers
 

@@ -94,7 +94,7 @@ def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
     found = f"sha256:{sha256_of(dem)}"
     for expected in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
         if not same_source(found, expected):
-            raise UserError("--dem", "elevation model", found, expected)
+            raise UserError("--dem", "", found, expected)
 
 
 @dataclass(frozen=True, slots=True)

@@ -146,7 +146,7 @@ def _of_scene(
     with interrupts_held():
         ground = cached_scene(ground_config, view_of(ground_config, exr_rig, recipe.kind), scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
-        raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
+        raise UserError("--dem", "", ground.dem_source, scene["dem_source"])
     of_camera = {name: taken for name in rig if (taken := [row for row in rows if row["camera"] == name])}
     for name, taken in of_camera.items():
         poses = (np.array([row[column] for row in taken]) for column in ("position_m", "rotation_wxyz"))

@@ -55,7 +55,7 @@ def part_of(plan: Plan, split: str, n_frames: int, sun_azimuth_offset_deg: float
         if len(trajectories) > first:
             ranges[scene.scene_id] = range(first, len(trajectories))
     if not ranges:
-        raise UserError("--split", "frames", f"none in {split}", "a split that has frames")
+        raise UserError("--split", "", f"none in {split}", "a split that has frames")
     scenes = tuple(
         replace(scene, sun_azimuth_deg=(scene.sun_azimuth_deg + sun_azimuth_offset_deg) % 360)
         for scene in plan.scenes

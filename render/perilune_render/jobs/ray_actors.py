@@ -89,13 +89,13 @@ class RayActors:
             ray.shutdown()
             raise
         except ConnectionError as error:
-            raise UserError("--address", "Ray", error, "the address of a running Ray cluster, as host:6379") from None
+            raise UserError("--address", "", error, "the address of a running Ray cluster, as host:6379") from None
         n_cores = sorted(int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"])
         n_fitting = sum(each // self._n_threads for each in n_cores)
         if not n_fitting:
             ray.shutdown()
             expected = f"a machine with {self._n_threads} cores, one for each thread of a process (--threads)"
-            raise UserError("--executor", "Ray", f"machines with {' and '.join(map(str, n_cores))} cores", expected)
+            raise UserError("--executor", "", f"machines with {' and '.join(map(str, n_cores))} cores", expected)
         self._n_workers = self._n_workers or n_fitting
         self._remote_job = ray.put(self._job)
         return self

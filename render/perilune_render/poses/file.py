@@ -157,7 +157,7 @@ def _axes(path: Path, stated: str | None, given: str | None) -> Array:
     """The rotation (3, 3) to right, down, forward from the camera's axes. Raises UserError."""
     known = [camera_axes(text, where) for text, where in ((stated, path), (given, "--camera-axes")) if text is not None]
     if len(known) == 2 and not np.array_equal(known[0], known[1]):
-        raise UserError("--camera-axes", "camera axes", given, f"{stated}, as {path} states")
+        raise UserError("--camera-axes", "", given, f"{stated}, as {path} states")
     return known[0] if known else np.eye(3)
 
 

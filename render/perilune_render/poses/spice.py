@@ -225,7 +225,7 @@ def _times(spice: Any, source: SpiceSource) -> Array:
         raise UserError("spice", "--frames and --step-s", "both or neither", "one of them")
     begin, end = (_time(spice, name, text) for name, text in (("--start", source.start), ("--end", source.end)))
     if end < begin or (end == begin and source.n_frames != 1):
-        raise UserError("--end", "time", source.end, f"a time after --start, {source.start}")
+        raise UserError("--end", "", source.end, f"a time after --start, {source.start}")
     number = source.n_frames if source.step_s is None else int((end - begin) / source.step_s + 1e-9) + 1
     if number is None or not 1 <= number <= _MAX_FRAMES:
         raise UserError("spice", "frames", number, f"1 to {_MAX_FRAMES}")
@@ -250,20 +250,20 @@ def _fixed_frame(spice: Any, name: str | None) -> str:
         return next(each for each in _FIXED_FRAMES if spice.namfrm(each) != 0)
     _check_frame(spice, "--fixed-frame", name)
     if spice.frinfo(spice.namfrm(name))[0] != spice.bodn2c(_MOON):
-        raise UserError("--fixed-frame", "frame", name, "a frame fixed to the Moon, such as MOON_ME or IAU_MOON")
+        raise UserError("--fixed-frame", "", name, "a frame fixed to the Moon, such as MOON_ME or IAU_MOON")
     return name
 
 
 def _check_frame(spice: Any, option: str, name: str) -> None:
     if spice.namfrm(name) == 0:
-        raise UserError(option, "frame", name, "a frame that the kernels (FK) define")
+        raise UserError(option, "", name, "a frame that the kernels (FK) define")
 
 
 def _body(spice: Any, name: str) -> str:
     try:
         return str(spice.bods2c(name))
     except spice.exceptions.NotFoundError:
-        raise UserError("--spacecraft", "body", name, "a NAIF id, or a name that the kernels define") from None
+        raise UserError("--spacecraft", "", name, "a NAIF id, or a name that the kernels define") from None
 
 
 def _refuse_night(towards: Array, utc: str) -> None:

@@ -70,9 +70,9 @@ def export(
     opened = ps.open_dataset(dataset)
     check_keys(opened)
     if split is not None and split not in SPLITS:
-        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+        raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     if selection not in SELECTIONS:
-        raise UserError("--selection", "selection", selection, nearest(selection, tuple(SELECTIONS)))
+        raise UserError("--selection", "", selection, nearest(selection, tuple(SELECTIONS)))
     choose = by_selection(SELECTIONS[selection]) if selection != "all" else None
     if choose is not None and format not in _WITH_LABELS:
         raise UserError(
@@ -82,13 +82,13 @@ def export(
         raise UserError("--link", "--format", format, "yolo: other formats have no images")
     if format == "croissant":
         if split is not None:
-            raise UserError("--split", "split", split, "no --split: Croissant describes the whole dataset")
+            raise UserError("--split", "", split, "no --split: Croissant describes the whole dataset")
         with progress_bar() as progress:
             written = export_croissant(opened, out, progress)
         _say(f"{written}: written")
         return
     if out is None:
-        raise UserError("--out", "folder", "none", f"a new folder for the {format} files")
+        raise UserError("--out", "", "none", f"a new folder for the {format} files")
     known = replaceable(out, _KNOWN_BY[format], overwrite=overwrite, inputs=(dataset,))
     with known as folder, progress_bar() as progress:
         match format:

@@ -58,7 +58,7 @@ def parse_setting(text: str) -> tuple[list[str], Any]:
     key, separator, value = text.partition("=")
     path = key.strip().split(".")
     if not separator or len(path) < 2 or not all(path):
-        raise UserError("--set", "setting", text, "section.key=value, for example dataset.seed=3")
+        raise UserError("--set", "", text, "section.key=value, for example dataset.seed=3")
     if path[0] not in SECTIONS:
         raise UserError("--set", key, "an unknown section", nearest(path[0], SECTIONS))
     return path, parse_yaml(value, f"--set {key}")
@@ -77,7 +77,7 @@ def resolve(
     Later sources override. Raises UserError with the source, the key, the value and the expected value.
     """
     if preset not in PRESETS:
-        raise UserError("--preset", "preset", preset, nearest(preset, PRESETS))
+        raise UserError("--preset", "", preset, nearest(preset, PRESETS))
     preset_text = resources.files(package).joinpath("presets", f"{preset}.yaml").read_text(encoding="utf-8")
     base = parse_yaml(preset_text, preset).get(section, {})
     return resolve_over(model, section, f"preset {preset}", base, config_file, settings)

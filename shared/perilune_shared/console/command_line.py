@@ -76,6 +76,16 @@ def add_renamed(app: typer.Typer, old: str, new: str, command: Callable[..., Non
     app.command(old, hidden=True)(renamed)
 
 
+def one_command(function: Callable[..., None]) -> typer.Typer:
+    """Create a program whose only command is `function`, without shell completion."""
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(function)
+    return app
+
+
+_UsageError: Any = typer.BadParameter.__base__
+"""The error of wrong options and arguments: Click's class in older versions of Typer, now its copy."""
+
 _UNTRACKED = {
     "DO_NOT_TRACK": "1",
     "HF_HUB_DISABLE_TELEMETRY": "1",
@@ -93,7 +103,7 @@ def _check_arguments() -> None:
 
 
 def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -> None:
-    """Run a command line; print user errors and disk errors in one line and exit with code 2.
+    """Run a command line; print wrong options, user errors and disk errors in one line and exit with code 2.
 
     Before it runs, set the threads of the numerical libraries (`threads.set_up_program`), which must not be imported
     yet, and switch off the telemetry of libraries.
@@ -120,9 +130,14 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
         set_up_program()
         for name, value in (_UNTRACKED | _folders()).items():
             os.environ.setdefault(name, value)
-        app()
+        _run(app)
     except UserError as error:
         return STOPPED if interrupted else f"error: {error}"
+    except _UsageError as error:
+        # Imported here so that correct commands start faster.
+        from perilune_shared.console.usage import usage_line
+
+        return STOPPED if interrupted else f"error: {usage_line(error)}"
     except SystemExit as stop:
         # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
         if interrupted or stop.code == EXIT_INTERRUPTED:
@@ -139,6 +154,21 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
             )
         raise
     return None
+
+
+def _run(app: Callable[[], object]) -> None:
+    """Call a command line; a Typer program raises the error of a wrong option instead of printing it in a box."""
+    if not isinstance(app, typer.Typer):
+        app()
+        return
+    try:
+        code = app(standalone_mode=False)
+    except _UsageError as error:
+        # A program without arguments has printed its help.
+        if type(error).__name__ == "NoArgsIsHelpError":
+            raise SystemExit(EXIT_USER_ERROR) from None
+        raise
+    raise SystemExit(code if type(code) is int else 0)
 
 
 def _folders() -> dict[str, str]:

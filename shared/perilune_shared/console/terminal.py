@@ -17,7 +17,7 @@ from rich.progress import (
     ProgressColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from perilune_shared.errors import one_line
@@ -78,6 +78,15 @@ def _lines(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
+class _Steps(MofNCompleteColumn):
+    """Column with the completed and all steps; with one decimal if their number is no integer, as for megabytes."""
+
+    def render(self, task) -> Text:
+        if task.total is None or float(task.total).is_integer():
+            return super().render(task)
+        return Text(f"{task.completed:.1f}/{task.total:.1f}", style="progress.download")
+
+
 class _Rate(ProgressColumn):
     """Column with the completed steps per second."""
 
@@ -98,7 +107,8 @@ class _Note(ProgressColumn):
     """Column with the task's current note, if it has one."""
 
     def render(self, task) -> Text:
-        return Text(one_line(task.fields.get("note", "")))
+        # The column stays foldable for Rich, so that it narrows before the others do.
+        return Text(one_line(task.fields.get("note", "")), no_wrap=True, overflow="ellipsis")
 
 
 class _LoggedProgress(Progress):
@@ -125,6 +135,11 @@ class _LoggedProgress(Progress):
             self.console.print(self.get_renderable(), width=_LOG_WIDTH)
 
 
+def _unwrapped() -> Column:
+    # A task takes one line in a narrow terminal too.
+    return Column(no_wrap=True, overflow="ellipsis")
+
+
 def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
     """Create a progress bar on standard error: name, steps, rate, remaining time and a note on the current step.
 
@@ -132,10 +147,10 @@ def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
     in seconds.
     """
     return _LoggedProgress(
-        _Name(),
+        _Name(table_column=_unwrapped()),
         BarColumn(),
-        MofNCompleteColumn(),
-        _Rate(),
+        _Steps(table_column=_unwrapped()),
+        _Rate(table_column=_unwrapped()),
         TimeRemainingColumn(),
         _Note(),
         clock=clock,

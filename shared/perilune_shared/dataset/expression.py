@@ -238,7 +238,7 @@ class Condition:
 
     @staticmethod
     def _fault(found: str, expected: str) -> UserError:
-        return UserError("--where", "condition", found, expected)
+        return UserError("--where", "", found, expected)
 
 
 def _column_value(kind: pa.DataType, expression: Any) -> _Value:

@@ -49,7 +49,7 @@ def pack(
     """
     check_source(source, out, progress)
     if not 0 < shard_mb <= _MAX_SHARD_MB:
-        raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_MAX_SHARD_MB}")
+        raise UserError("--shard-mb", "", shard_mb, f"above 0, at most {_MAX_SHARD_MB}")
     packed = source.info.images in ("files", "packed")
     info = source.info
     if packed:

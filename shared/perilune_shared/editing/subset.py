@@ -49,7 +49,7 @@ def subset(
     planned = source.info.images == "planned" or images == "plan"
     if on_labels and planned:
         expected = "conditions on frames, trajectories and scenes: a plan has no labels"
-        raise UserError("--where", "condition", on_labels[0].text, expected)
+        raise UserError("--where", "", on_labels[0].text, expected)
     check_source(source, out, progress)
     frames_within_limit = None if limit is None else _first_frames(source, on_frames, limit)
 

@@ -42,7 +42,7 @@ def export_hugging_face(
     Returns the number of frames. The field `chosen` of each label states whether it is selected. Raises UserError if
     `out` is not empty, an image is missing or the split has no frames.
     """
-    task = progress.add_task("hugging face", total=count_frames(dataset, split), unit="frames")
+    task = progress.add_task("huggingface", total=count_frames(dataset, split), unit="frames")
     writers: dict[str, _Shards] = {}
     n_frames = 0
     with new_files(out) as folder:

@@ -48,8 +48,8 @@ def test_shards_in_random_order_and_at_the_same_time_give_the_same_bytes(options
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--shard", "4/3"], "--shard: shard: got 4/3"),
-        (["--shard", "0/3"], "--shard: shard: got 0/3"),
+        (["--shard", "4/3"], "--shard: got 4/3"),
+        (["--shard", "0/3"], "--shard: got 0/3"),
         (["--shard", "1/3", "--finish"], "got --shard and --finish, expected one of them"),
         (["--finish"], "--finish: got no dataset"),
     ],

@@ -136,7 +136,7 @@ def test_axes_turn_the_angular_velocity_too_and_parquet_states_them(tmp_path):
     found = read_poses(path, *SITE)
     check(found)
     assert np.allclose(found.angular_velocity_radps, turns * [1, -1, -1])
-    with pytest.raises(UserError, match="--camera-axes: camera axes: got opencv, expected x,-y,-z"):
+    with pytest.raises(UserError, match="--camera-axes: got opencv, expected x,-y,-z"):
         read_poses(path, *SITE, "opencv")
 
 
@@ -260,7 +260,7 @@ def test_the_commands_have_the_option(tmp_path):
     path = tmp_path / "poses.tum"
     path.write_text("# frame: O_L\n0 0 0 800 1 0 0 0\n")
     out = ["--out", tmp_path / "out", "--preset", "tiny", "--set", "dataset.render.engine=heightfield"]
-    for axes, message in (("x,y", "--camera-axes: camera axes: got x,y"), ("blender", "--camera-axes opencv")):
+    for axes, message in (("x,y", "--camera-axes: got x,y"), ("blender", "--camera-axes opencv")):
         done = in_process.call(main, "frames", "--poses", path, *out, "--camera-axes", axes)
         assert done.returncode == 2 and message in done.stderr, done.stderr
     done = in_process.call(main, "preview", "--out", tmp_path / "a.png", "--camera-axes", "blender")

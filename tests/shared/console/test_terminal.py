@@ -36,3 +36,20 @@ def test_a_short_task_leaves_one_line(log):
         for _ in range(3):
             progress.advance(task)
     assert len(log.getvalue().splitlines()) == 1
+
+
+def test_a_task_takes_one_line_in_a_narrow_terminal(monkeypatch):
+    text = io.StringIO()
+    monkeypatch.setattr(terminal, "console", Console(file=text, width=72, force_terminal=True, color_system=None))
+    with terminal.progress_bar() as progress:
+        task = progress.add_task("classical methods", total=3, unit="trajectories")
+        progress.update(task, note="a note on the current step that is longer than the line")
+        progress.advance(task, 3)
+    final = text.getvalue().split("\x1b[2K")[-1]
+    assert final.count("\n") == 1 and "3/3" in final and final.endswith("\n\x1b[?25h")
+
+
+def test_megabytes_have_a_decimal(log):
+    with terminal.progress_bar() as progress:
+        progress.advance(progress.add_task("hashing", total=0.42, unit="MB"), 0.42)
+    assert "0.4/0.4" in log.getvalue()

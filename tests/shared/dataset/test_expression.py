@@ -103,7 +103,7 @@ def test_conditions(text, expected):
 def test_invalid_conditions_are_refused(text, message):
     with pytest.raises(UserError, match=message) as raised:
         Condition(text)
-    assert str(raised.value).startswith("--where: condition: got ") and "\n" not in str(raised.value)
+    assert str(raised.value).startswith("--where: got ") and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

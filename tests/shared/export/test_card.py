@@ -134,7 +134,7 @@ def test_a_card_elsewhere_leaves_the_dataset_as_it_is(of_nobody, tmp_path):
 
 
 def test_a_licence_that_spdx_does_not_know_is_refused(of_nobody):
-    with pytest.raises(UserError, match=r"--licence: licence: got Mine, expected an SPDX licence expression"):
+    with pytest.raises(UserError, match=r"--licence: got Mine, expected an SPDX licence expression"):
         write_card(open_dataset(of_nobody), None, NO_PROGRESS, "Mine")
     assert not (of_nobody / "README.md").exists()
 

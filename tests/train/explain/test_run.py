@@ -220,7 +220,7 @@ def test_the_task_chooses_the_networks(dataset_detect, tmp_path, monkeypatch):
     assert in_process.call(main, *common).returncode == 0 and calls[-1][2:4] == (detector, navigator)
     assert in_process.call(main, *common, "--task", "navigate").returncode == 0 and calls[-1][2:4] == (None, navigator)
     refused = in_process.call(main, *common, "--task", "detect", "--navigator", "a.ckpt")
-    assert refused.returncode == 2 and refused.stderr.startswith("error: --navigator: option: got a.ckpt, expected")
+    assert refused.returncode == 2 and refused.stderr.startswith("error: --navigator: got a.ckpt, expected")
 
 
 def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect):

@@ -247,6 +247,16 @@ def test_narrow_pages_do_not_scroll_sideways_and_the_switch_changes_colours(brow
     opened.page.context.close()
 
 
+@pytest.mark.parametrize("width", [400, 2200])
+def test_a_dark_page_has_no_light_band(browser, page, width):
+    opened = load(browser, page, viewport={"width": width, "height": 900}, color_scheme="dark")
+    pixels = np.asarray(Image.open(io.BytesIO(opened.page.screenshot(full_page=True))).convert("L"))
+    # A row of links has bright underlines, which are thinner than the bands of 8 px.
+    bands = pixels[: len(pixels) // 8 * 8].reshape(-1, 8 * width)
+    assert (bands > 128).mean(axis=1).max() < 0.5
+    opened.page.context.close()
+
+
 def test_printing_to_pdf_shows_the_frame_that_was_chosen(browser, page, report_data):
     opened = load(browser, page)
     opened.page.locator("#place").fill("2")

@@ -35,7 +35,7 @@ Scales = Annotated[
     typer.Option(
         "--scale",
         help="Factor by which images are resized before detection. Repeatable; detections at all scales are merged."
-        " [default: those of the run]",
+        " [default: the run's scales]",
     ),
 ]
 TileSide = Annotated[
@@ -51,7 +51,7 @@ BoxMargin = Annotated[
 NoData = Annotated[
     float | None,
     typer.Option(
-        help="Value of pixels without data, if the files do not declare it. [default: found where it stands apart]"
+        help="Value of pixels without data, if the files do not declare it. [default: values far from all others]"
     ),
 ]
 Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels.")]
@@ -60,7 +60,7 @@ Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels
 def check_nodata(value: float | None) -> None:
     """Raise UserError if the value of pixels without data is not a finite number."""
     if value is not None and not abs(value) < float("inf"):
-        raise UserError("--nodata", "value", value, "a finite number; others are always taken as no data")
+        raise UserError("--nodata", "", value, "a finite number; infinite values and NaN always count as no data")
 
 
 @app.command("train")
@@ -125,7 +125,7 @@ def evaluate(
         bool,
         typer.Option(
             "--choose-threshold",
-            help="Choose a new threshold on the validation split, for settings other than those of the run.",
+            help="Choose a new threshold on the validation split, for settings other than the run's.",
         ),
     ] = False,
     out: Annotated[
@@ -169,9 +169,9 @@ def evaluate(
     from perilune_shared.dataset.names import SPLITS
 
     if split not in SPLITS:
-        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+        raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     if threshold is not None and not 0 <= threshold <= 1:
-        raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
+        raise UserError("--threshold", "", threshold, "a number from 0 to 1")
     if choose_threshold and (threshold is not None or images is not None or split == "val"):
         other = "--threshold" if threshold is not None else "--images" if images is not None else "--split val"
         raise UserError("--choose-threshold", "options", f"together with {other}", "only one of them")
@@ -185,9 +185,9 @@ def evaluate(
     if run is None:
         run = shipped_run("detect")
         if out is None:
-            raise UserError("--out", "folder", "none", "a folder to write into, since --run is not given")
+            raise UserError("--out", "", "none", "a folder to write into, since --run is not given")
         if dataset is None and images is None:
-            raise UserError("--dataset", "address", "none", "a dataset or --images, since --run is not given")
+            raise UserError("--dataset", "", "none", "a dataset or --images, since --run is not given")
     config = config_of_run(run, tuple(set_ or ()))
     if images is not None:
         for text in set_ or ():
@@ -208,9 +208,9 @@ def evaluate(
         say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return
     if scale:
-        own = config.model_dump(mode="json")
-        own["evaluation"]["scales"] = scale
-        config = resolve_over(DetectConfig, "detect", "--scale", own)
+        values = config.model_dump(mode="json")
+        values["evaluation"]["scales"] = scale
+        config = resolve_over(DetectConfig, "detect", "--scale", values)
     # Importing torch takes seconds; check the settings first.
     from perilune_train.detect.evaluate_runs import evaluate_again
     from perilune_train.records.provenance import EvaluatedSplit
@@ -246,9 +246,9 @@ def benchmark(
         raise UserError("benchmark", "options", "both --run and --detections", "one of them")
     if (threshold is None) != (detections is None):
         expected = "--threshold, chosen on other frames" if detections else "none: a run has its own threshold"
-        raise UserError("--threshold", "score", threshold, expected)
+        raise UserError("--threshold", "", threshold, expected)
     if threshold is not None and not 0 <= threshold <= 1:
-        raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
+        raise UserError("--threshold", "", threshold, "a number from 0 to 1")
     from perilune_train.detect.benchmark.score_run import FIGURES, PAGE, score_run, score_submission
 
     if detections is not None and threshold is not None:
@@ -301,7 +301,7 @@ def predict(
     ] = 0.0,
     min_size: Annotated[float, typer.Option(help="Twice --min-radius-px: minimum sqrt(w h), pixels.")] = 0.0,
     top: Annotated[
-        int | None, typer.Option(min=1, help="Maximum number of craters in an image: those of the highest scores.")
+        int | None, typer.Option(min=1, help="Maximum number of craters in an image; the highest scores are kept.")
     ] = None,
     nodata: NoData = None,
     scale: Scales = None,
@@ -317,10 +317,10 @@ def predict(
     pixel. The image names of video frames are <file>.<index, six digits>.png, and those of TIFF pages end in .tif.
     """
     if min_score is not None and not 0 < min_score <= 1:
-        raise UserError("--min-score", "score", min_score, "above 0, at most 1")
+        raise UserError("--min-score", "", min_score, "above 0, at most 1")
     for option, pixels in (("--min-radius-px", min_radius_px), ("--min-size", min_size)):
         if not 0 <= pixels < float("inf"):
-            raise UserError(option, "pixels", pixels, "at least 0")
+            raise UserError(option, "", pixels, "at least 0")
     if min_radius_px and min_size:
         raise UserError("--min-size", "options", "together with --min-radius-px", "only one of them")
     check_nodata(nodata)

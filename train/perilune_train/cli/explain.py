@@ -66,7 +66,7 @@ def explain(
     name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
     for given, option, other in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
         if given is not None and task == other:
-            raise UserError(option, "option", str(given), f"no {option} with --task {other}")
+            raise UserError(option, "", str(given), f"no {option} with --task {other}")
     if task != "navigate" and detector is None:
         run_folder = runs / "detect" / name
         detector = RunFolder(shipped_run("detect") if task == "detect" and not run_folder.is_dir() else run_folder).best
@@ -131,7 +131,7 @@ def causal(
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     if (nav_dataset is None) != (nav_counterfactual is None):
-        raise UserError("--nav-dataset", "datasets", "only one", "--nav-dataset and --nav-counterfactual together")
+        raise UserError("--nav-dataset", "", "only one", "--nav-dataset and --nav-counterfactual together")
     # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.explain.causal.causal_run import CausalInputs, PoseInputs, causal_folder, causal_run
     from perilune_train.training.begin import held
@@ -157,5 +157,5 @@ def causal(
 
 def _chosen_gate(explained: Path) -> str:
     """The gate that an explain run chose on validation frames; without such a run B_11, the paper's first gate."""
-    found = read_metrics(explained).get("detect/strongest_gate") if (explained / METRICS_FILE).is_file() else None
-    return found if isinstance(found, str) else "B_11"
+    gate = read_metrics(explained).get("detect/strongest_gate") if (explained / METRICS_FILE).is_file() else None
+    return gate if isinstance(gate, str) else "B_11"

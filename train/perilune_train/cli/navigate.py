@@ -79,7 +79,7 @@ def evaluate(
     was trained, and compared with the mean pose; pose.md then replaces descent.png.
     """
     if split not in SPLITS:
-        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+        raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
     from perilune_train.motion.evaluate_runs import evaluate_navigator
     from perilune_train.records.provenance import EvaluatedSplit
@@ -162,7 +162,7 @@ def calibrate(
     another camera.
     """
     if split not in SPLITS:
-        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+        raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
     from perilune_shared.dataset.manifest import open_single
     from perilune_train.motion.covariance import FILE
@@ -257,7 +257,7 @@ def methods(
     metrics.json (hashes, command, commit, versions). Catalogues, priors and initial states use a fixed random seed.
     """
     if split not in SPLITS:
-        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+        raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
     from perilune_train.landing.methods.fly_methods import PAGE, TABLE, fly_methods
     from perilune_train.records.provenance import EvaluatedSplit
@@ -295,17 +295,17 @@ def monte_carlo(
     draws.parquet (one row per draw and frame), errors.png and consistency.png.
     """
     if split not in SPLITS:
-        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+        raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     if scenario not in SCENARIOS:
-        raise UserError("--scenario", "scenario", scenario, "one of " + ", ".join(SCENARIOS))
+        raise UserError("--scenario", "", scenario, "one of " + ", ".join(SCENARIOS))
     # torch takes seconds to load.
     from perilune_train.landing.monte_carlo.fly_draws import PAGE, fly_draws
     from perilune_train.records.provenance import EvaluatedSplit
 
-    own = detector or shipped_run("detect")
+    network = detector or shipped_run("detect")
     drawn = Draws(scenario, draws, attitude_deg, seed)
-    with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, own)) as folder:
-        fly_draws(EvaluatedSplit(dataset, split, allow_overlap), own, folder, drawn, workers)
+    with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, network)) as folder:
+        fly_draws(EvaluatedSplit(dataset, split, allow_overlap), network, folder, drawn, workers)
     say(f"{out / PAGE}: table and pictures; draws.parquet")
 
 
@@ -364,7 +364,7 @@ def fly(
     estimates.parquet, estimates.csv and flight.png. `navigate descent` writes examples of all input files.
     """
     if live is not None and live.suffix.lower() != ".png":
-        raise UserError("--live", "name", live, "a name that ends in .png")
+        raise UserError("--live", "", live, "a name that ends in .png")
     if run is not None and detections is not None:
         raise UserError("--detections", "options", "together with --run", "one of them")
     source = detections or run or shipped_run("detect")
@@ -413,9 +413,9 @@ def descent(
     """
     ids = tuple(trajectory.split("/"))
     if len(ids) != 2:
-        raise UserError("--trajectory", "trajectory", trajectory, "scene_id/trajectory_id")
+        raise UserError("--trajectory", "", trajectory, "scene_id/trajectory_id")
     if grade not in GRADES:
-        raise UserError("--grade", "grade", grade, "one of " + ", ".join(GRADES))
+        raise UserError("--grade", "", grade, "one of " + ", ".join(GRADES))
     offset = (position_m, velocity_mps, attitude_deg)
     for name, value in zip(("--position-m", "--velocity-mps", "--attitude-deg"), offset, strict=True):
         if not 0 < value < 1e4:

@@ -39,7 +39,7 @@ def report(
 
     chosen = name or {"demo": "small", "paper": "paper", "benchmark": "benchmark"}[kind]
     if not is_plain(chosen) or "/" in chosen:
-        raise UserError("command line", "--name", chosen, "a plain name, without folders")
+        raise UserError("--name", "", chosen, "a plain name, without folders")
     data = dataset or Path("data") / ("benchmark" if kind == "benchmark" else chosen)
     root = runs or (Path("runs") / chosen if kind == "paper" else Path("runs"))
     page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen)

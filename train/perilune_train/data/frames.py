@@ -91,8 +91,8 @@ def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np
     camera = dataset.info.camera
     n_bytes = len(table) * camera.height_px * camera.width_px
     if n_bytes > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
-        found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
-        raise UserError(dataset.store, "frames", found, f"{split} frames that fit into memory; see detect.stream")
+        got = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
+        raise UserError(dataset.store, "frames", got, f"{split} frames that fit into memory; see detect.stream")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
     index_of = {frame_id: index for index, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()

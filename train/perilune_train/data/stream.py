@@ -227,8 +227,8 @@ class FrameStream(torch_data.IterableDataset):
                 opened[path] = open_shard(self.dataset.store, path)
             tables[group] = opened[path].read([*self.columns, *self._nested], [int(self._groups.in_shard[group])])
             if len(tables[group]) != self._groups.n_frames[group]:
-                found, expected = len(tables[group]), f"{self._groups.n_frames[group]}, as when the stream was opened"
-                raise UserError(self.dataset.store.at(path), "rows", found, expected)
+                got, expected = len(tables[group]), f"{self._groups.n_frames[group]}, as when the stream was opened"
+                raise UserError(self.dataset.store.at(path), "rows", got, expected)
         return tables
 
     def _of_window(self, window: tuple[NDArray[np.int64], NDArray[np.int64]], tables: Any) -> Iterator[StreamedFrame]:

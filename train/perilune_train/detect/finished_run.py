@@ -18,8 +18,8 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
     """
     path = run / "config.yaml"
     if not path.is_file():
-        found = "a folder without config.yaml" if run.is_dir() else "no such folder"
-        raise UserError(run, "run", found, "a detect run; train one: perilune-train detect train --preset small")
+        got = "a folder without config.yaml" if run.is_dir() else "no such folder"
+        raise UserError(run, "run", got, "a detect run; train one: perilune-train detect train --preset small")
     section = read_config_file(path).get("detect")
     if section is None:
         raise UserError(path, "detect", "no such section", "config.yaml of a detect run")

@@ -115,8 +115,8 @@ def read_darknet(path: Path, expected: Sequence[int]) -> DarknetFile:
         whole, rest = divmod(size - length, 4)
         if size < length or rest or whole not in expected:
             content = "an incomplete header" if size < length else f"a header and {whole} floats and {rest} bytes"
-            found = f"{size} bytes: {content.removesuffix(' and 0 bytes')}"
-            raise UserError(path, "size", found, f"{' or '.join(map(str, expected))} floats")
+            got = f"{size} bytes: {content.removesuffix(' and 0 bytes')}"
+            raise UserError(path, "size", got, f"{' or '.join(map(str, expected))} floats")
         values = np.fromfile(stream, "<f4", whole).astype(np.float32, copy=False)
     finite = np.isfinite(values)
     if not finite.all():

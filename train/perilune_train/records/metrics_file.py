@@ -13,7 +13,7 @@ from perilune_shared.storage.files import write_text
 from perilune_train import __version__
 
 METRICS_FILE = "metrics.json"
-_MOST_BYTES = 10_000_000
+_MAX_BYTES = 10_000_000
 Metrics = dict[str, float | int | str | None]
 
 
@@ -46,8 +46,8 @@ def read_metrics(folder: Path, name: str = METRICS_FILE) -> Metrics:
     if not path.is_file():
         expected = "the metrics of a finished run; resume it with the command that started it"
         raise UserError(path, "metrics", "no such file", expected)
-    if path.stat().st_size > _MOST_BYTES:
-        raise UserError(path, "metrics", f"{path.stat().st_size} bytes", f"at most {_MOST_BYTES}")
+    if path.stat().st_size > _MAX_BYTES:
+        raise UserError(path, "metrics", f"{path.stat().st_size} bytes", f"at most {_MAX_BYTES}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

@@ -8,12 +8,12 @@ from markupsafe import Markup
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a figure was made from."""
+    """The source of a figure: a run or dataset, with hashes, commit, command and hardware."""
 
     source: str
     """Folder of the run below the folder of all runs, or name and kind of the dataset."""
     settings_sha256: str = ""
-    """SHA-256 of config.yaml, or of the dataset's recipes; empty if there is none."""
+    """SHA-256 of config.yaml, or of the dataset's recipes; empty if there is no such file."""
     inputs: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the inputs by name: datasets (of dataset.json) and checkpoints."""
     commit: str = ""
@@ -63,9 +63,9 @@ class Figure:
     html: Markup
     """An inline SVG or an image as a data URI, from pictures.py."""
     caption: str
-    """What is drawn, with units."""
+    """Caption: the quantities drawn, with units."""
     sources: tuple[Provenance, ...]
-    """What it was made from."""
+    """The runs and datasets that it shows."""
     wide: bool = False
     """Whether it takes the whole width of the page."""
     key: str = ""
@@ -77,13 +77,13 @@ class Table:
     """A table of texts and links."""
 
     caption: str
-    """What the rows are."""
+    """Caption: the meaning of the rows."""
     head: tuple[str, ...]
     """Titles of the columns."""
     rows: tuple[tuple[str, ...], ...]
     """Cells, row by row; Markup for a link."""
     sources: tuple[Provenance, ...]
-    """What it was made from."""
+    """The runs and datasets that it shows."""
 
 
 @dataclass(frozen=True)
@@ -109,13 +109,13 @@ class FramePicture:
     height_px: int
     """Height of the frame."""
     about: str
-    """Altitude, Sun and counts."""
+    """Caption: altitude, Sun elevation and counts."""
     labels: tuple[Mark, ...]
     """Ellipses."""
     detections: tuple[Mark, ...] = ()
     """Boxes."""
     sources: tuple[Provenance, ...] = ()
-    """What it was made from."""
+    """The runs and datasets that it shows."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,9 @@ class Section:
     """One part of the report."""
 
     key: str
-    """Its anchor in the page."""
+    """Anchor in the page."""
     title: str
-    """Its heading."""
+    """Heading."""
     lead: tuple[str, ...] = ()
     """First lines: the answer, then how it was obtained."""
     tables: tuple[Table, ...] = ()
@@ -161,7 +161,7 @@ class Viewer:
     masks: tuple[MaskStack, ...]
     """Masks of each gate; empty if there is no explain run."""
     sources: tuple[Provenance, ...]
-    """What frames, detections and masks were made from."""
+    """The sources of frames, detections and masks."""
 
 
 @dataclass(frozen=True)

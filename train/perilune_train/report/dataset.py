@@ -55,8 +55,8 @@ def labelled_pictures(frames: LabelledFrames) -> list[FramePicture]:
     names = list(dict.fromkeys(zip(scene.tolist(), trajectory.tolist(), strict=True)))
     chosen = []
     for number, target in enumerate(np.linspace(altitude.max(), altitude.min(), _LABELLED)):
-        own = np.flatnonzero([pair == names[number % len(names)] for pair in zip(scene, trajectory, strict=True)])
-        chosen.append(int(own[np.argmin(np.abs(altitude[own] - target))]))
+        rows = np.flatnonzero([pair == names[number % len(names)] for pair in zip(scene, trajectory, strict=True)])
+        chosen.append(int(rows[np.argmin(np.abs(altitude[rows] - target))]))
     return [frames.picture(index) for index in dict.fromkeys(chosen)]
 
 
@@ -98,12 +98,12 @@ def _histograms(dataset: Dataset) -> list[Figure]:
 
 def _histogram(axes: Axes, values: Mapping[str, Array], *, on_logarithms: bool) -> None:
     """Draw stacked bars by group. With `on_logarithms`, draw lines instead, because stacked bars would mislead."""
-    own = {name: one[np.isfinite(one) & ((one > 0) | (not on_logarithms))] for name, one in values.items()}
-    known = np.concatenate(list(own.values()))
+    finite = {name: one[np.isfinite(one) & ((one > 0) | (not on_logarithms))] for name, one in values.items()}
+    known = np.concatenate(list(finite.values()))
     low, high = (known.min(), known.max()) if len(known) else (1.0, 2.0)
     bins = np.geomspace(low, max(high, low * 1.01), 31) if on_logarithms else np.linspace(low, max(high, low + 1), 31)
     below = np.zeros(len(bins) - 1)
-    for number, (name, one) in enumerate(own.items()):
+    for number, (name, one) in enumerate(finite.items()):
         counted, colour, label = np.histogram(one, bins)[0].astype(np.float64), COLOURS[number], name or None
         if on_logarithms:
             axes.stairs(counted, bins, color=colour, linestyle=DASHES[number], linewidth=1.7, label=label)

@@ -74,15 +74,15 @@ def extremes(frames: LabelledFrames) -> list[FramePicture]:
     table = frames.split.frames.table
     chosen: list[tuple[str, int]] = []
     for word, ranked in (("best", order[::-1]), ("worst", order)):
-        own: list[int] = []
+        picked: list[int] = []
         for others_too in (False, True):
             for place in ranked:
-                seen = [(table["scene_id"][k], table["trajectory_id"][k]) for k in own]
+                seen = [(table["scene_id"][k], table["trajectory_id"][k]) for k in picked]
                 fresh = (table["scene_id"][place], table["trajectory_id"][place]) not in seen
-                used = own + [k for _, k in chosen]
-                if len(own) < _EXTREMES and place not in used and (fresh or others_too):
-                    own.append(place)
-        chosen += [(word, place) for place in own]
+                used = picked + [k for _, k in chosen]
+                if len(picked) < _EXTREMES and place not in used and (fresh or others_too):
+                    picked.append(place)
+        chosen += [(word, place) for place in picked]
     return [frames.picture(place, f"{word}, F1 {f1[place]:.2f}: ") for word, place in chosen]
 
 
@@ -165,16 +165,16 @@ def read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
 
 def _bins(runs: Sequence[Run], prefix: str) -> list[Figure]:
     """Draw AP by radius, altitude and Sun elevation, with the bars of the runs side by side."""
-    found: dict[str, dict[str, tuple[float, float, str]]] = {by: {} for by in _PANELS}
+    by_panel: dict[str, dict[str, tuple[float, float, str]]] = {by: {} for by in _PANELS}
     for run in runs:
         for key in run.metrics:
             match = _BIN.fullmatch(key)
             if match and match.group(1) == prefix:
                 low, high = float(match.group(3)), float(match.group(4))
-                found[match.group(2)][key] = (low, high, key)
+                by_panel[match.group(2)][key] = (low, high, key)
     figures = []
     for by, x in _PANELS.items():
-        bins = sorted(found[by].values())
+        bins = sorted(by_panel[by].values())
         if not bins:
             continue
         with drawing(height_in=3.2) as figure:

@@ -43,14 +43,14 @@ def headline_of(run: Run) -> str:
 
     If every claim is undecided because there are too few scenes, the text says this once.
     """
-    found = run.metrics.get("headline")
-    if not isinstance(found, str):
+    headline = run.metrics.get("headline")
+    if not isinstance(headline, str):
         return ""
     verdicts = [claim["verdict"] for claim in read_claims(run.folder / CLAIMS_FILE)]
     undecided = next((verdict for verdict in verdicts if verdict.startswith("undecided")), None)
-    if undecided is not None and not re.search(r"\b(holds|does not)\b", found):
+    if undecided is not None and not re.search(r"\b(holds|does not)\b", headline):
         return one_line(f"What the attention masks show is {undecided}.")
-    return one_line(found)
+    return one_line(headline)
 
 
 def paper_section(folder: Path, run: Run) -> Section:

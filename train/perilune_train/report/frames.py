@@ -21,9 +21,9 @@ from perilune_train.report.pictures import image_uri, png_uri
 
 MASKS_FILE = "masks_detect.npz"
 _MATCH_IOU = 0.5
-_MOST_FRAMES = 60
-_LARGEST_SIDE_PX = 512
-_LARGEST_MASKS_BYTES = 2**28
+_MAX_FRAMES = 60
+_MAX_SIDE_PX = 512
+_MAX_MASKS_BYTES = 2**28
 _KINDS = {FOUND: "matched", FALSE: "false"}
 
 
@@ -53,16 +53,18 @@ class LabelledFrames:
 
     def picture(self, index: int, first_words: str = "") -> FramePicture:
         """One frame with the marks of its labels and detections."""
-        own = self.split.labels[index]
+        frame_labels = self.split.labels[index]
         rows = np.flatnonzero(self.matches.frame == index)
-        missed = own.selected.copy()
+        missed = frame_labels.selected.copy()
         hit = self.matches.label[rows]
         missed[hit[hit >= 0] - self.first_label[index]] = False
         labels = []
-        for (cx, cy, a, b, theta), selected, lost in zip(own.ellipses, own.selected, missed, strict=True):
+        for (cx, cy, a, b, theta), selected, lost in zip(
+            frame_labels.ellipses, frame_labels.selected, missed, strict=True
+        ):
             kind = "ignored" if not selected else "missed" if lost and self.has_detections else "found"
             labels.append(Mark(kind, (_px(cx), _px(cy), _px(a), _px(b), _px(np.degrees(theta)))))
-        labels = [mark for mark, labelled in zip(labels, own.labelled, strict=True) if labelled]
+        labels = [mark for mark, labelled in zip(labels, frame_labels.labelled, strict=True) if labelled]
         detections = []
         # The rows of the matches have the order of the detections of each frame.
         for (x0, y0, x1, y1), score, outcome in zip(
@@ -77,7 +79,7 @@ class LabelledFrames:
             frame_uri(image),
             width,
             height,
-            first_words + self._about(index, int(own.selected.sum())),
+            first_words + self._about(index, int(frame_labels.selected.sum())),
             tuple(labels),
             tuple(detections),
             (self.provenance,),
@@ -93,32 +95,32 @@ class LabelledFrames:
 
     def places_of(self, trajectory: str) -> list[int]:
         """Indices of the frames of one trajectory, scene_id/trajectory_id, in order."""
-        return [place for place, own in enumerate(facts_of(self.split.frames).trajectory) if own == trajectory]
+        return [place for place, name in enumerate(facts_of(self.split.frames).trajectory) if name == trajectory]
 
     def trajectories(self) -> list[str]:
         """Names of the trajectories, scene_id/trajectory_id, in order."""
         return list(dict.fromkeys(facts_of(self.split.frames).trajectory))
 
 
-def labelled_frames(split: DetectSplit, found: list[Detections] | None, provenance: Provenance) -> LabelledFrames:
-    """Match the labels of a split to a run's detections above the threshold; `found` is None without a run."""
+def labelled_frames(split: DetectSplit, detected: list[Detections] | None, provenance: Provenance) -> LabelledFrames:
+    """Match the labels of a split to a run's detections above the threshold; `detected` is None without a run."""
     nothing = Detections(np.empty((0, 4)), np.empty(0))
-    detections = [nothing] * len(split) if found is None else found
+    detections = [nothing] * len(split) if detected is None else detected
     height, width = split.frames.images.shape[1:]
     overlaps = find_overlaps(detections, list(split.labels), np.tile([width, height], (len(split), 1)))
     matches = overlaps.match(_MATCH_IOU, split.radius_px)
     first = np.searchsorted(overlaps.label_frame, np.arange(len(split)))
     # Order each frame's detections by score, as in the matches.
-    ordered = [_best_first(own) for own in detections]
-    return LabelledFrames(split, ordered, matches, first, found is not None, provenance)
+    ordered = [_best_first(of_frame) for of_frame in detections]
+    return LabelledFrames(split, ordered, matches, first, detected is not None, provenance)
 
 
 def frame_uri(image: NDArray[np.uint8]) -> str:
     """A frame as a data URI: a lossless PNG up to 512 px; larger frames are reduced to 512 px, as WebP."""
-    if max(image.shape) <= _LARGEST_SIDE_PX:
+    if max(image.shape) <= _MAX_SIDE_PX:
         return _png(Image.fromarray(image))
     picture = Image.fromarray(image)
-    picture.thumbnail((_LARGEST_SIDE_PX, _LARGEST_SIDE_PX))
+    picture.thumbnail((_MAX_SIDE_PX, _MAX_SIDE_PX))
     return image_uri(picture)
 
 
@@ -137,8 +139,8 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
             raise UserError(masks, "frame_ids", first, "a test frame of the detection dataset")
         trajectory = facts_of(frames.split.frames).trajectory[names.index(first)]
     places = frames.places_of(trajectory)
-    if len(places) > _MOST_FRAMES:
-        places = [places[k] for k in np.linspace(0, len(places) - 1, _MOST_FRAMES).astype(int)]
+    if len(places) > _MAX_FRAMES:
+        places = [places[k] for k in np.linspace(0, len(places) - 1, _MAX_FRAMES).astype(int)]
     chosen = [names[place] for place in places]
     stacks = () if content is None else tuple(_stacks(content, chosen))
     sources = [frames.provenance, *([mask_provenance] if stacks and mask_provenance else [])]
@@ -153,8 +155,8 @@ def read_masks(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(item.file_size for item in archive.infolist())
-        if size > _LARGEST_MASKS_BYTES:
-            raise UserError(path, "size", f"{size} bytes", f"at most {_LARGEST_MASKS_BYTES} bytes")
+        if size > _MAX_MASKS_BYTES:
+            raise UserError(path, "size", f"{size} bytes", f"at most {_MAX_MASKS_BYTES} bytes")
         with np.load(path, allow_pickle=False) as file:
             content = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
@@ -172,10 +174,10 @@ def read_masks(path: Path) -> dict[str, NDArray[Any]]:
         if len(unusable):
             raise UserError(path, name, unusable[0], "finite numbers")
     for block in blocks:
-        own = content.get(str(block))
-        if own is None or own.dtype != np.uint8 or own.ndim != 3 or len(own) != count or 0 in own.shape:
-            found = "nothing" if own is None else f"{own.dtype} {own.shape}"
-            raise UserError(path, str(block), found, f"uint8 ({count}, height, width)")
+        array = content.get(str(block))
+        if array is None or array.dtype != np.uint8 or array.ndim != 3 or len(array) != count or 0 in array.shape:
+            got = "nothing" if array is None else f"{array.dtype} {array.shape}"
+            raise UserError(path, str(block), got, f"uint8 ({count}, height, width)")
     return content
 
 
@@ -198,9 +200,9 @@ def _stacks(content: dict[str, NDArray[Any]], names: Sequence[str]) -> list[Mask
     return stacks
 
 
-def _best_first(own: Detections) -> Detections:
-    order = np.argsort(-own.scores, kind="stable")
-    return Detections(own.boxes[order], own.scores[order])
+def _best_first(detections: Detections) -> Detections:
+    order = np.argsort(-detections.scores, kind="stable")
+    return Detections(detections.boxes[order], detections.scores[order])
 
 
 def _png(picture: Image.Image) -> str:

@@ -11,12 +11,12 @@ from perilune_train.report.sources import provenance_of_dataset
 
 Array = NDArray[np.float64]
 _SIDE_PX = 480
-_LEAST_DIAMETER_PX = 2.5
+_MIN_DIAMETER_PX = 2.5
 _REACH_RADII = 2.5
 _RIM_SHARE = 0.18
 """Height of the rim above the plain, divided by the depth: 0.036 D / 0.2 D in fresh craters (Pike 1977)."""
 _MARGIN_M = 250.0
-_MOST_TRACKS = 6
+_MAX_TRACKS = 6
 
 
 def shaded_ground(craters: pd.DataFrame, sun: Array, half_m: float, side_px: int = _SIDE_PX) -> NDArray[np.uint8]:
@@ -53,9 +53,9 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
     position = np.stack([np.asarray(one, np.float64) for one in frames["position_m"]])
     half_m = float(np.abs(position[:, :2]).max() + _MARGIN_M)
     craters = dataset.table("craters", ["x_m", "y_m", "diameter_m", "depth_m"], scene_id=scene_id).to_pandas()
-    least_m = _LEAST_DIAMETER_PX * 2 * half_m / _SIDE_PX
-    drawn = craters[craters["diameter_m"] >= least_m]
-    tracks = list(frames.groupby("trajectory_id").indices.items())[:_MOST_TRACKS]
+    min_m = _MIN_DIAMETER_PX * 2 * half_m / _SIDE_PX
+    drawn = craters[craters["diameter_m"] >= min_m]
+    tracks = list(frames.groupby("trajectory_id").indices.items())[:_MAX_TRACKS]
     with drawing(height_in=5.0) as figure:
         axes = figure.subplots()
         # Columns run west and rows south, so reverse both.
@@ -73,7 +73,7 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
         description = f"Shaded map of {scene_id} with the ground tracks of {len(tracks)} trajectories"
         html = svg_of(figure, description)
     caption = (
-        f"Scene {scene_id}, shaded from its table of craters ({len(drawn)} above {least_m:.0f} m) under its Sun, with "
+        f"Scene {scene_id}, shaded from its table of craters ({len(drawn)} above {min_m:.0f} m) under its Sun, with "
         "the ground tracks of its trajectories; a dot marks the first frame. Relief, boulders and cast shadows are not "
         "in the table and are not drawn."
     )

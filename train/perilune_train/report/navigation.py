@@ -75,8 +75,8 @@ def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
     joined = pd.concat([table.assign(run=name) for name, table in errors.items()], ignore_index=True)
     # Each run also evaluates the methods without a network. Their results are equal in all runs, so keep one copy.
     joined = joined.drop_duplicates(["method", "scene_id", "trajectory_id", "step"])
-    own = {run.metrics.get("evaluation/method") for run in runs}
-    drawn = [name for name in joined["method"].unique() if name in _DRAWN or name in own]
+    run_methods = {run.metrics.get("evaluation/method") for run in runs}
+    drawn = [name for name in joined["method"].unique() if name in _DRAWN or name in run_methods]
     sources = sources_of(runs)
     figures = [] if dataset is None else _trajectory(joined, drawn, dataset, sources)
     figures += [*_bands(joined, drawn, sources), _drift(joined, drawn, sources)]
@@ -144,7 +144,7 @@ def _starts(runs: Sequence[Run]) -> list[str]:
 def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
     """Show the filter with the installed detector on the test descents, from the folder of `navigate monte-carlo`."""
     rows, columns = read_landing(folder), _LANDING_COLUMNS
-    cells = tuple(("/".join(ids), *(number(own[key]) for key in columns)) for ids, own in by_trajectory(rows).items())
+    cells = tuple(("/".join(ids), *(number(row[key]) for key in columns)) for ids, row in by_trajectory(rows).items())
     table = Table("Descents, with all draws of each", ("descent", *columns.values()), cells, sources)
     figures = [
         Figure(picture_of(folder / name, caption), caption, sources, wide=True)
@@ -161,8 +161,8 @@ def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
 
 def landing_headline(rows: pd.DataFrame) -> str:
     """One line with the filter's errors, from the table of draws."""
-    own = run_summary(rows)
-    over, end = number(own["position_rmse_m"]), number(own["position_end_rmse_m"])
+    summary = run_summary(rows)
+    over, end = number(summary["position_rmse_m"]), number(summary["position_end_rmse_m"])
     return (
         f"The filter with the installed detector has an r.m.s. position error of {over} m over the test descents, "
         f"and of {end} m at their end."
@@ -181,7 +181,8 @@ def scores_section(scores: Sequence[Run]) -> Section:
         for key in score.metrics:
             method, _, name = key.partition("/")
             if name in _SCORED:
-                angle = next((f"{method}/{own}" for own in _SCORED_ANGLES if f"{method}/{own}" in score.metrics), "")
+                angles = (f"{method}/{name}" for name in _SCORED_ANGLES)
+                angle = next((key for key in angles if key in score.metrics), "")
                 rows.append((method, score.name, _spread(score, key), _spread(score, angle)))
         for path in sorted(score.folder.glob("*.png")):
             caption = f"{score.name}: {path.stem.replace('_', ' ')}."
@@ -196,8 +197,8 @@ def _table(runs: Sequence[Run]) -> Table:
     rows = []
     for run in runs:
         prefixes = [("test", str(run.metrics.get("evaluation/method", run.name)))]
-        found = dict.fromkeys(key.split("/")[1] for key in run.metrics if key.startswith("baseline/"))
-        prefixes += [(f"baseline/{name}", name) for name in found] if run is runs[-1] else []
+        baselines = dict.fromkeys(key.split("/")[1] for key in run.metrics if key.startswith("baseline/"))
+        prefixes += [(f"baseline/{name}", name) for name in baselines] if run is runs[-1] else []
         for prefix, name in prefixes:
             keys = (
                 "position_rmse_vector_m", "position_rmse_per_component_m", "orientation_rmse_angle_deg", "drift_final_m"
@@ -237,11 +238,11 @@ def _trajectory(
     scene, trajectory = errors["scene_id"].iloc[0], errors["trajectory_id"].iloc[0]
     columns = ["frame_index", "position_m"]
     rows = dataset.table("frames", columns, scene_id=scene, trajectory_id=trajectory).to_pandas()
-    own = errors[(errors["scene_id"] == scene) & (errors["trajectory_id"] == trajectory)]
+    of_descent = errors[(errors["scene_id"] == scene) & (errors["trajectory_id"] == trajectory)]
     true = np.array(rows.sort_values("frame_index")["position_m"].tolist(), np.float64).reshape(-1, 3)
     paths = {}
     for method in methods:
-        steps = own[own["method"] == method].sort_values("step")
+        steps = of_descent[of_descent["method"] == method].sort_values("step")
         if len(steps) == len(true) - 1:
             drift = steps[["drift_x_m", "drift_y_m", "drift_z_m"]].to_numpy()
             paths[method] = np.concatenate([true[:1], true[1:] + drift])
@@ -279,11 +280,11 @@ def _bands(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenan
         with drawing(height_in=3.8) as figure:
             axes = figure.subplots()
             for place, method in enumerate(methods):
-                own = errors[errors["method"] == method]
-                in_bin = np.digitize(own["altitude_m"], edges) - 1
+                of_method = errors[errors["method"] == method]
+                in_bin = np.digitize(of_method["altitude_m"], edges) - 1
                 used = [k for k in range(_BINS) if (in_bin == k).any()]
                 low, middle, high = np.array(
-                    [np.percentile(own[column].to_numpy()[in_bin == k], _PERCENTILES) for k in used]
+                    [np.percentile(of_method[column].to_numpy()[in_bin == k], _PERCENTILES) for k in used]
                 ).T
                 x = (edges[used] + edges[np.array(used) + 1]) / 2
                 axes.fill_between(x, low, high, color=COLOURS[place % 6], alpha=0.15, linewidth=0)

@@ -87,20 +87,20 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
     opened = _open(folders, runs)
     sections: list[Section] = []
     frames: LabelledFrames | None = None
-    for folder, own in opened.datasets.items():
+    for folder, data in opened.datasets.items():
         split: DetectSplit | None = None
-        if own.info.kind == "detect" and "test" in own.table("frames", ["split"])["split"].unique().to_pylist():
+        if data.info.kind == "detect" and "test" in data.table("frames", ["split"])["split"].unique().to_pylist():
             detect = opened.detect[-1] if opened.detect else None
-            found = None
+            detections = None
             if detect is not None:
                 installed = detect.name.endswith(INSTALLED)
                 read = read_detections(detect.folder, str(folder), shipped_run("detect") if installed else None)
-                split, found = read.split, read.found
+                split, detections = read.split, read.found
             else:
-                split = load_split(own, "test", LabelSettings())
-            source = provenance_of_dataset(own) if detect is None else detect.provenance
-            frames = frames or labelled_frames(split, found, source)
-        sections.append(dataset_section(own, f"dataset-{len(sections)}", split))
+                split = load_split(data, "test", LabelSettings())
+            source = provenance_of_dataset(data) if detect is None else detect.provenance
+            frames = frames or labelled_frames(split, detections, source)
+        sections.append(dataset_section(data, f"dataset-{len(sections)}", split))
     # Results come first, descriptions of the datasets after them.
     sections = [*_run_sections(folders, opened, frames, runs), *sections]
     if not sections:
@@ -201,16 +201,16 @@ def _headlines(opened: _Opened, folders: Folders) -> list[str]:
     lines += [navigation.headline(run) for run in opened.navigate]
     if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
         lines.append(navigation.landing_headline(navigation.read_landing(folders.landing)))
-    return lines + [found for run in opened.explain if (found := explanation.headline_of(run))]
+    return lines + [headline for run in opened.explain if (headline := explanation.headline_of(run))]
 
 
 def _provenance(sections: Sequence[Section], viewer: Viewer | None) -> tuple[Provenance, ...]:
-    found: dict[str, Provenance] = {}
+    by_anchor: dict[str, Provenance] = {}
     for section in sections:
         groups = (section.tables, section.figures, section.frames)
-        found |= {own.anchor: own for group in groups for one in group for own in one.sources}
-    found |= {own.anchor: own for own in (viewer.sources if viewer else ())}
-    return tuple(found.values())
+        by_anchor |= {source.anchor: source for group in groups for one in group for source in one.sources}
+    by_anchor |= {source.anchor: source for source in (viewer.sources if viewer else ())}
+    return tuple(by_anchor.values())
 
 
 def html_of(report: Report) -> str:
@@ -274,10 +274,10 @@ def _hash(text: str) -> str:
 
 
 def _versions() -> str:
-    found = []
+    versions = []
     for name in _VERSIONS:
         try:
-            found.append(f"{name} {importlib.metadata.version(name)}")
+            versions.append(f"{name} {importlib.metadata.version(name)}")
         except importlib.metadata.PackageNotFoundError:
             continue
-    return ", ".join(found)
+    return ", ".join(versions)

@@ -53,15 +53,15 @@ _STYLE = {
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.7,
 }
-_LARGEST_SIDE_PX = 1400
+_MAX_SIDE_PX = 1400
 _QUALITY = 82
 _WHITE = 250
-_LEAST_PAPER_SHARE = 0.01
-_LEAST_PATCH_PX = 60
+_MIN_PAPER_SHARE = 0.01
+_MIN_PATCH_PX = 60
 """A white area beyond a line counts as paper from this size on. Bright spots in photographs are mostly smaller."""
 _STROKE_PX = 13
 """Largest width of a line or letter on paper, pixels."""
-_LARGEST_INK_SPREAD = 24
+_MAX_INK_SPREAD = 24
 """Largest difference between the channels, of 255, of a pixel that counts as grey. Compression shifts the channels."""
 _numbers = itertools.count()
 ElementTree.register_namespace("", _SVG)
@@ -126,14 +126,14 @@ def svg_of(figure: Drawing, description: str) -> Markup:
 
 def _presentation(style: str) -> dict[str, str]:
     """Convert a CSS style to presentation attributes. Of `font`, only the size is kept."""
-    found = {}
+    attributes = {}
     for part in style.split(";"):
         name, _, value = (text.strip() for text in part.partition(":"))
         if name == "font" and (size := _FONT.search(value)):
-            found["font-size"] = size.group(1)
+            attributes["font-size"] = size.group(1)
         elif name and name != "font":
-            found[name] = value
-    return found
+            attributes[name] = value
+    return attributes
 
 
 def png_uri(content: bytes) -> str:
@@ -167,7 +167,7 @@ def picture_of(path: Path, description: str) -> Markup:
     except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(path, "picture", error, f"a PNG of at most {LARGEST_IMAGE_PX} pixels") from None
     # `thumbnail` reduces pictures that are too large for the page and does not enlarge small ones.
-    colours.thumbnail((_LARGEST_SIDE_PX, 4 * _LARGEST_SIDE_PX))
+    colours.thumbnail((_MAX_SIDE_PX, 4 * _MAX_SIDE_PX))
     layers = layers_of(np.asarray(colours))
     if layers is None:
         return img(image_uri(colours), description)
@@ -191,7 +191,7 @@ def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np
     share = np.where(paper, np.sqrt(least), 1.0)
     pure = 255 - (255 - values) / np.maximum(share, 1 / 255)[..., None]
     content = np.dstack([np.clip(pure, 0, 255), 255 * share])
-    is_ink = paper & (np.ptp(colours, axis=2) <= _LARGEST_INK_SPREAD)
+    is_ink = paper & (np.ptp(colours, axis=2) <= _MAX_INK_SPREAD)
     ink = np.zeros_like(content)
     ink[..., 3] = np.where(is_ink, 255 * least, 0)
     content[is_ink] = 0
@@ -206,14 +206,14 @@ def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
     """
     _, parts, facts, _ = cv2.connectedComponentsWithStats((colours.min(axis=2) >= _WHITE).astype(np.uint8))
     area = facts[:, cv2.CC_STAT_AREA]
-    area[0] = 0  # all that is not white
-    known = area >= _LEAST_PAPER_SHARE * parts.size
+    area[0] = 0  # component 0: all pixels that are not white
+    known = area >= _MIN_PAPER_SHARE * parts.size
     if not known.any():
         return None
     shape = cv2.getStructuringElement(cv2.MORPH_RECT, (_STROKE_PX, _STROKE_PX))
     while True:
         near = np.unique(parts[cv2.dilate(known[parts].astype(np.uint8), shape) > 0])
-        added = near[~known[near] & (area[near] >= _LEAST_PATCH_PX)]
+        added = near[~known[near] & (area[near] >= _MIN_PATCH_PX)]
         if not len(added):
             break
         known[added] = True

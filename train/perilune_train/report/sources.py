@@ -19,7 +19,7 @@ Kind = Literal["demo", "paper", "benchmark"]
 SCORE_FILE = "benchmark.json"
 INSTALLED = "-installed"
 """End of the folder name of an evaluation of the installed detector. This folder has no settings and no threshold."""
-LARGEST_JSON_BYTES = 16 * 2**20
+MAX_JSON_BYTES = 16 * 2**20
 """Largest size of a JSON file that is read, bytes."""
 
 
@@ -81,15 +81,15 @@ def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
     if kind == "paper":
         return Folders(
             both,
-            tuple(runs / "detect" / own for own in DETECTORS.values()),
-            tuple(runs / "navigate" / f"{own}-stack" for own in NAVIGATORS.values()),
+            tuple(runs / "detect" / name for name in DETECTORS.values()),
+            tuple(runs / "navigate" / f"{name}-stack" for name in NAVIGATORS.values()),
             (),
             (runs / "explain" / EXPLAINED, runs / "explain" / f"{EXPLAINED}-causal"),
             _scores(runs),
             page=runs,
         )
-    found = sorted(path.parent for path in dataset.glob(f"benchmark-*/{INFO_NAME}"))
-    return Folders(tuple(found), (), (), (), (), _scores(runs))
+    folders = sorted(path.parent for path in dataset.glob(f"benchmark-*/{INFO_NAME}"))
+    return Folders(tuple(folders), (), (), (), (), _scores(runs))
 
 
 def _scores(runs: Path) -> tuple[Path, ...]:
@@ -134,7 +134,9 @@ def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Prove
     text, sha256, seed = "", "", str(metrics.get("seed") or "")
     if (folder / "config.yaml").is_file():
         sections = read_config_file(folder / "config.yaml")
-        seeds = {str(own["seed"]) for own in sections.values() if isinstance(own, dict) and "seed" in own}
+        seeds = {
+            str(section["seed"]) for section in sections.values() if isinstance(section, dict) and "seed" in section
+        }
         content_bytes = (folder / "config.yaml").read_bytes()
         text, sha256 = content_bytes.decode(), hashlib.sha256(content_bytes).hexdigest()
         seed = ", ".join(sorted(seeds)) or seed
@@ -164,8 +166,8 @@ def provenance_of_dataset(dataset: Dataset) -> Provenance:
 
 def read_json(path: Path) -> Any:
     """Read a JSON file of a run. Raises UserError if it is damaged or too large."""
-    if path.stat().st_size > LARGEST_JSON_BYTES:
-        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_JSON_BYTES} bytes")
+    if path.stat().st_size > MAX_JSON_BYTES:
+        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {MAX_JSON_BYTES} bytes")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

@@ -14,9 +14,14 @@ def summary_of(report: Report) -> str:
     for section in report.sections:
         lines += [f"## {for_markdown(section.title)}", ""]
         lines += [line for text in section.lead for line in (for_markdown(text), "")]
-        for own in section.tables:
-            rows = [[for_markdown(_text(cell)) for cell in row] for row in own.rows]
-            lines += [f"{for_markdown(own.caption)}:", "", *table([for_markdown(cell) for cell in own.head], rows), ""]
+        for entry in section.tables:
+            rows = [[for_markdown(_text(cell)) for cell in row] for row in entry.rows]
+            lines += [
+                f"{for_markdown(entry.caption)}:",
+                "",
+                *table([for_markdown(cell) for cell in entry.head], rows),
+                "",
+            ]
     if report.missing:
         lines += ["## Not in this report", "", *[f"- {for_markdown(part)}" for part in report.missing], ""]
     lines += ["## Provenance", ""]

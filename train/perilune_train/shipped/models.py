@@ -57,7 +57,7 @@ def weights_file(given: str | Path) -> Path:
 
 def shipped_run(task: Task) -> Path:
     """Folder of the installed network for a task. Raises UserError if there is no such network."""
-    found = [model.folder for model in shipped_models() if model.task == task]
-    if not found:
-        raise UserError("--run", "run", "not given, and no network is installed for this task", "the folder of a run")
-    return found[0]
+    folders = [model.folder for model in shipped_models() if model.task == task]
+    if not folders:
+        raise UserError("--run", "", "not given, and no network is installed for this task", "the folder of a run")
+    return folders[0]

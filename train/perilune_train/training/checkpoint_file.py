@@ -21,7 +21,7 @@ import torch
 
 from perilune_shared.errors import UserError
 
-MOST_WEIGHT_BYTES, MOST_STATE_BYTES = 2 * 2**30, 12 * 2**30
+MAX_WEIGHT_BYTES, MAX_STATE_BYTES = 2 * 2**30, 12 * 2**30
 """Maximum sizes of a file of weights and of a training state. The weights of a network of width 2 take half of the
 first limit; a training state contains four tensors for each weight tensor."""
 _MAX_PICKLE_BYTES = 4_000_000
@@ -71,14 +71,14 @@ class _Storage:
     """Number of stored numbers."""
 
 
-def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
+def load_checked(path: Path, field: str, expected: str, max_bytes: int) -> Any:
     """Load a checkpoint on the CPU. Raises UserError on anything that perilune does not write.
 
-    Memory and time are bounded by the size of the file, which is at most `most_bytes`.
+    Memory and time are bounded by the size of the file, which is at most `max_bytes`.
     """
     size = path.stat().st_size
-    if size > most_bytes:
-        raise UserError(path, field, f"{size} bytes", f"at most {most_bytes}")
+    if size > max_bytes:
+        raise UserError(path, field, f"{size} bytes", f"at most {max_bytes}")
     with path.open("rb") as stream:
         try:
             _check(_read_records(stream, size))
@@ -106,8 +106,8 @@ def check_weights(path: Path, field: str, state: object) -> None:
             raise UserError(path, f"{field}.{name}", type(tensor).__name__, "a tensor")
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             wrong = tensor[~torch.isfinite(tensor)]
-            found = f"{wrong.numel()} of {tensor.numel()} numbers are not finite; the first is {float(wrong[0])}"
-            raise UserError(path, f"{field}.{name}", found, expected)
+            got = f"{wrong.numel()} of {tensor.numel()} numbers are not finite; the first is {float(wrong[0])}"
+            raise UserError(path, f"{field}.{name}", got, expected)
         if name.endswith("running_var") and tensor.numel() and float(tensor.min()) < 0:
             raise UserError(path, f"{field}.{name}", float(tensor.min()), "a variance of at least 0")
 
@@ -223,7 +223,7 @@ def _ordered() -> OrderedDict:
     return OrderedDict()
 
 
-# The parameters are those of torch's `_rebuild_tensor_v2`, which the pickle calls.
+# Takes the arguments of torch's `_rebuild_tensor_v2`, which the pickle calls.
 def _tensor(
     storage: _Storage, offset: int, shape: tuple, strides: tuple, grad: bool, hooks: dict, _: object = None
 ) -> TensorRecord:

@@ -72,9 +72,9 @@ class StopDiverged(Callback):
         if not all(bool(torch.isfinite(tensor).all()) for tensor in state if tensor.is_floating_point()):
             self._stop(trainer, "weights that are not finite")
 
-    def _stop(self, trainer: lightning.Trainer, found: str) -> None:
+    def _stop(self, trainer: lightning.Trainer, loss_text: str) -> None:
         expected = f"a decreasing loss: lower {self.rate} and run again with --overwrite"
-        raise UserError(self.run.root, f"loss in epoch {trainer.current_epoch + 1}", found, expected)
+        raise UserError(self.run.root, f"loss in epoch {trainer.current_epoch + 1}", loss_text, expected)
 
 
 class KeepBest(Callback):

@@ -11,10 +11,10 @@ from safetensors.torch import load, save
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
-from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
+from perilune_train.training.checkpoint_file import MAX_WEIGHT_BYTES
 
 SUFFIX = ".safetensors"
-_MOST_HEADER_BYTES = 8_000_000
+_MAX_HEADER_BYTES = 8_000_000
 _DTYPES = {"F16", "F32", "F64", "I64", "I32", "I8", "BOOL"}
 _STEP = "#step"
 """Suffix in the name of the tensor that holds the quantisation steps of an 8-bit tensor."""
@@ -100,8 +100,8 @@ def _as_float32(path: Path, tensors: dict[str, torch.Tensor]) -> dict[str, torch
         if whole is None or step is None or whole.dtype != torch.int8 or whole.ndim < 2:
             raise UserError(path, name, "integers without steps, or the reverse", "both, for a tensor of weights")
         if step.dtype != torch.float32 or step.shape != whole.shape[:1]:
-            found = f"steps of shape {list(step.shape)}, {step.dtype}"
-            raise UserError(path, name, found, f"{whole.shape[0]} of torch.float32")
+            got = f"steps of shape {list(step.shape)}, {step.dtype}"
+            raise UserError(path, name, got, f"{whole.shape[0]} of torch.float32")
         tensors[name] = whole.float() * step.view(-1, *[1] * (whole.ndim - 1))
     return {key: tensor.float() if tensor.dtype == torch.float16 else tensor for key, tensor in tensors.items()}
 
@@ -129,7 +129,7 @@ def _check_header(path: Path, expected: str) -> None:
     size = path.stat().st_size
     with path.open("rb") as stream:
         header = int.from_bytes(stream.read(8), "little")
-    if size > MOST_WEIGHT_BYTES:
-        raise UserError(path, "weights", f"{size} bytes", f"at most {MOST_WEIGHT_BYTES}")
-    if header > min(_MOST_HEADER_BYTES, size):
+    if size > MAX_WEIGHT_BYTES:
+        raise UserError(path, "weights", f"{size} bytes", f"at most {MAX_WEIGHT_BYTES}")
+    if header > min(_MAX_HEADER_BYTES, size):
         raise UserError(path, "weights", f"a header of {header} bytes", expected)

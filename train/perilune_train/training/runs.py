@@ -15,8 +15,8 @@ from perilune_train.config import Precision
 from perilune_train.records.metrics_file import METRICS_FILE, has_metrics
 from perilune_train.records.provenance import RECORD
 from perilune_train.training.checkpoint_file import (
-    MOST_STATE_BYTES,
-    MOST_WEIGHT_BYTES,
+    MAX_STATE_BYTES,
+    MAX_WEIGHT_BYTES,
     check_weights,
     is_whole,
     load_checked,
@@ -128,7 +128,7 @@ def load_weights(path: Path) -> dict[str, Any]:
         content = read_half(path)
     else:
         keys, expected = {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run"
-        content = read_saved(path, "checkpoint", keys, expected, MOST_WEIGHT_BYTES)
+        content = read_saved(path, "checkpoint", keys, expected, MAX_WEIGHT_BYTES)
     if not isinstance(content["architecture"], dict):
         raise UserError(path, "architecture", type(content["architecture"]).__name__, "settings by name")
     check_weights(path, "weights", content["state_dict"])
@@ -136,21 +136,21 @@ def load_weights(path: Path) -> dict[str, Any]:
 
 
 def read_saved(
-    path: Path, field: str, keys: set[str], expected: str, most_bytes: int = MOST_STATE_BYTES
+    path: Path, field: str, keys: set[str], expected: str, max_bytes: int = MAX_STATE_BYTES
 ) -> dict[str, Any]:
     """Read a dictionary saved by torch, on the CPU. Raises UserError if the file is damaged or lacks `keys`."""
-    content = load_checked(path, field, expected, most_bytes)
+    content = load_checked(path, field, expected, max_bytes)
     missing = keys - content.keys() if isinstance(content, dict) else keys
     if missing:
         raise UserError(path, field, f"no {', '.join(sorted(missing))}", expected)
     return content
 
 
-def check_architecture(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+def check_architecture(path: Path, got: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
     """Raise UserError naming the first setting of `expected` that differs in a checkpoint's architecture."""
     for key, value in expected.items():
-        if found.get(key) != value:
-            raise UserError(path, key, found.get(key), f"{value}; the checkpoint has another architecture")
+        if got.get(key) != value:
+            raise UserError(path, key, got.get(key), f"{value}; the checkpoint has another architecture")
 
 
 def load_state(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
@@ -163,10 +163,10 @@ def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Mod
     """Raise UserError naming the first tensor of a checkpoint that is missing, extra or of the wrong shape."""
     tensors = network.state_dict()
     for key in sorted(tensors.keys() | state.keys()):
-        found = tuple(state[key].shape) if key in state else "nothing"
+        got = tuple(state[key].shape) if key in state else "nothing"
         expected = str(tuple(tensors[key].shape)) if key in tensors else "no such tensor"
-        if str(found) != expected:
-            raise UserError(path, key, found, f"{expected}; the checkpoint has another architecture")
+        if str(got) != expected:
+            raise UserError(path, key, got, f"{expected}; the checkpoint has another architecture")
 
 
 def choose_device(device: str) -> str:

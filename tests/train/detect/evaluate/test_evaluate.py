@@ -124,8 +124,8 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--split", "tset"], "--split: split: got tset, expected one of train, val, test"),
-        (["--threshold", "2"], "--threshold: score: got 2.0, expected a number from 0 to 1"),
+        (["--split", "tset"], "--split: got tset, expected one of train, val, test"),
+        (["--threshold", "2"], "--threshold: got 2.0, expected a number from 0 to 1"),
         (["--set", "detect.width=1"], "--set: detect.width: got not a setting of the evaluation"),
         (["--set", "detect.evaluation.match_iuo=0.4"], "got an unknown key, expected match_iou"),
         (["--out", "."], "the run's own folder"),

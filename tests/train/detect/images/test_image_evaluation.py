@@ -107,9 +107,9 @@ def test_the_command(run, folder, tmp_path):
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
     for option, value, message in (
         ("--dataset", "data", "--dataset: options: got together with --images, expected only one of them"),
-        ("--split", "test", "--split: split: got test, expected a source with splits; images has none"),
+        ("--split", "test", "--split: got test, expected a source with splits; images has none"),
         ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: got together with --images"),
-        ("--scale", "9", "--scale: factor: got [9.0]"),
+        ("--scale", "9", "--scale: got [9.0]"),
     ):
         refused = CliRunner().invoke(app, [*arguments, option, value])
         assert isinstance(refused.exception, UserError) and message in str(refused.exception)

@@ -129,7 +129,7 @@ def test_categories_by_name(tmp_path, capsys):
     assert "categories taken as craters: moon-crater (1); left out: boulder (2)" in " ".join(
         capsys.readouterr().err.split()
     )
-    with pytest.raises(UserError, match="--category: name: got craterr, expected one of moon-crater, boulder"):
+    with pytest.raises(UserError, match="--category: got craterr, expected one of moon-crater, boulder"):
         read_images(tmp_path, Request(categories=("craterr",)))
     written(tmp_path / "annotations.json", coco(categories=[{"id": 1, "name": "boulder"}]))
     assert read_images(tmp_path).categories == "every object is taken as a crater; their category is boulder"
@@ -175,7 +175,7 @@ def test_a_split_of_a_folder_of_roboflow(tmp_path, capsys):
     assert "set: split test of test, train, val" in capsys.readouterr().err
     assert only(read_images(tmp_path / "set", Request(split="val"))) == BOXES[:1]
     assert read_images(tmp_path / "set" / "valid").split == ""
-    with pytest.raises(UserError, match="--split: split: got val, expected a source with splits"):
+    with pytest.raises(UserError, match="--split: got val, expected a source with splits"):
         read_images(tmp_path / "set" / "valid", Request(split="val"))
     roboflow(tmp_path / "two", ("train", "valid"))
     with pytest.raises(UserError, match="splits: got train, val, expected test among them, or --split"):
@@ -398,7 +398,7 @@ def test_label_files_that_two_pictures_share_are_refused(tmp_path):
 def test_large_and_deep_label_files_are_refused(tmp_path, monkeypatch):
     picture(tmp_path / "a.png")
     texts = sys.modules["perilune_train.detect.images.labels.texts"]
-    monkeypatch.setattr(texts, "_MOST_BRACKETS", 100)
+    monkeypatch.setattr(texts, "_MAX_BRACKETS", 100)
     written(tmp_path / "annotations.json", "[" + "[]," * 200 + "[]]")
     with pytest.raises(UserError, match="more than 100 lists and objects"):
         read_images(tmp_path)

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.images.overlay import MOST_DRAWN, write_overlay
+from perilune_train.detect.images.overlay import MAX_DRAWN, write_overlay
 
 
 def drawn(tmp_path, scores):
@@ -23,7 +23,7 @@ def test_higher_scores_are_yellower(tmp_path):
 
 
 def test_only_the_strongest_are_drawn(tmp_path):
-    scores = np.linspace(1.0, 0.6, MOST_DRAWN + 200)
+    scores = np.linspace(1.0, 0.6, MAX_DRAWN + 200)
     picture = drawn(tmp_path, scores)
     assert [picture[25 * (k // 60) :][:20, 25 * (k % 60) :][:, :20].any() for k in (0, 999, 1000, 1199)] == [
         True,

@@ -245,8 +245,8 @@ def test_a_folder_and_a_least_size(run, tmp_path):
     for arguments, message in (
         ([str(tmp_path / "none"), "--out", str(tmp_path / "x")], "none: images: got a folder without images"),
         ([str(root), str(root / "a.png"), "--out", str(tmp_path / "x")], "a.png: name: got a second image"),
-        ([str(root), "--min-size", "-1"], "--min-size: pixels: got -1.0"),
-        ([str(root), "--nodata", "inf"], "--nodata: value: got inf"),
+        ([str(root), "--min-size", "-1"], "--min-size: got -1.0"),
+        ([str(root), "--nodata", "inf"], "--nodata: got inf"),
     ):
         refused = CliRunner().invoke(app, ["detect", "predict", *arguments])
         assert isinstance(refused.exception, UserError) and message in str(refused.exception)

@@ -96,7 +96,7 @@ def test_a_file_that_is_no_video_is_refused_in_one_line(tmp_path, content, messa
 
 
 def test_too_many_pixels_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(sequences, "_MOST_PIXELS", 10_000)
+    monkeypatch.setattr(sequences, "_MAX_PIXELS", 10_000)
     path = write_video(tmp_path / "a.avi", [noise(48, 64)] * 4)
     with pytest.raises(UserError, match=r"got more than 10000, expected at most 10000; take fewer frames: ffmpeg -i a"):
         frames_of(path, tmp_path)

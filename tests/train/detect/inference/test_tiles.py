@@ -80,7 +80,7 @@ def test_large_images_are_enlarged_tile_by_tile(detector, monkeypatch):
     image, truth = discs(301, 411, 60, 14)
     tiling = Tiling(scales=(2.5,), overlap_px=128)
     whole = detect_image(blobs, image, tiling)
-    monkeypatch.setattr("perilune_train.detect.inference.tiles._MOST_ENLARGED_PIXELS", 1000)
+    monkeypatch.setattr("perilune_train.detect.inference.tiles._MAX_ENLARGED_PIXELS", 1000)
     parts = detect_image(blobs, image, tiling)
     assert len(parts.boxes) == len(whole.boxes) == len(truth)
     assert np.abs(np.sort(parts.boxes, axis=0) - np.sort(whole.boxes, axis=0)).max() <= 0.5
@@ -103,7 +103,7 @@ def test_boxes_can_get_a_margin(detector):
     plain, larger = (detect_image(blobs, image, Tiling(box_margin_px=margin)) for margin in (0.0, 1.5))
     assert len(plain.boxes) > 20
     assert larger.boxes == pytest.approx(plain.boxes + np.array([-1.5, -1.5, 1.5, 1.5]))
-    with pytest.raises(UserError, match=r"--box-margin: pixels: got -1, expected 0 to 10"):
+    with pytest.raises(UserError, match=r"--box-margin: got -1, expected 0 to 10"):
         Tiling(box_margin_px=-1).check()
 
 

@@ -136,10 +136,10 @@ def score(
 def _region(evaluation: Evaluation, name: str, of_frame: list[str]) -> Region:
     chosen = np.array([each == name for each in of_frame])
 
-    def own(matches: Matches) -> Matches:
+    def in_region(matches: Matches) -> Matches:
         return matches.of_frames(chosen)
 
-    matches = own(evaluation.matches)
+    matches = in_region(evaluation.matches)
     spread = spreads(
         lambda drawn: {"ap50_paper": average_precisions(matches, drawn)}, matches.selected_frame, evaluation.resamples
     )
@@ -149,6 +149,6 @@ def _region(evaluation: Evaluation, name: str, of_frame: list[str]) -> Region:
         len(matches.selected_frame),
         curve(matches).ap_paper(),
         spread["ap50_paper"],
-        curve(own(evaluation.at_edge)).ap_paper(),
+        curve(in_region(evaluation.at_edge)).ap_paper(),
         at_threshold(matches, evaluation.threshold)[2],
     )

@@ -118,9 +118,9 @@ def read_split_labels(
             frame = frame_of_row[check.add_labels(labels)]
             wrong = (frame >= 0) & ~np.isin(frame, scene_frames)
             if wrong.any():
-                found = labels["frame_id"][int(wrong.argmax())].as_py()
+                got = labels["frame_id"][int(wrong.argmax())].as_py()
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
-                raise UserError(dataset.store, "labels: frame_id", found, expected)
+                raise UserError(dataset.store, "labels: frame_id", got, expected)
             craters = read_craters(dataset, str(scene_id))
             # Labels of another split have the index -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
@@ -154,8 +154,8 @@ def frame_labels(
     ids = labels["crater_id"].to_numpy()
     known = (np.append(craters.crater_id, -1)[np.searchsorted(craters.crater_id, ids)] == ids) & (ids >= 0)
     if not known.all():
-        found = f"{ids[known.argmin()]} in {row['frame_id']}"
-        raise UserError(dataset.store, "labels: crater_id", found, "craters; see `perilune-manifest validate`")
+        got = f"{ids[known.argmin()]} in {row['frame_id']}"
+        raise UserError(dataset.store, "labels: crater_id", got, "craters; see `perilune-manifest validate`")
     scene_labels = _SceneLabels.of(labels, craters, limits.selection)
     ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, scene_labels.crater_id)
     frames = _Joined()

@@ -21,7 +21,7 @@ from perilune_train.detect.data.split import DetectSplit
 _UNCHANGED = AugmentSettings(
     flips_and_turns=False, scale=(1.0, 1.0), gain=0.0, gamma=0.0, stretch=0.0, blur_px=0.0, noise=0.0
 )
-_LARGEST_SHARE = 0.25
+_MAX_SHARE = 0.25
 """Share of the memory of a GPU that resident frames may take."""
 _PORTION = 256
 """Frames whose assignments are computed together."""
@@ -116,7 +116,7 @@ def may_reside(config: DetectConfig) -> bool:
 
 def fits(split: DetectSplit, device: torch.device) -> bool:
     """Whether the frames of a split take at most a quarter of the memory of a GPU; assignments take far less."""
-    return split.frames.images.nbytes <= _LARGEST_SHARE * torch.cuda.get_device_properties(device).total_memory
+    return split.frames.images.nbytes <= _MAX_SHARE * torch.cuda.get_device_properties(device).total_memory
 
 
 class _Numbers(torch_data.Dataset):

@@ -39,7 +39,7 @@ class DetectSplit:
         return len(self.labels)
 
     def first(self, count: int) -> "DetectSplit":
-        """The first `count` frames of this split, as a split of its own."""
+        """The first `count` frames of this split, as a separate split."""
         frames = FrameStore(self.frames.table.iloc[:count], self.frames.images[:count])
         labels = self.labels[:count]
         boxes = np.concatenate([part.boxes[part.selected] for part in labels])

@@ -16,7 +16,7 @@ from torch import nn
 
 from perilune_shared.errors import UserError
 from perilune_shared.threads import cores_in_affinity, usable_cores
-from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
+from perilune_train.training.checkpoint_file import MAX_WEIGHT_BYTES
 
 Array = NDArray[np.float32]
 Engine = Callable[[Array], tuple[Array, Array]]
@@ -117,8 +117,8 @@ def _readable(path: Path) -> Any:
     """Raise UserError if an engine cannot read a file; engines raise various kinds of RuntimeError."""
     if not path.is_file():
         raise UserError(path, "network", "no such file", _EXPECTED)
-    if path.stat().st_size > MOST_WEIGHT_BYTES:
-        raise UserError(path, "network", f"{path.stat().st_size} bytes", f"at most {MOST_WEIGHT_BYTES}")
+    if path.stat().st_size > MAX_WEIGHT_BYTES:
+        raise UserError(path, "network", f"{path.stat().st_size} bytes", f"at most {MAX_WEIGHT_BYTES}")
     try:
         if path.suffix == ".onnx":
             _check_no_other_files(path)
@@ -137,7 +137,7 @@ def _check_no_other_files(path: Path) -> None:
     model = package("onnx").load(str(path), load_external_data=False)
     names = [f"a tensor in the file {each.value!r}" for tensor in _tensors(model) for each in tensor.external_data]
     if names:
-        raise UserError(path, "network", names[0], f"{_EXPECTED}, which holds its own tensors")
+        raise UserError(path, "network", names[0], f"{_EXPECTED}, which contains all its tensors")
 
 
 def _tensors(message: Any) -> Iterator[Any]:

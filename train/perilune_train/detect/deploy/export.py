@@ -182,8 +182,8 @@ def export_run(
     if opened is not None:
         camera = opened.info.camera
         if (camera.width_px, camera.height_px) != (size_px, size_px):
-            found = f"{camera.width_px} x {camera.height_px}"
-            raise UserError(opened.store, "frames", found, f"{size_px} x {size_px} pixels; --size-px sets it")
+            got = f"{camera.width_px} x {camera.height_px}"
+            raise UserError(opened.store, "frames", got, f"{size_px} x {size_px} pixels; --size-px sets it")
     metadata = export_metadata(trained, size_px)
     terrain, terrain_check = _terrain(trained.checkpoint, opened if int8 else None, allow_overlap)
     metadata["terrain"] = {**terrain.plain(), **(terrain_check.metrics() if terrain_check is not None else {})}

@@ -152,7 +152,7 @@ def _of_labels(
     threshold: float,
     resamples: Resamples,
 ) -> BinFigures:
-    """Recall of the labels `in_bin` (L,); the matches are those of all labels."""
+    """Recall of the labels `in_bin` (L,); the matches cover all labels."""
     hit = np.zeros(len(in_bin), np.bool_)
     hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
     frames = overlaps.label_frame[in_bin]

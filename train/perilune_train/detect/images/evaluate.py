@@ -95,7 +95,7 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
     tiling, min_size_px, threshold = settings.tiling, settings.min_size_px, settings.threshold
     tiling.check()
     if not 0 < min_size_px < np.inf:
-        raise UserError("--min-size", "pixels", min_size_px, "above 0")
+        raise UserError("--min-size", "", min_size_px, "above 0")
     image_set = read_images(source, settings.request)
     if not any(image.selected(min_size_px).any() for image in image_set.images):
         raise UserError(source, "boxes", f"none of {min_size_px:g} px or more", "at least one")

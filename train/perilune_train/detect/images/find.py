@@ -112,7 +112,7 @@ def load_detector(run_or_file: str | PathLike[str] | None = None) -> CraterDetec
     """Load a crater detector: the installed detector, or the detector of a run.
 
     `run_or_file` is the folder of a detect run, a file in it (such as checkpoints/best.ckpt), or the name of an
-    installed network. Raises UserError if it is none of these.
+    installed network. Raises UserError on other values.
 
         craters = load_detector()("photo.png")
     """

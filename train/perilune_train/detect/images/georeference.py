@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 """Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
-_LARGEST_PRJ = 2**16
+_MAX_PRJ = 2**16
 _CORNERS = 32
 _GRID = 17
 """Sample points per side to test whether an image lies on its map. The corners alone are not enough: in an image of the
@@ -97,7 +97,7 @@ def read_georeference(path: Path) -> Georeference | None:
 
 def _prj_text(path: Path) -> str:
     with path.open("rb") as file:
-        return file.read(_LARGEST_PRJ).decode("utf-8")
+        return file.read(_MAX_PRJ).decode("utf-8")
 
 
 def can_read_georeferences() -> bool:

@@ -63,7 +63,7 @@ def read_images(source: Path, request: Request = Request()) -> ImageSet:
     else:
         raise UserError(source, "--images", "no such folder", "a folder of images with labels, or a label file")
     if request.split is not None and not split:
-        raise UserError("--split", "split", request.split, f"a source with splits; {source.name} has none")
+        raise UserError("--split", "", request.split, f"a source with splits; {source.name} has none")
     if split:
         say(f"{source.name}: {split}")
     return replace(image_set(label_file, request.categories), split=split)
@@ -210,8 +210,8 @@ def _from_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled:
     pictures_by_label: dict[Path, Path] = {}
     for picture, path in files.items():
         if path in pictures_by_label:
-            found = f"{path.name}, also the label file of {pictures_by_label[path].name}"
-            raise UserError(picture, "labels", found, "one image for each label file")
+            got = f"{path.name}, also the label file of {pictures_by_label[path].name}"
+            raise UserError(picture, "labels", got, "one image for each label file")
         pictures_by_label[path] = picture
     suffix = next(iter(pictures_by_label)).suffix.lower()
     notes = [f"{n_unlabelled} images without labels are left out"] if n_unlabelled else []

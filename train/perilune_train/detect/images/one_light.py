@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from perilune_train.detect.evaluate.matching import Detections
 
-LEAST_AGREEMENT = 0.8
+MIN_AGREEMENT = 0.8
 """A picture with a lower agreement is flagged as possibly not lunar."""
-LEAST_CRATERS = 10
+MIN_CRATERS = 10
 """Number of craters below which the agreement is not meaningful."""
-_MOST_CRATERS = 500
-_LEAST_SIDE_PX, _LEAST_SCORE = 4, 0.5
+_MAX_CRATERS = 500
+_MIN_SIDE_PX, _MIN_SCORE = 4, 0.5
 _SIDE, _FLAT = 16, 1e-6
 _STEPS = np.linspace(-1, 1, _SIDE)
 _IN_DISC = np.hypot(_STEPS, _STEPS[:, None]) <= 1
@@ -30,22 +30,22 @@ _WEIGHTS = np.stack([np.where(_IN_DISC, _STEPS, 0.0), np.where(_IN_DISC, _STEPS[
 """Weights (2, 16, 16) of the slope of grey levels along x and y in the disc inside a box."""
 
 
-def doubt_of(image: NDArray[np.uint8], found: Detections) -> str | None:
+def doubt_of(image: NDArray[np.uint8], detections: Detections) -> str | None:
     """Return a warning if a grey image (height, width) does not look like the Moon, else None."""
-    agreement, count = agreement_of_light(image, found)
-    if count < LEAST_CRATERS or agreement >= LEAST_AGREEMENT:
+    agreement, count = agreement_of_light(image, detections)
+    if count < MIN_CRATERS or agreement >= MIN_AGREEMENT:
         return None
-    got = f"got {agreement:.2f}, expected at least {LEAST_AGREEMENT} from one Sun; is it a picture of the Moon?"
+    got = f"got {agreement:.2f}, expected at least {MIN_AGREEMENT} from one Sun; is it a picture of the Moon?"
     return f"agreement of the light on {count} craters: {got}"
 
 
-def agreement_of_light(image: NDArray[np.uint8], found: Detections) -> tuple[float, int]:
+def agreement_of_light(image: NDArray[np.uint8], detections: Detections) -> tuple[float, int]:
     """Return the agreement (0 to 1) of the light directions in the highest-scored craters, and their number."""
     height, width = image.shape
-    best = np.argsort(-found.scores, kind="stable")
-    best = best[found.scores[best] >= _LEAST_SCORE]
-    boxes = np.clip(np.rint(found.boxes[best]), 0, [width, height, width, height]).astype(int)
-    boxes = boxes[(boxes[:, 2:] - boxes[:, :2] >= _LEAST_SIDE_PX).all(axis=1)][:_MOST_CRATERS]
+    best = np.argsort(-detections.scores, kind="stable")
+    best = best[detections.scores[best] >= _MIN_SCORE]
+    boxes = np.clip(np.rint(detections.boxes[best]), 0, [width, height, width, height]).astype(int)
+    boxes = boxes[(boxes[:, 2:] - boxes[:, :2] >= _MIN_SIDE_PX).all(axis=1)][:_MAX_CRATERS]
     directions = []
     for x0, y0, x1, y1 in boxes:
         patch = cv2.resize(image[y0:y1, x0:x1], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)

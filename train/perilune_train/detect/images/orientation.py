@@ -18,7 +18,7 @@ UPRIGHT = 1
 ORIENTATION_TAG = 274
 _MIRRORED, _HALF_TURNED, _TRANSPOSED = (2, 3, 6, 7), (3, 4, 7, 8), (5, 6, 7, 8)
 """Orientations with reversed columns, with reversed rows, and with rows and columns exchanged first."""
-_LARGEST_EXIF = 2**20
+_MAX_EXIF = 2**20
 _BIG_TIFF = (b"II\x2b\x00", b"MM\x00\x2b")
 
 
@@ -92,7 +92,7 @@ def _late_exif(path: Path) -> bytes:
         file.seek(8)
         while len(head := file.read(8)) == 8:
             length = int.from_bytes(head[:4], "big")
-            if head[4:] == b"eXIf" and length <= _LARGEST_EXIF:
+            if head[4:] == b"eXIf" and length <= _MAX_EXIF:
                 return b"Exif\0\0" + file.read(length)
             file.seek(length + 4, io.SEEK_CUR)
     return b""

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.records.pictures import save_image
 
-MOST_DRAWN = 1000
+MAX_DRAWN = 1000
 """Maximum number of craters in an overlay: more lines would hide the ground."""
-_LARGEST_PX = 4096
-_SMALLEST_PX = 1600
+_MAX_PX = 4096
+_MIN_PX = 1600
 _LINE_OPACITY = 0.8
 """Lines are one pixel wide, OpenCV's minimum, so that the ground shows through."""
 _DARKEST = 80
@@ -24,16 +24,16 @@ _STRIP_SHARE = 0.02
 def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, threshold: float) -> None:
     """Draw the detections as ellipses over the image; small images are enlarged, large ones reduced.
 
-    Colours go from purple (the threshold) to yellow (a score of 1). Draws at most the MOST_DRAWN detections of the
+    Colours go from purple (the threshold) to yellow (a score of 1). Draws at most the MAX_DRAWN detections of the
     highest scores; the strip below the image states their number.
     """
     side = max(image.shape)
-    factor = min(max(_SMALLEST_PX // side, 1), 4) if side < _LARGEST_PX else _LARGEST_PX / side
+    factor = min(max(_MIN_PX // side, 1), 4) if side < _MAX_PX else _MAX_PX / side
     size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
     # Draw the strongest last, on top of the others.
-    drawn = np.argsort(detections.scores, kind="stable")[-MOST_DRAWN:]
+    drawn = np.argsort(detections.scores, kind="stable")[-MAX_DRAWN:]
     lines = canvas.copy()
     for k, colour in zip(drawn, _colours(detections.scores[drawn], threshold), strict=True):
         draw_boxes(lines, detections.boxes[k : k + 1] * factor, colour)

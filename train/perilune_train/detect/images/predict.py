@@ -49,7 +49,7 @@ class PredictSettings:
     nodata: float | None = None
     """Value of pixels without data."""
     top: int | None = None
-    """Maximum number of craters in an image, those of the highest scores; None for all."""
+    """Maximum number of craters in an image; the highest scores are kept. None keeps all."""
 
 
 def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:

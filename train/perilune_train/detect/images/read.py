@@ -30,14 +30,14 @@ from perilune_train.detect.images.orientation import (
     tiff_tags,
     upright,
 )
-from perilune_train.detect.images.stretch import LARGEST_VALUE, SAMPLE, Stretch, stretch_of
+from perilune_train.detect.images.stretch import MAX_VALUE, SAMPLE, Stretch, stretch_of
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".img", ".cub", ".lbl")
 _KINDS = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000", "ISIS3": "ISIS cube", "PDS": "PDS3"}
-LARGEST_PIXELS = 2**29
+MAX_PIXELS = 2**29
 """Largest number of pixels of an image: twice a whole Narrow Angle Camera image. A limit is needed, because the header
 of a small file can state any size."""
-LARGEST_DECODED = 2**30
+MAX_DECODED = 2**30
 """Largest size, bytes, of a picture that is decoded as a whole; only rasterio reads larger pictures."""
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _BITS_TAG, _PHOTOMETRIC_TAG, _SAMPLE_FORMAT_TAG, _NODATA_TAG = 258, 262, 339, 42113
@@ -116,8 +116,8 @@ def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> N
             grey[rows] = _grey_of(bands, picture, nodata, stretch)
         if stretch is not None and stretch.fills and not quiet:
             values = ", ".join(f"{fill:g}" for fill in stretch.fills)
-            found = f"{stretch.fill_share:.1%} of the pixels are {values}, far from all others"
-            say(f"{path.name}: {found}: taken as no data (--nodata sets the value)")
+            fills = f"{stretch.fill_share:.1%} of the pixels are {values}, far from all others"
+            say(f"{path.name}: {fills}: taken as no data (--nodata sets the value)")
         return grey if picture.is_upright else upright(grey, picture.orientation)
 
 
@@ -128,17 +128,17 @@ def grey_of_array(pixels: NDArray, where: object = "image") -> NDArray[np.uint8]
     """
     kind = pixels.dtype.kind
     if kind not in "buif" or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
-        found, expected = f"{pixels.dtype} of shape {pixels.shape}", "numbers (height, width) or (height, width, 3)"
-        raise UserError(where, "pixels", found, expected)
-    if pixels.size == 0 or pixels.size > LARGEST_PIXELS:
-        raise UserError(where, "pixels", f"shape {pixels.shape}", f"1 to {LARGEST_PIXELS} pixels")
+        got, expected = f"{pixels.dtype} of shape {pixels.shape}", "numbers (height, width) or (height, width, 3)"
+        raise UserError(where, "pixels", got, expected)
+    if pixels.size == 0 or pixels.size > MAX_PIXELS:
+        raise UserError(where, "pixels", f"shape {pixels.shape}", f"1 to {MAX_PIXELS} pixels")
     bands = [pixels] if pixels.ndim == 2 else [pixels[..., k] for k in range(3 if pixels.shape[2] > 1 else 1)]
     if pixels.dtype in (np.bool_, np.uint8):
         grey = np.rint(_luma(np.stack(bands))) if len(bands) > 1 else bands[0] * (255 if kind == "b" else 1)
         return np.ascontiguousarray(grey, np.uint8)
     small = pixels.dtype.itemsize <= 2 or pixels.dtype == np.float32
     values = np.stack(bands).astype(np.float32 if small else np.float64)
-    values[~(np.abs(values) <= LARGEST_VALUE)] = np.nan
+    values[~(np.abs(values) <= MAX_VALUE)] = np.nan
     values = _luma(values) if len(bands) > 1 else values[0]
     known = values[np.isfinite(values)]
     return stretch_of(known[:: max(known.size // SAMPLE, 1)], find_fills=True).grey(values)
@@ -176,9 +176,9 @@ def _values(bands: NDArray, picture: _Picture, nodata: float | None) -> NDArray:
     # float32 holds all 16-bit values; 32-bit values need float64.
     small = bands.dtype.itemsize <= 2 or bands.dtype == np.float32
     values = bands.astype(np.float32 if small else np.float64)
-    values[~(np.abs(values) <= LARGEST_VALUE)] = np.nan
+    values[~(np.abs(values) <= MAX_VALUE)] = np.nan
     for missing in (nodata, picture.nodata):
-        if missing is not None and abs(missing) <= LARGEST_VALUE:
+        if missing is not None and abs(missing) <= MAX_VALUE:
             values[values == (np.float32(missing) if values.dtype == np.float32 else missing)] = np.nan
     grey = _luma(values) if len(values) > 1 else values[0]
     return -grey if picture.white_is_zero else grey
@@ -324,7 +324,7 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
 
 
 def _check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
-    most = min(LARGEST_PIXELS, LARGEST_DECODED // bytes_per_pixel)
+    most = min(MAX_PIXELS, MAX_DECODED // bytes_per_pixel)
     if width * height > most:
         raise UserError(path, "size", f"{width} x {height}", f"at most {most} pixels, for {bytes_per_pixel} bytes each")
 

@@ -11,12 +11,12 @@ from PIL import Image
 
 from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
-from perilune_train.detect.images.read import LARGEST_PIXELS
+from perilune_train.detect.images.read import MAX_PIXELS
 
 VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
-_MOST_PIXELS = 2**32
+_MAX_PIXELS = 2**32
 """Maximum number of pixels of all frames: 2000 frames of 1920 x 1080, or 65,000 frames of 256 x 256."""
-_MOST_PAGES, _NEW_SUBFILE_TYPE = 65_536, 254
+_MAX_PAGES, _NEW_SUBFILE_TYPE = 65_536, 254
 _STARTS = ((4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (0, b"RIFF"), (0, b"\x1aE\xdf\xa3"))
 """First bytes of MP4, QuickTime, AVI and Matroska files. Other files are refused, because FFmpeg would also read lists
 of other files and of network addresses."""
@@ -26,7 +26,7 @@ def frames_of(path: Path, folder: Path) -> list[Path] | None:
     """Write the frames of a video, or the pages of a TIFF, into a folder as <file name>.<index>.png (or .tif).
 
     Returns None if the file is a single picture. Raises UserError if OpenCV cannot decode a video, or if all frames
-    together have more than _MOST_PIXELS.
+    together have more than _MAX_PIXELS.
     """
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _of_video(path, folder)
@@ -50,8 +50,8 @@ def _of_video(path: Path, folder: Path) -> list[Path]:
         width, height = (int(capture.get(each)) for each in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not capture.isOpened() or width <= 0 or height <= 0:
             raise UserError(path, "video", "no frame that OpenCV can decode", expected)
-        if width * height > LARGEST_PIXELS:
-            raise UserError(path, "size", f"{width} x {height} pixels", f"at most {LARGEST_PIXELS} pixels")
+        if width * height > MAX_PIXELS:
+            raise UserError(path, "size", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
         paths: list[Path] = []
         while (decoded := capture.read())[0]:
             _check_total(path, (len(paths) + 1) * width * height)
@@ -72,7 +72,7 @@ def _pages(path: Path) -> list[int]:
     """
     pages: list[int] = []
     with contextlib.suppress(OSError, ValueError, SyntaxError, EOFError), _opened(path) as image:
-        for number in range(_MOST_PAGES):
+        for number in range(_MAX_PAGES):
             image.seek(number)
             # Bit 0 marks a smaller copy of another page, such as a GeoTIFF overview; bit 2 marks a mask.
             if not int(image.tag_v2.get(_NEW_SUBFILE_TYPE, 0)) & 0b101:  # type: ignore[attr-defined]
@@ -99,8 +99,8 @@ def _of_tiff(path: Path, pages: list[int], folder: Path) -> list[Path]:
                 image.seek(page)
                 pixels += image.width * image.height
                 _check_total(path, pixels)
-                if image.width * image.height > LARGEST_PIXELS:
-                    raise UserError(path, f"page {page}", f"{image.width} x {image.height}", f"{LARGEST_PIXELS} pixels")
+                if image.width * image.height > MAX_PIXELS:
+                    raise UserError(path, f"page {page}", f"{image.width} x {image.height}", f"{MAX_PIXELS} pixels")
                 paths.append(folder / f"{path.name}.{number:06d}.tif")
                 image.save(paths[-1])
             except (OSError, SyntaxError, ValueError) as error:
@@ -110,6 +110,6 @@ def _of_tiff(path: Path, pages: list[int], folder: Path) -> list[Path]:
 
 
 def _check_total(path: Path, pixels: int) -> None:
-    if pixels > _MOST_PIXELS:
-        expected = f"at most {_MOST_PIXELS}; take fewer frames: ffmpeg -i {path.name} -vf fps=1 %06d.png"
-        raise UserError(path, "pixels of all frames", f"more than {_MOST_PIXELS}", expected)
+    if pixels > _MAX_PIXELS:
+        expected = f"at most {_MAX_PIXELS}; take fewer frames: ffmpeg -i {path.name} -vf fps=1 %06d.png"
+        raise UserError(path, "pixels of all frames", f"more than {_MAX_PIXELS}", expected)

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 PERCENT = (0.05, 99.95)
 """The percentiles between which 99.9 % of the values lie."""
 SAMPLE = 1_000_000
-LARGEST_VALUE = 1e30
+MAX_VALUE = 1e30
 """Larger values are not measurements: ISIS marks missing data with values near the end of float32's range."""
 _FILL_SHARE = PERCENT[0] / 100
 """A fill value with a smaller share does not affect the stretch."""
-_MOST_FILLS = 8
+_MAX_FILLS = 8
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ def stretch_of(sample: NDArray, find_fills: bool) -> Stretch:
 
 
 def _isolated_end(values: NDArray, n_all: int) -> list[float]:
-    """The smallest values, at most _MOST_FILLS, if they are fill values; otherwise [].
+    """The smallest values, at most _MAX_FILLS, if they are fill values; otherwise [].
 
     Many pixels must share them, and their distance to all other values must exceed the range of the others.
     """
     distinct, counts = np.unique(values, return_counts=True)
-    for n_fills in range(min(_MOST_FILLS, len(distinct) - 2), 0, -1):
+    for n_fills in range(min(_MAX_FILLS, len(distinct) - 2), 0, -1):
         if counts[:n_fills].sum() < max(_FILL_SHARE * n_all, 2):
             break
         rest = values[values >= distinct[n_fills]]

@@ -22,7 +22,7 @@ from perilune_train.detect.inference.tiling import Tiling
 Array = NDArray[np.float64]
 _MAX_TOGETHER = 5_000
 """Largest number of boxes that are suppressed together; more boxes are suppressed block by block."""
-_MOST_ENLARGED_PIXELS = 2**27
+_MAX_ENLARGED_PIXELS = 2**27
 """An image that would have more pixels when enlarged is enlarged tile by tile."""
 _TOLERANCE_PX = 2.0
 """Tolerance of the distance to a tile's border. Two tiles detect a crater at slightly different positions; without a
@@ -66,7 +66,7 @@ def detect_image(
     boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
     for scale in tiling.scales:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
-        large = scale > 1 and size[0] * size[1] > _MOST_ENLARGED_PIXELS and min(size) >= tiling.tile_px
+        large = scale > 1 and size[0] * size[1] > _MAX_ENLARGED_PIXELS and min(size) >= tiling.tile_px
         scaled = Enlarged(image, *size) if large else resized(image, *size)
         whole = scaled if isinstance(scaled, Enlarged) else padded(scaled, tiling.tile_px)
         for detections in _detect_tiles(detector, whole, tiling, advance):

@@ -24,10 +24,10 @@ class Tiling:
     def check(self) -> None:
         """Raise UserError on unusable values."""
         if self.tile_px < COARSEST_STRIDE or self.tile_px % COARSEST_STRIDE:
-            raise UserError("--tile", "pixels", self.tile_px, f"a multiple of {COARSEST_STRIDE}")
+            raise UserError("--tile", "", self.tile_px, f"a multiple of {COARSEST_STRIDE}")
         if not 0 <= self.overlap_px < self.tile_px:
-            raise UserError("--overlap", "pixels", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
+            raise UserError("--overlap", "", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
         if not self.scales or not all(0.05 <= scale <= 8 for scale in self.scales):
-            raise UserError("--scale", "factor", list(self.scales), "0.05 to 8")
+            raise UserError("--scale", "", list(self.scales), "0.05 to 8")
         if not 0 <= self.box_margin_px <= 10:
-            raise UserError("--box-margin", "pixels", self.box_margin_px, "0 to 10")
+            raise UserError("--box-margin", "", self.box_margin_px, "0 to 10")

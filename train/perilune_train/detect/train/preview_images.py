@@ -11,7 +11,7 @@ from perilune_train.detect.evaluate.matching import Detections
 
 COUNT = 4
 """Number of frames that are drawn."""
-_LEAST_SIDE_PX = 512
+_MIN_SIDE_PX = 512
 _LABEL, _DETECTION = (240, 228, 66), (86, 180, 233)
 
 
@@ -28,7 +28,7 @@ def preview_images(
     images = {}
     for number in chosen.tolist():
         grey = split.frames.images[number]
-        factor = max(1, _LEAST_SIDE_PX // max(grey.shape))
+        factor = max(1, _MIN_SIDE_PX // max(grey.shape))
         image = cv2.cvtColor(grey.repeat(factor, 0).repeat(factor, 1), cv2.COLOR_GRAY2RGB)
         labels = split.labels[number]
         for cx, cy, a, b, theta in labels.ellipses[labels.selected].tolist():

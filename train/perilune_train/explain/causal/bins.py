@@ -26,7 +26,7 @@ BINS = {
 """Label and edges of the bins of each property of a crater."""
 OUTSIDE = "outside"
 """Name of the bin for values outside all other bins; it is not drawn."""
-MOST_ROWS = 6
+MAX_ROWS = 6
 """Largest number of gates drawn as bars, in one row of panels per gate; more gates are drawn as a heat map."""
 
 
@@ -83,7 +83,7 @@ def draw_gate_bins(path: Path, table: pd.DataFrame) -> None:
     `table` is the result of `binned` with the column map.
     """
     gates = list(dict.fromkeys(table["map"]))
-    if len(gates) <= MOST_ROWS:
+    if len(gates) <= MAX_ROWS:
         draw_bins(path, {f"change of {gate},\ndeviations of the gate": table[table["map"] == gate] for gate in gates})
         return
     versions = [version for version in VERSIONS if (table["version"] == version).any()]

@@ -128,7 +128,7 @@ def causal_run(
     marks, terrain = terrain_marks(fitted, allow_overlap, split)
     detector = open_single_scale(checkpoint, config, settings)
     if gate not in detector.network.backbone.attentions:
-        raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
+        raise UserError("--gate", "", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
     pairs = crater_pairs(opened, open_single(inputs.counterfactual), removed, split, config.labels)
     # Report errors in the other inputs before writing anything.
     if turned is not None:

@@ -199,6 +199,6 @@ def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> Non
     )
     for trajectory, count in changed.items():
         if whole[trajectory] != count:
-            found = f"{count} frames of {trajectory}"
+            got = f"{count} frames of {trajectory}"
             expected = "all frames of a trajectory of the dataset; render with --frames-per-trajectory 1000"
-            raise UserError(counterfactual.store, "frames", found, expected)
+            raise UserError(counterfactual.store, "frames", got, expected)

@@ -17,7 +17,7 @@ from perilune_train.data.frames import frame_table, load_images
 _LABELS = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _REMOVED = ["scene_id", "crater_id", "depth_ratio"]
-_MOST_BYTES = 64 * 2**20
+_MAX_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFr
     rows, whole = (frame_table(dataset, split) for dataset in (other, factual))
     known = whole[whole["frame_id"].isin(rows["frame_id"])].reset_index(drop=True)
     if known["frame_id"].tolist() != rows["frame_id"].tolist():
-        found = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
-        raise UserError(other.store, "frames", found, "frames of the dataset that it was rendered from")
+        got = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
+        raise UserError(other.store, "frames", got, "frames of the dataset that it was rendered from")
     return known, rows
 
 
@@ -74,9 +74,9 @@ def read_removed(address: Address) -> pd.DataFrame:
     above, _, name = f"{str(address).rstrip('/')}.removed.parquet".rpartition("/")
     store = open_store(above or ".")
     if not store.exists(name):
-        raise UserError(store.at(name), "table", "no such file", "that of `perilune-render counterfactual`")
+        raise UserError(store.at(name), "table", "no such file", "the table of `perilune-render counterfactual`")
     try:
-        table = pd.read_parquet(io.BytesIO(store.read(name, most_bytes=_MOST_BYTES)), columns=_REMOVED)
+        table = pd.read_parquet(io.BytesIO(store.read(name, most_bytes=_MAX_BYTES)), columns=_REMOVED)
     except (ValueError, OSError) as error:
         raise UserError(store.at(name), "table", str(error).splitlines()[0], ", ".join(_REMOVED)) from None
     if table.empty:

@@ -12,7 +12,7 @@ from perilune_train.explain.maps.masks import Masks
 from perilune_train.records.pictures import save_image
 
 _CELL_PX = 160
-_MOST_COLUMNS = 8
+_MAX_COLUMNS = 8
 _WHITE = (255, 255, 255)
 
 
@@ -25,7 +25,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
     """
     low = min(float(gate_masks.min()) for gate_masks in masks.values())
     high = max(float(gate_masks.max()) for gate_masks in masks.values())
-    columns = min(_MOST_COLUMNS, 1 + len(masks))
+    columns = min(_MAX_COLUMNS, 1 + len(masks))
     sheet = []
     for n, image in enumerate(images):
         height = round(_CELL_PX * image.shape[0] / image.shape[1])

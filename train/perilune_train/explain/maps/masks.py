@@ -19,7 +19,7 @@ Masks = dict[str, NDArray[np.float32]]
 """Masks (N, height, width) of N images by block "B_ij", resized to the size of the frames."""
 
 _BATCH = 8
-LARGEST_PX = 64
+MAX_PX = 64
 """Largest width of a stored mask, pixels. Native masks of deep gates are smaller."""
 
 
@@ -87,7 +87,7 @@ def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
     arrays: dict[str, np.ndarray] = {}
     for block, block_masks in masks.items():
         low, high = float(block_masks.min()), float(block_masks.max())
-        width = min(LARGEST_PX, max(8, block_masks.shape[2] // 2 ** int(block[2])))
+        width = min(MAX_PX, max(8, block_masks.shape[2] // 2 ** int(block[2])))
         size = width, max(1, round(block_masks.shape[1] * width / block_masks.shape[2]))
         small = np.stack([cv2.resize(mask, size, interpolation=cv2.INTER_AREA) for mask in block_masks])
         arrays[block] = np.rint(255 * (small - low) / max(high - low, 1e-9)).clip(0, 255).astype(np.uint8)

@@ -13,7 +13,7 @@ from perilune_train.explain.evidence.significance import BEATS, LEVEL, UNDECIDED
 from perilune_train.explain.evidence.tables import Evidence
 from perilune_train.records.spread import MIN_UNITS
 
-LEAST_DEVIATION = 0.02
+MIN_DEVIATION = 0.02
 """Smallest standard deviation, over pixels and images, at which a mask does not count as constant."""
 _REMOVES = "removing the 20 %"
 STILL_FROM = 37
@@ -126,9 +126,9 @@ def headline(claims: list[Claim]) -> str:
 
 def _constant(task: str, deviations: dict[str, float], picture: str) -> Claim:
     least = min(deviations, key=lambda block: deviations[block])
-    constant = [block for block, value in deviations.items() if value < LEAST_DEVIATION]
+    constant = [block for block, value in deviations.items() if value < MIN_DEVIATION]
     return Claim(
-        f"{task}: no gate is constant (standard deviation over pixels and images at least {LEAST_DEVIATION:g})",
+        f"{task}: no gate is constant (standard deviation over pixels and images at least {MIN_DEVIATION:g})",
         f"{len(constant)} of {len(deviations)} constant; least {deviations[least]:.3f} ({least})",
         "-",
         "-",

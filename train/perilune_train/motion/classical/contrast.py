@@ -10,7 +10,7 @@ from perilune_shared.geometry.frames import Array
 
 _FINE_PX, _COARSE_PX = 0.5, 2.0
 """Standard deviations of the fine and the coarse blur, pixels. Chosen on training and validation scenes."""
-_LEAST_BACKGROUND = 2.0
+_MIN_BACKGROUND = 2.0
 """Grey value that is added to the background, so that the contrast in black shadow stays finite."""
 
 
@@ -34,7 +34,7 @@ def local_contrast(image: np.ndarray) -> Array:
     fine, coarse = (
         cv2.GaussianBlur(grey, (0, 0), sigma, borderType=cv2.BORDER_REFLECT) for sigma in (_FINE_PX, _COARSE_PX)
     )
-    return (fine - coarse) / (coarse + _LEAST_BACKGROUND)
+    return (fine - coarse) / (coarse + _MIN_BACKGROUND)
 
 
 def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:

@@ -51,7 +51,7 @@ class Ahead(Generic[Key, Item]):
         next(self._expected)
         self._made, self._stop = queue.Queue(self._most), threading.Event()
         arguments = (self._following(key), self._made, self._stop)
-        # A daemon thread: it must not keep a process alive that ends with an error.
+        # A daemon thread, so that a process that ends with an error does not wait for it.
         self._thread = threading.Thread(target=self._run, args=arguments, name="ahead", daemon=True)
         self._thread.start()
 
@@ -71,7 +71,7 @@ class Ahead(Generic[Key, Item]):
                 yield key
 
         try:
-            for found in self._make(wanted()):
-                put(found)
+            for item in self._make(wanted()):
+                put(item)
         except BaseException as error:
             put(error)

@@ -100,8 +100,8 @@ class Stream:
         use = served_terrain(where, ground.dataset, scene, ground.dem_source, ground.content_sha256)
         for other in sorted(self._held_out):
             if other.sha256 == use.sha256:
-                found = f"the terrain of {other.scene_id} of the dataset ({other.use})"
-                raise UserError(where, f"scene {scene}", found, "terrain of no validation or test scene")
+                got = f"the terrain of {other.scene_id} of the dataset ({other.use})"
+                raise UserError(where, f"scene {scene}", got, "terrain of no validation or test scene")
         with self._lock:
             before = self._uses.setdefault(scene, use)
         if before != use:
@@ -112,8 +112,8 @@ class Stream:
     def _checked(self, image: np.ndarray) -> np.ndarray:
         size = (self.served.camera.height_px, self.served.camera.width_px)
         if image.dtype != np.uint8 or image.shape != size:
-            found = f"{image.dtype} {image.shape}"
-            raise UserError(self.settings.address, "image", found, f"uint8 {size}: dataset.sensor.bits 8")
+            got = f"{image.dtype} {image.shape}"
+            raise UserError(self.settings.address, "image", got, f"uint8 {size}: dataset.sensor.bits 8")
         return image
 
 

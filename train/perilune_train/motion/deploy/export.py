@@ -27,7 +27,7 @@ from perilune_train.records.provenance import read_provenance
 from perilune_train.training.runs import RunFolder, load_weights
 
 ONNX, METADATA, README = "navigator.onnx", "navigator.json", "README.md"
-LARGEST_DIFFERENCE = 1e-5
+MAX_DIFFERENCE = 1e-5
 """Largest accepted difference from torch, divided by the larger of 1 and the largest value of that output."""
 _OPSET = 17
 _PAIRS = 12
@@ -91,8 +91,8 @@ def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> f
         path = folder / ONNX
         _write_onnx(flight, path, pairs.inputs(0, fusion), fusion, hidden, metadata)
         largest = _largest_difference(path, network, architecture, pairs, fusion, focal)
-        if not largest <= LARGEST_DIFFERENCE:
-            raise UserError(path, "difference from torch", f"{largest:.2g}", f"at most {LARGEST_DIFFERENCE:g}")
+        if not largest <= MAX_DIFFERENCE:
+            raise UserError(path, "difference from torch", f"{largest:.2g}", f"at most {MAX_DIFFERENCE:g}")
         metadata["largest_difference_from_torch"] = largest
         metadata["sha256"] = sha256_of(path)
         write_text(folder / METADATA, json.dumps(metadata, indent=2) + "\n")

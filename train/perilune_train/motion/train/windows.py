@@ -19,7 +19,7 @@ from perilune_train.motion.network import Scales
 from perilune_train.motion.pose import normalised_frames, warped_frames
 from perilune_train.motion.train.views import view_homographies
 
-_LARGEST_SHARE = 0.25
+_MAX_SHARE = 0.25
 """Share of a GPU's free memory that frames may take; larger sets stay in main memory."""
 
 
@@ -113,7 +113,7 @@ class Windows:
     def _resident(self) -> Tensor:
         """All frames (frames, height, width), 8 bit, on the device if they are small enough."""
         frames = torch.from_numpy(np.concatenate(self.images))
-        if self.device.type != "cuda" or frames.numel() > _LARGEST_SHARE * torch.cuda.mem_get_info(self.device)[0]:
+        if self.device.type != "cuda" or frames.numel() > _MAX_SHARE * torch.cuda.mem_get_info(self.device)[0]:
             return frames
         return frames.to(self.device)
 

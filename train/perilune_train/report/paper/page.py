@@ -149,7 +149,7 @@ def _elsewhere(runs: PaperRuns) -> bool:
 
 def _starts(runs: PaperRuns) -> str:
     """A sentence on the initial weights of the headline rows and the transfer rows; empty if unknown."""
-    found = []
+    parts = []
     for ground, title in ((HEADLINE, "the headline rows"), (TRANSFER, "rows after transfer")):
         starts = {
             str(metrics["train/start"])
@@ -157,8 +157,8 @@ def _starts(runs: PaperRuns) -> str:
             for metrics in trainings
             if "train/start" in metrics
         }
-        found += [f"{title} from {' or '.join(map(_start, sorted(starts)))}"] if starts else []
-    return f" Weights: {', '.join(found)}." if found else ""
+        parts += [f"{title} from {' or '.join(map(_start, sorted(starts)))}"] if starts else []
+    return f" Weights: {', '.join(parts)}." if parts else ""
 
 
 def _start(start: str) -> str:
@@ -240,7 +240,7 @@ def _attention(runs: PaperRuns) -> list[str]:
         return [NOT_RUN]
     lines = [
         "Correlations do not depend on the range of a mask. Read them beside the masks: some may be nearly constant. A "
-        "gate beats a null if its mean is above that of the null by a test over scenes; one scene decides nothing.",
+        "gate beats a null if a test over scenes finds its mean above the null's mean; one scene is too few for this.",
         "",
         *gate_table(explained),
     ]

@@ -94,10 +94,10 @@
     l: () => toggle("labels"), d: () => toggle("detections"), m: toggleMask,
   };
   addEventListener("keydown", (event) => {
-    // A slider or a list has its own meaning of these keys.
-    const own = event.target.matches("select, input[type=range]") || event.target.closest("[tabindex]");
+    // A slider or a list uses these keys itself.
+    const handlesKeys = event.target.matches("select, input[type=range]") || event.target.closest("[tabindex]");
     if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
-    if (own && (event.key.startsWith("Arrow") || event.target === gate)) return;
+    if (handlesKeys && (event.key.startsWith("Arrow") || event.target === gate)) return;
     keys[event.key]();
     event.preventDefault();
   });

@@ -11,7 +11,7 @@ Box = tuple[float, float, float, float]
 """x0, y0, x1, y1 in pixels."""
 StatedSize = tuple[int | None, int | None]
 """Width and height in pixels; None if not stated."""
-LARGEST_PX = 1e6
+MAX_PX = 1e6
 
 
 def box_of(values: Any, path: Path, field: str, may_be_empty: bool = True) -> Box:
@@ -21,11 +21,11 @@ def box_of(values: Any, path: Path, field: str, may_be_empty: bool = True) -> Bo
     except (TypeError, ValueError, OverflowError):
         raise UserError(path, field, values, "four numbers: left, top, width, height") from None
     shorter = min(w, h)
-    if not all(math.isfinite(v) and abs(v) <= LARGEST_PX for v in (x, y, w, h)) or not (
+    if not all(math.isfinite(v) and abs(v) <= MAX_PX for v in (x, y, w, h)) or not (
         shorter > 0 or (may_be_empty and shorter == 0)
     ):
         least = "of at least 0" if may_be_empty else "above 0"
-        raise UserError(path, field, values, f"a width and height {least}, and no number beyond {LARGEST_PX:.0f} px")
+        raise UserError(path, field, values, f"a width and height {least}, and no number beyond {MAX_PX:.0f} px")
     return x, y, x + w, y + h
 
 
@@ -36,8 +36,8 @@ def around(points: Iterable[Any], path: Path, field: str) -> Box:
         xs, ys = zip(*pairs, strict=True)
     except (TypeError, ValueError, OverflowError):
         raise UserError(path, field, "no points", "pairs of numbers, x and y in pixels") from None
-    if not all(math.isfinite(v) and abs(v) <= LARGEST_PX for v in (*xs, *ys)):
-        raise UserError(path, field, "a number that is not finite or too large", f"at most {LARGEST_PX:.0f} px")
+    if not all(math.isfinite(v) and abs(v) <= MAX_PX for v in (*xs, *ys)):
+        raise UserError(path, field, "a number that is not finite or too large", f"at most {MAX_PX:.0f} px")
     return min(xs), min(ys), max(xs), max(ys)
 
 

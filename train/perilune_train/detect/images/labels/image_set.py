@@ -154,7 +154,7 @@ def choose_categories(
     known = ", ".join(names.values())
     for name, original in zip(asked, wanted, strict=True):
         if name not in {key.lower() for key in names} | {other.lower() for other in names.values()}:
-            raise UserError("--category", "name", original, f"one of {known}" if names else "a category of the labels")
+            raise UserError("--category", "", original, f"one of {known}" if names else "a category of the labels")
     among = asked or _CRATER_NAMES
     chosen = {key for key, name in names.items() if name.lower() in among or key.lower() in asked}
     if not chosen:
@@ -168,5 +168,5 @@ def _other_size(entry: Entry, size: tuple[int, int]) -> UserError:
     width, height = (stated or side for stated, side in zip(entry.size_px, size, strict=True))
     expected = f"{width} x {height}, as stated in {entry.labels.name}"
     if (height, width) == size and stored_size(entry.path) == (width, height):
-        expected += "; the picture's EXIF orientation turns it, and labels must be those of the upright picture"
+        expected += "; the picture's EXIF orientation turns it, and labels must refer to the upright picture"
     return UserError(entry.path, "size", f"{size[0]} x {size[1]}", expected)

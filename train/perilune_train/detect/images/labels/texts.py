@@ -9,13 +9,13 @@ from typing import Any
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.errors import UserError
 
-_LARGEST_TEXT, _LARGEST_XML, _LARGEST_JSON = 2**26, 2**26, 2**29
-_MOST_BRACKETS = 2**22
+_MAX_TEXT, _MAX_XML, _MAX_JSON = 2**26, 2**26, 2**29
+_MAX_BRACKETS = 2**22
 """Limit on objects, lists and elements: each takes 50 to 250 bytes of memory, but as few as 3 bytes in a file."""
 _DOCUMENT_TYPES = ("<!DOCTYPE", "<!ENTITY")
 
 
-def read_text(path: Path, field: str, largest: int = _LARGEST_TEXT) -> str:
+def read_text(path: Path, field: str, largest: int = _MAX_TEXT) -> str:
     """A text file in UTF-8. Raises UserError if it is missing, too large or of another encoding."""
     if not path.is_file():
         raise UserError(path, field, "no such file", "a label file")
@@ -30,9 +30,9 @@ def read_text(path: Path, field: str, largest: int = _LARGEST_TEXT) -> str:
 
 def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = None) -> Any:
     """The content of a JSON file; `hook` replaces each object, for example to drop parts of it."""
-    text = read_text(path, "JSON", _LARGEST_JSON)
-    if text.count("[") + text.count("{") > _MOST_BRACKETS:
-        raise UserError(path, "JSON", f"more than {_MOST_BRACKETS} lists and objects", "fewer, in several files")
+    text = read_text(path, "JSON", _MAX_JSON)
+    if text.count("[") + text.count("{") > _MAX_BRACKETS:
+        raise UserError(path, "JSON", f"more than {_MAX_BRACKETS} lists and objects", "fewer, in several files")
     try:
         return json.loads(text, object_hook=hook)
     except (ValueError, RecursionError) as error:
@@ -41,11 +41,11 @@ def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = No
 
 def read_xml(path: Path, expected: str) -> ET.Element:
     """The root of an XML file. Document types are refused: entities can fill the memory or refer to other files."""
-    text = read_text(path, "XML", _LARGEST_XML)
+    text = read_text(path, "XML", _MAX_XML)
     if any(word in text for word in _DOCUMENT_TYPES):
         raise UserError(path, "XML", "a document type or an entity", expected)
-    if text.count("<") > _MOST_BRACKETS:
-        raise UserError(path, "XML", f"more than {_MOST_BRACKETS} elements", "fewer, in several files")
+    if text.count("<") > _MAX_BRACKETS:
+        raise UserError(path, "XML", f"more than {_MAX_BRACKETS} elements", "fewer, in several files")
     try:
         return ET.fromstring(text)
     except (ET.ParseError, ValueError, RecursionError) as error:

@@ -38,8 +38,8 @@ def read_cvat(path: Path, image_folder: Path | None = None) -> LabelFile:
     """Read a file of CVAT for images: boxes, polygons, ellipses and masks. Other shapes are counted and omitted."""
     root = read_xml(path, "a file of CVAT for images")
     if root.tag != "annotations" or root.find("track") is not None:
-        found = "tracks of CVAT for video" if root.find("track") is not None else f"<{root.tag}>"
-        raise UserError(path, "XML", found, "<annotations> with <image>, as in CVAT for images")
+        got = "tracks of CVAT for video" if root.find("track") is not None else f"<{root.tag}>"
+        raise UserError(path, "XML", got, "<annotations> with <image>, as in CVAT for images")
     entries, n_left_out = [], 0
     for k, image in enumerate(root.findall("image")):
         field = f"image {k + 1}"

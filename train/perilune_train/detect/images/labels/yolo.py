@@ -85,7 +85,7 @@ def class_names(content: Mapping[str, Any]) -> dict[str, str]:
 
 
 def pictures_of_split(path: Path, value: Any) -> list[Path]:
-    """The pictures of a split of a data.yaml, which names folders or lists of paths, all below its own folder."""
+    """The pictures of a split of a data.yaml. Its folders and lists of paths must be below the folder of data.yaml."""
     root = path.resolve().parent
     images = []
     for name in value if isinstance(value, list) else [value]:
