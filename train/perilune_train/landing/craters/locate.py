@@ -22,6 +22,10 @@ _AHEAD = 1.3
 _MAX_TILT_RAD = float(np.radians(5))
 """A search knows the tilt to about a degree. Fixes with a tilt that differs by more than this are wrong: over level
 ground, a tilt has nearly the effect of a displacement, and some craters agree."""
+_WEAK_TILT_RAD, _KNOWN_TILT_RAD = float(np.radians(3)), float(np.radians(1))
+"""Standard deviations of a rotation: of a weak prior, and of the tilt of a camera that is lost in space."""
+_N_POLISHED = 3
+"""Largest number of fits from a candidate."""
 _SIGMAS = 3.5
 _ATTEMPTS = ((1.0, QUICK), (1.0, THOROUGH), (3.0, QUICK))
 """Searches, tried in turn: search radius, as a multiple of the radius that the prior suggests, and effort. The larger
@@ -68,7 +72,7 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
         shift_px = factor * max(_SIGMAS * on_ground_px, 20.0)
         limits = SearchRange(ground_m, shift_px, log_altitude, heading_rad)
         poses = candidates(sightings, catalogue, camera, prior.pose, limits, effort)
-        fix = _best(sightings, catalogue, camera, poses)
+        fix = _best(sightings, catalogue, camera, poses, min(float(sigma[3:5].max()), _KNOWN_TILT_RAD))
         if fix is not None:
             return Located(fix, searched=True)
     return None
@@ -83,7 +87,7 @@ def lost_in_space(
     """
     rotation_camera_from_site = prior.pose.rotation_camera_from_site
     hypotheses = search(sightings, catalogue, camera, rotation_camera_from_site, area)
-    fix = _best(sightings, catalogue, camera, [hypothesis.pose for hypothesis in hypotheses])
+    fix = _best(sightings, catalogue, camera, [hypothesis.pose for hypothesis in hypotheses], _KNOWN_TILT_RAD)
     if fix is None and len(sightings) >= MIN_MATCHES:
         ground_m = catalogue.ground_m(area.centre_m, _NEAREST)
         low, high = area.altitude_m
@@ -92,18 +96,20 @@ def lost_in_space(
         log_altitude = np.log(low / middle_m), np.log(high / middle_m)
         limits = SearchRange(ground_m, area.reach_m / low * camera.fx_px, log_altitude, area.heading_rad)
         poses = candidates(sightings, catalogue, camera, middle, limits, THOROUGH)
-        fix = _best(sightings, catalogue, camera, poses)
+        fix = _best(sightings, catalogue, camera, poses, _KNOWN_TILT_RAD)
     return Located(fix, searched=True) if fix is not None else None
 
 
-def _best(sightings: Sightings, catalogue: Catalogue, camera: Camera, poses: list[Pose]) -> Fix | None:
-    """The fix with the most support among those that start at some poses; None if it may be chance."""
+def _best(sightings: Sightings, catalogue: Catalogue, camera: Camera, poses: list[Pose], tilt_rad: float) -> Fix | None:
+    """The fix with the most support among the fixes from some poses; None if it may be chance.
+
+    `tilt_rad` is the standard deviation of the poses' tilt.
+    """
     fixes: list[tuple[Support, Fix]] = []
     for pose in poses:
-        fix = refine(sightings, catalogue, camera, _around(pose), pose)
+        agreed, fix = _polished(sightings, catalogue, camera, pose, tilt_rad)
         if fix is None or _tilt(fix.pose, pose) > _MAX_TILT_RAD:
             continue
-        agreed = support(sightings, catalogue, camera, fix.pose)
         if agreed.sigmas >= _SURE_SIGMAS:
             return fix
         fixes.append((agreed, fix))
@@ -117,6 +123,31 @@ def _best(sightings: Sightings, catalogue: Catalogue, camera: Camera, poses: lis
     return fix
 
 
+def _polished(
+    sightings: Sightings, catalogue: Catalogue, camera: Camera, pose: Pose, tilt_rad: float
+) -> tuple[Support, Fix | None]:
+    """The fix from a candidate of a search, and its support.
+
+    A candidate is off by several pixels at the edges of the frame, and a fit from there may match a part of the frame
+    only, with a wrong tilt. So the first fit keeps the tilt near the candidate's, with standard deviation `tilt_rad`,
+    and the fit is repeated from its result while the support grows.
+    """
+    first = refine(sightings, catalogue, camera, _around(pose, tilt_rad), pose)
+    best, agreed = None, Support(0, 0.0, 1.0)
+    start = pose if first is None else first.pose
+    for _ in range(_N_POLISHED):
+        fix = refine(sightings, catalogue, camera, _around(start), start)
+        if fix is None:
+            break
+        later = support(sightings, catalogue, camera, fix.pose)
+        if later.excess <= agreed.excess:
+            break
+        best, agreed, start = fix, later, fix.pose
+        if agreed.sigmas < _NEAR_SIGMAS:
+            break
+    return agreed, best
+
+
 def _tilt(first: Pose, second: Pose) -> float:
     """Angle between the optical axes of two poses, radians."""
     cos = float(first.rotation_camera_from_site[2] @ second.rotation_camera_from_site[2])
@@ -128,6 +159,7 @@ def _same(first: Pose, second: Pose) -> bool:
     return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 
-def _around(pose: Pose) -> PosePrior:
-    """A weak prior around a pose. The fix then depends on the sightings alone, and no sighting is counted twice."""
-    return PosePrior(pose, np.diag(np.square([300.0] * 3 + [np.radians(3.0)] * 3)))
+def _around(pose: Pose, tilt_rad: float = _WEAK_TILT_RAD) -> PosePrior:
+    """A prior around a pose; by default a weak one. The fix then depends on the sightings alone, and no sighting is
+    counted twice."""
+    return PosePrior(pose, np.diag(np.square([300.0] * 3 + [tilt_rad, tilt_rad, _WEAK_TILT_RAD])))
