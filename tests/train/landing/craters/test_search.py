@@ -34,7 +34,7 @@ def test_frames_are_found_without_a_prior(altitude_m):
 
 def test_another_place_is_not_found():
     elsewhere = world(seed=1)
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         true = pose(rng, 1000.0)
         assert find(sighted(elsewhere, true, rng), 1000.0) is None

@@ -10,7 +10,7 @@ from perilune_train.landing.craters.fix import MIN_MATCHES, Fix, PosePrior, refi
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.search import Area, search
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.craters.vote import QUICK, THOROUGH, SearchRange, Support, candidates, support
+from perilune_train.landing.craters.vote import EXHAUSTIVE, QUICK, THOROUGH, SearchRange, Support, candidates, support
 
 _NEAR_PX = 6.0
 """Largest standard deviation of the expected pose, in pixels on the ground, for which no search is needed."""
@@ -95,7 +95,7 @@ def lost_in_space(
         middle = Pose(np.array([*area.centre_m, ground_m + middle_m]), rotation_camera_from_site)
         log_altitude = np.log(low / middle_m), np.log(high / middle_m)
         limits = SearchRange(ground_m, area.reach_m / low * camera.fx_px, log_altitude, area.heading_rad)
-        poses = candidates(sightings, catalogue, camera, middle, limits, THOROUGH)
+        poses = candidates(sightings, catalogue, camera, middle, limits, EXHAUSTIVE)
         fix = _best(sightings, catalogue, camera, poses, _KNOWN_TILT_RAD)
     return Located(fix, searched=True) if fix is not None else None
 

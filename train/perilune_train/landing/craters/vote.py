@@ -46,7 +46,8 @@ class Effort:
     """Sightings of the rarest sizes vote, as many as have this number of pairs altogether."""
 
 
-QUICK, THOROUGH = Effort(2.0, 40_000), Effort(1.0, 200_000)
+QUICK, THOROUGH, EXHAUSTIVE = Effort(2.0, 40_000), Effort(1.0, 200_000), Effort(1.0, 3_000_000)
+"""With a prior: a first search, and a second one if the first finds nothing. Without a prior: seconds per frame."""
 
 
 @dataclass(frozen=True, slots=True)
