@@ -11,7 +11,7 @@ HIGHEST_M = 20_000.0
 
 
 class ViewConfig(Section):
-    """How far from the site cameras at one height see ground."""
+    """The extent of the ground that cameras at one height see."""
 
     height_m: Annotated[float, Field(gt=0, le=2e6)]
     """Height of a camera above the ground, metres."""
