@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from perilune_shared.config.resolve import Section
 
 HIGHEST_M = 20_000.0
-"""Largest height of a camera in a scene with horizon, metres; the ground is a spherical cap around the site."""
+"""Largest height of a camera in a scene with horizon, metres; it limits the ground, which extends to the horizon."""
 
 
 class ViewConfig(Section):

@@ -168,7 +168,10 @@ LAWS: dict[str, Law] = {
 
 
 def reflectance_factor(law: str, mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """I/F divided by mu0 of a named law for mu0, mu > 0: the colour for which a diffuse shader has the radiance I/F."""
+    """Return I/F of a named law, divided by mu0, for mu0, mu > 0.
+
+    A diffuse shader with this value as its colour has the radiance I/F.
+    """
     return LAWS[law](mu0, mu, cos_phase)
 
 

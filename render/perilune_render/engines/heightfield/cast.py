@@ -132,7 +132,7 @@ def _ring_at(half_widths, d, low, high):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def any_ring_at(ground, d, high):
-    """`_ring_at` among all rings, with the help of a table."""
+    """Like `_ring_at` for all rings up to `high`, but starts from the table `Ground.ring`."""
     half_widths, table = ground.half_widths_m, ground.ring
     ring = table[min(max(int((d - half_widths[0]) * ground.rings_per_m), 0), len(table) - 1)]
     while ring < high and half_widths[ring + 1] <= d:

@@ -48,7 +48,7 @@ class Horizon(NamedTuple):
 
 
 NOWHERE = Horizon(np.full((1, 1), np.inf, np.float32), 1.0, 0.0, 0.0, 1.0)
-"""A horizon by which no point is surely lit."""
+"""A horizon that marks no point as surely lit."""
 
 
 def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
