@@ -23,7 +23,7 @@ import numpy as np
 Law = Callable[[Any, Any, Any], Any]
 
 MIN_SINE_SQUARED = 1e-7
-"""Floor against division by 0 at i = 0 and e = 0, also in float32; roughness terms vanish at larger angles already."""
+"""Smallest sine squared of i and e, against division by 0; at such small angles the roughness terms vanish anyway."""
 
 
 @dataclass(frozen=True, slots=True)
