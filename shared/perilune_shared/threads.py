@@ -26,7 +26,7 @@ from perilune_shared.cgroups import processor_quota
 from perilune_shared.errors import UserError
 
 SPIN_COUNT, CROWDED_SPIN_COUNT = 30_000, 1000
-"""Rounds for which a waiting libgomp thread spins before it sleeps: usually, and if there is more work than cores.
+"""Rounds for which a waiting libgomp thread spins before it sleeps; the second value is for an overloaded machine.
 
 libgomp's default is about 300,000. The values were chosen by measurement (docs/notebook/2026-11-27-speed.md): below
 30,000 training is slower on idle cores; beside a busy process training is fastest with 1000 or less.

@@ -96,7 +96,10 @@ def _sun(offset_deg: float) -> dict[str, float]:
 
 
 def _table_beside(out: str) -> tuple[Store, str]:
-    """Store and name of the table of removed craters, beside the dataset's folder, which holds only known files."""
+    """Store and name of the table of removed craters.
+
+    The table is beside the dataset's folder, since a dataset may contain only the files of its format.
+    """
     if "://" in out:
         above, _, name = out.rstrip("/").rpartition("/")
     else:

@@ -16,7 +16,7 @@ from perilune_shared.errors import UserError
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""
 OneKind = Annotated[Kind, typer.Option(help="Dataset of the preset: detect (crater detection) or nav (navigation).")]
-"""Option of commands that use one dataset; commands set the default detect."""
+"""Option of commands that use one dataset; each command gives `detect` as the default."""
 Preset = Annotated[
     str,
     typer.Option(

@@ -7,11 +7,11 @@ from pydantic import Field, model_validator
 from perilune_shared.config.resolve import Section
 
 HIGHEST_M = 20_000.0
-"""Largest height of a camera in a scene with horizon, metres; the ground is a spherical cap around the site."""
+"""Largest height of a camera in a scene with horizon, metres; it limits the ground, which extends to the horizon."""
 
 
 class ViewConfig(Section):
-    """How far from the site cameras at one height see ground."""
+    """The extent of the ground that cameras at one height see."""
 
     height_m: Annotated[float, Field(gt=0, le=2e6)]
     """Height of a camera above the ground, metres."""

@@ -27,7 +27,7 @@ from perilune_shared.storage.store import Store
 
 _OVERVIEW = "overview.png"
 _SHEET_FRAMES, _FRAMES_PER_CAMERA, _COLUMNS = 12, 3, 6
-"""In the overview: number of frames, number of frames of each of several cameras, and pictures in a row."""
+"""Numbers in the overview: frames of a single camera, frames of each camera if there are several, pictures per row."""
 _AHEAD = 32
 """Number of reads in flight, since each request to an object store takes tens of milliseconds."""
 _Name = TypeVar("_Name")

@@ -170,8 +170,8 @@ def _flight(
 ) -> Flight:
     """The flight of a row of the table `trajectories` and the columns of its frames.
 
-    The motion follows from the recorded seed, unless a position differs; then the motion was not drawn, or was drawn
-    with other settings.
+    The motion between frames is drawn again from the recorded seed. If it does not pass through the recorded positions,
+    the flight has no motion: the recorded motion was not drawn, or was drawn with other settings.
     """
     position, velocity, acceleration = (
         tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")

@@ -58,7 +58,7 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
 
 
 def write_left_out_frames(manifest: Dataset, out: Address, progress: Progress) -> None:
-    """Write a manifest whose table `frames` was left out into the new folder `out`, with this table restored.
+    """Restore the table `frames` of a manifest without it, and write the whole manifest into the new folder `out`.
 
     Scenes, trajectories and metadata are copied from the manifest; poses, splits and times are drawn again by its
     recipe, without generating ground. Raises UserError if the manifest has several recipes or already has its frames,

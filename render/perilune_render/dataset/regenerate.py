@@ -62,7 +62,7 @@ class Outcome:
     frame_id: str
     """Id in the manifest."""
     png: State
-    """Result of comparing the PNG with the manifest's hash, then with the dataset's file; new without a hash."""
+    """Result for the PNG, from the manifest's hash or, if this differs, the dataset's pixels; new without a hash."""
     exr: State | None
     """Result for the EXR; None if the frame has no EXR."""
     lidar: State | None

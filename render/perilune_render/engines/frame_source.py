@@ -209,7 +209,11 @@ class FrameSource:
         return crater_index(circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
 
     def _seen_circles(self, shot: Shot) -> RimCircles:
-        """The rims, each moved so that the shot's pose sees it where the pose of its centre's row sees the real rim."""
+        """The rims, moved to correct for a rolling shutter.
+
+        A real rim is seen from the pose of the row that shows the rim's centre. From the shot's pose, the moved rim has
+        the same image.
+        """
         if not self._rolls(shot):
             return self.circles
         moving = Moving(*(each[None] for each in (*shot.pose, shot.velocity_mps, shot.angular_velocity_radps)))

@@ -87,8 +87,9 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
     """Check poses against the ground of a scene: valid positions (`check_places`), and ground in the frames.
 
     The ray through every tested point of the image border must hit the mesh, unless the scene's views may show the sky.
-    A ray from above the ground hits the mesh if and only if it is lower than the mesh's edge where it leaves the
-    square. Raises UserError with `where` and the first frame that fails.
+    From above, the mesh is a square. A ray that begins above the ground hits the mesh if and only if the ray is below
+    the mesh's edge at the point where it leaves this square. Raises UserError with `where` and the first frame that
+    fails.
     """
     horizon = scene.view is not None and scene.view.horizon
     rays = _check_mesh(poses, camera, scene.grid, where, horizon=horizon)
@@ -194,7 +195,7 @@ def _check_not_only_sky(poses: Poses, camera: Camera, matrices: Array, where: ob
 
 
 def ground_in_view(position_m: Array, matrices: Array, camera: Camera) -> np.ndarray:
-    """Whether each view (N,) shows ground, curved as the Moon.
+    """Whether each view (N,) shows ground; the ground is taken as a sphere with the Moon's radius.
 
     `matrices` are rotation_camera_from_site (N, 3, 3).
     """

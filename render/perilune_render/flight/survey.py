@@ -17,13 +17,13 @@ from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 _SHARE_OF_GROUND = 0.95
-"""Distance from the site that the images cover, as a share of the distance to the edge of the ground, where relief may
-end."""
+"""Distance from the site that the images cover, as a share of the distance to the edge of the ground. Beyond the edge
+there may be no relief."""
 _TILE_PX = 32
 _LARGEST_SIDE_PX = 8192
 _BETWEEN_S = 100.0
-"""Time between the two images, long enough that the motion during an exposure is far below a pixel, as if
-compensated."""
+"""Time between the two images. It is so long that the camera is slow and moves far less than a pixel during an
+exposure; on a real orbiter, motion compensation has this effect."""
 _CAMERA_FROM_SITE_LEVEL = np.diag([1.0, -1.0, -1.0])
 
 

@@ -23,7 +23,7 @@ import numpy as np
 Law = Callable[[Any, Any, Any], Any]
 
 MIN_SINE_SQUARED = 1e-7
-"""Floor against division by 0 at i = 0 and e = 0, also in float32; roughness terms vanish at larger angles already."""
+"""Smallest sine squared of i and e, against division by 0; at such small angles the roughness terms vanish anyway."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,10 @@ LAWS: dict[str, Law] = {
 
 
 def reflectance_factor(law: str, mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """I/F divided by mu0 of a named law for mu0, mu > 0: the colour for which a diffuse shader has the radiance I/F."""
+    """Return I/F of a named law, divided by mu0, for mu0, mu > 0.
+
+    A diffuse shader with this value as its colour has the radiance I/F.
+    """
     return LAWS[law](mu0, mu, cos_phase)
 
 

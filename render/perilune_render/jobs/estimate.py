@@ -139,7 +139,7 @@ class _Bytes:
     scene: float
     """Size of a scene's rows."""
     fixed: float
-    """Size of the frame and label tables and the index that does not depend on their number of rows."""
+    """Size of the tables `frames` and `labels` and of the index if they had no rows."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> "_Bytes":

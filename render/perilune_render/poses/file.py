@@ -69,7 +69,7 @@ class GivenPoses:
     """Angular velocity of the camera, O_C, radians per second (N, 3); None if not in the file."""
 
     line: np.ndarray | None = None
-    """Line of each pose in the file, from 1 (N,); None for a file with rows instead, which count from 0."""
+    """Line of each pose in the file, from 1 (N,); None for a file without lines, whose rows count from 0."""
     attitudes: Attitudes | None = None
     """The attitudes as in the file; None without a file."""
 

@@ -27,7 +27,7 @@ degrees."""
 _MAX_SCENES = 1000
 _N_VIEWS = 24
 _LOWER = 0.9
-"""Lowest camera height that the views allow for, as a share of its height: the ground may rise towards the camera."""
+"""Smallest height above the ground divided by the height above z = 0: the ground may rise towards the camera."""
 _WIDER = 1.05
 _SPLIT = "test"
 _N_CHECKED = 1000

@@ -58,11 +58,11 @@ class Grounds:
         self._kept.clear()
 
     def simulated(self, number: int, client: object) -> SimulatedScene | None:
-        """The simulated scene of a number; None if it is not in memory yet; then ask again.
+        """The simulated scene of a number, or None if it is not in memory yet.
 
-        The scene is then being generated or queued, unless another scene of the client or MAX_WAITING scenes are
-        queued. Raises UserError for a number that the server does not have, and the original error if generation
-        failed.
+        After None, call again: the scene is being generated or queued, unless another scene of the client or
+        MAX_WAITING scenes are queued. Raises UserError for a number that the server does not have, and the original
+        error if generation failed.
         """
         if number >= self.n_scenes:
             raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")

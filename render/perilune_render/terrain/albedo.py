@@ -74,7 +74,7 @@ def add_rays(
 ) -> None:
     """Brighten albedo (n_vertices,) along the rays of craters, in place.
 
-    The rays of `removed` craters (indices) are drawn but not added, so that all other rays stay unchanged.
+    Random numbers are also drawn for the rays of `removed` craters (indices), so that all other rays stay unchanged.
     """
     rng = stream(seed, "rays")
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2

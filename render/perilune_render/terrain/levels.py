@@ -92,7 +92,11 @@ def _band(
 
 
 def _needed(terrain: TerrainConfig, view: ViewEnvelope) -> int:
-    """Number of vertices that the limit must allow: for the largest of the narrowest bands, or for the whole ground."""
+    """Smallest limit of vertices per mesh with which the ground can be rendered.
+
+    The limit must allow the mesh of every band between two neighbouring heights of `view.seen`, and the number of
+    vertices of the whole ground divided by _GROUND_PER_MESH. A limit that allows the whole ground also suffices.
+    """
     whole = graded_grid(terrain, view).n_vertices
     if view.seen is None:
         return whole
@@ -126,9 +130,9 @@ def _refusal(terrain: TerrainConfig, view: ViewEnvelope, needed: int) -> UserErr
 
 
 def _last_that_fits(band: Callable[[int], Grid], low: int, high: int, most: int) -> int:
-    """The last index from `low` to `high` for which a band has at most `most` vertices.
+    """The last index from `low` to `high` whose band has at most `most` vertices.
 
-    `low` is assumed to fit.
+    The band of `low` is not checked.
     """
     while low < high:
         middle = (low + high + 1) // 2

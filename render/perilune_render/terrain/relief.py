@@ -38,7 +38,7 @@ def add_relief(
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
-    The RMS slope is drawn from `config.rms_slope_deg` with `seed`; all octaves down to 1 m have this slope together.
+    The RMS slope of the sum of all octaves down to 1 m is drawn from `config.rms_slope_deg` with `seed`.
     Long waves are added before the craters, which cut them. Short waves are added afterwards, since a worn crater is
     as rough as the ground around it.
     """

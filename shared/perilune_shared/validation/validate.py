@@ -182,7 +182,8 @@ def _scene_faults(
 def _in_file(dataset: Dataset, faults: Iterator[Fault], name: str, reported: set[tuple[str, str]]) -> Iterator[Fault]:
     """Convert row numbers within a scene or trajectory to row numbers of the file.
 
-    `name` begins its frame_ids. Skips faults of files and columns already in `reported`.
+    `name` is the scene_id, or the beginning of the trajectory's frame_ids. Skips faults of files and columns already in
+    `reported`.
     """
     for fault in faults:
         if (fault.file, fault.column) in reported:

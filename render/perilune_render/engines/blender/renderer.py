@@ -34,7 +34,7 @@ BAND_PX = 0.2
 """Largest image motion between two neighbouring bands of rows, which have one pose each, pixels."""
 _MIN_FREE_BYTES = 16_000_000
 _LIT = 1e-4
-"""Sunlight above which a pixel counts as sunlit; in shadow, sunlight is 0 and earthshine gives less than this."""
+"""Direct light above which a pixel counts as sunlit. In shadow, only earthshine is direct, and it is weaker."""
 
 
 _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
@@ -45,8 +45,9 @@ class Renderer:
     """Renders frames of one scene.
 
     Use as a context manager: it holds a temporary folder and Blender's only scene. If the ground is too large for one
-    mesh, a frame shows the level (`perilune_render.terrain.levels`) of its trajectory that is made for the height of
-    the camera. Blender holds the mesh of one level at a time, so render frames in an order with few changes of level.
+    mesh, each trajectory has several meshes, its levels (`perilune_render.terrain.levels`). The height of the camera
+    determines the level that a frame shows. Blender holds the mesh of one level at a time, so render frames in an order
+    with few changes of level.
 
     It is an `Engine` of `perilune_render.engines.frame_source`: `camera` has no distortion, `sun` (3,) is the unit
     vector towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only
@@ -126,7 +127,7 @@ class Renderer:
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
         """Render one frame with a rolling shutter, in bands of rows with one pose each.
 
-        There are enough bands that the image moves by at most BAND_PX between neighbours, but at most one per row.
+        Between neighbouring bands, the image moves by at most BAND_PX, unless there is already one band for each row.
         Depth is along the camera's axis at the band's pose. Raises the errors of `render`.
         """
         middle = poses.pose_at(0.0)
@@ -202,8 +203,8 @@ def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
     """Configure a stage to send one ray through each pixel's centre, to within 1e-5 px, until the block ends.
 
     Cycles puts the first sample of a pixel at the centre of its filter for any seed, but it reads this centre from a
-    table, which is off by 5e-4 px for the box filter of one pixel. The width of the box cannot be set, so the narrowest
-    Gaussian is used.
+    table, which is off by 5e-4 px for the box filter of one pixel. Cycles ignores `filter_width` for the box
+    filter, so a narrow Gaussian is used instead.
     """
     narrow = {"samples": 1, "pixel_filter_type": "GAUSSIAN", "filter_width": 0.01}
     before = {name: getattr(stage.cycles, name) for name in narrow}
@@ -232,7 +233,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     render.pixel_aspect_x, render.pixel_aspect_y = _pixel_aspect(camera)
     render.use_persistent_data = True
     render.use_file_extension = False
-    # Blender's default is the number of cores that it could use when it started: one.
+    # By default, Blender uses the cores that were available when bpy was imported; the package allows one core then.
     render.threads_mode = "FIXED"
     render.threads = settings.threads or usable_cores()
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
@@ -245,11 +246,11 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     cycles.use_denoising = False
     cycles.max_bounces = cycles.diffuse_bounces = int(light.bounce)
     cycles.use_light_tree = False
-    # Cycles drops contributions below this threshold at random. At the default of 0.01, it would drop most ground at
-    # low Sun.
+    # Cycles drops contributions below this threshold at random. At the default of 0.01, most ground would lose its
+    # sunlight when the Sun is low.
     cycles.light_sampling_threshold = 0.0
     cycles.pixel_filter_type = "BOX"
-    # A box of one pixel: the sensor model applies its point spread later.
+    # A box is always one pixel wide: the sensor model applies its point spread later.
     cycles.filter_width = 1.0
     stage.view_settings.view_transform = "Raw"
     layer = stage.view_layers[0]
@@ -271,7 +272,7 @@ def _radiance(path: Path) -> Radiance:
     normal = np.stack([by_pass[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     radiance_factor = by_pass["Combined.R"]
-    # If there is light besides the Sun's, the pass of direct light divided by colour shows where the Sun reaches.
+    # If there is other light than the Sun's, use the pass of direct light. Cycles has divided it by the surface colour.
     sunlit = by_pass.get("DiffDir.R", radiance_factor) > _LIT
     return Radiance(radiance_factor, np.where(depth > _FAR_M, np.float32(np.inf), depth), normal, sunlit)
 

@@ -36,7 +36,7 @@ from perilune_render.provenance.kernels import njit
 _FIRST_LEVEL = 1
 """Level of the pyramid at which a walk begins."""
 _BEHIND = 1e-6
-"""Relative distance behind a ray's current point beyond which a line no longer counts as ahead."""
+"""Relative tolerance for rounding: a crossing this little behind the ray's current point still counts as ahead."""
 
 
 @njit(**INLINED)
@@ -84,16 +84,16 @@ def _walk_inner(ground, rocks, horizon, ray, span):
             tg, triangle = cross_inner(ground, j, i, in_cells, (t, end))
             if tg < best:
                 return tg, Facet(0, j, i, triangle, -1, -1)
-        # A boulder hit beyond this block may lie behind ground in the next block.
+        # Ground in the next blocks may hide a boulder that is hit beyond this block, so stop only for a nearer hit.
         if best <= end:
             break
         t = end
-        # Near the start, the answer is the same as at the start, so test only after the ray has passed a block.
+        # Near the ray's start, `surely_lit` is the same as at the start. Test it only after the ray has passed a block.
         if horizon is not None and above and _lit_at(horizon, ray, t):
             return -np.inf, NO_FACET
         if t >= t1:
             break
-        # Step over the nearer border; rounding must not leave the block along the other axis.
+        # Step over the nearer border. Clip the other index to the block, since rounding could move it outside.
         if tp <= tq:
             i = min((bi + 1) << level, cells) if dp > 0 else (bi << level) - 1
             low = bj << level
@@ -104,7 +104,7 @@ def _walk_inner(ground, rocks, horizon, ray, span):
             i = min(max(int(p0 + t * dp), low), min(((bi + 1) << level), cells) - 1)
         if i < 0 or j < 0 or i >= cells or j >= cells:
             break
-        # A falling ray cannot pass the rest of a block if it could not pass the beginning.
+        # A falling ray is lowest where it leaves a block. If the larger block stopped it before, it still does.
         if level < coarsest and (rises or i >> (level + 1) != bi >> 1 or j >> (level + 1) != bj >> 1):
             level += 1
     if best < np.inf:
@@ -132,7 +132,7 @@ def _ring_at(half_widths, d, low, high):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def any_ring_at(ground, d, high):
-    """`_ring_at` among all rings, with the help of a table."""
+    """Like `_ring_at` for all rings up to `high`, but starts from the table `Ground.ring`."""
     half_widths, table = ground.half_widths_m, ground.ring
     ring = table[min(max(int((d - half_widths[0]) * ground.rings_per_m), 0), len(table) - 1)]
     while ring < high and half_widths[ring + 1] <= d:
@@ -159,7 +159,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
     else:
         a0, da, d0, dd = -ray.y, -ray.dy, -ray.x, -ray.dx
     in_sector = Ray(a0, d0, ray.z, da, dd, ray.dz, ray.start)
-    # Spokes meet at the centre. The sign of `turning` says whether the ray crosses them upwards or downwards.
+    # Spokes meet at the centre. `turning` is positive if the ray crosses them in ascending order, else negative.
     turning, per_d, per_n = da * d0 - a0 * dd, 1 / dd if dd != 0 else 0.0, 1 / n
     rises = ray.dz > 0
     d = d0 + t * dd
@@ -183,7 +183,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             if slope != 0:
                 ts = (u * d0 - a0) / slope
                 if ts < t - _BEHIND * (abs(t) + 1):
-                    # The ray crosses this line behind its start, on the way towards the centre.
+                    # The crossing lies behind the current point, so the ray does not cross this line in the sector.
                     ts = np.inf
         end = max(min(min(tr, ts), t1), t)
         if level > 0:
@@ -203,16 +203,16 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             tg, triangle = cross_sector(ground, side, (ring, spoke), in_sector, (t, end))
             if tg < best:
                 return tg, Facet(side + 1, ring, spoke, triangle, -1, -1)
-        # A boulder hit beyond this block may lie behind ground in the next block.
+        # Ground in the next blocks may hide a boulder that is hit beyond this block, so stop only for a nearer hit.
         if best <= end:
             break
         t = end
-        # Near the start, the answer is the same as at the start, so test only after the ray has passed a block.
+        # Near the ray's start, `surely_lit` is the same as at the start. Test it only after the ray has passed a block.
         if horizon is not None and above and _lit_at(horizon, ray, t):
             return -np.inf, NO_FACET
         if t >= t1:
             break
-        # Step over the nearer border; rounding must not leave the block along the other axis.
+        # Step over the nearer border. Clip the other index to the block, since rounding could move it outside.
         if tr <= ts:
             ring = last_ring if dd > 0 else first_ring - 1
             d = d0 + t * dd
@@ -222,7 +222,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             ring = _ring_at(half, d0 + t * dd, first_ring, last_ring - 1)
         if ring < 0 or spoke < 0 or ring >= n_rings or spoke >= spokes:
             break
-        # A falling ray cannot pass the rest of a block if it could not pass the beginning.
+        # A falling ray is lowest where it leaves a block. If the larger block stopped it before, it still does.
         if level < coarsest and (rises or ring >> (level + 1) != br >> 1 or spoke >> (level + 1) != bs >> 1):
             level += 1
     if best < np.inf:
@@ -234,8 +234,8 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
 def first_hit(ground, rocks, horizon, ray, span):
     """The first hit of a ray within span, (t0, t1): its parameter t and the facet.
 
-    Returns inf and `NO_FACET` without a hit. For a ray to the Sun's disc, `horizon` may be the Sun's horizon; for other
-    rays it is None. If such a ray reaches a point that is surely lit, no hit lies ahead, and t is -inf.
+    Returns inf and `NO_FACET` without a hit. For a ray to the Sun's disc, `horizon` may be the Sun's horizon: if
+    the ray reaches a point that is surely lit, no hit lies ahead, and t is -inf. For other rays, `horizon` is None.
     """
     (x, y, z, dx, dy, dz, _), (t0, t1) = ray, span
     half, outer = ground.half_widths_m[0], ground.half_widths_m[-1]

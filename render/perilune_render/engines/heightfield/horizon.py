@@ -3,8 +3,8 @@
 A raster lies along the Sun's azimuth. For each square, it stores the height above which a point of the ground is surely
 lit. Such a point needs no shadow ray; the image does not change. The test has two parts:
 
-- near, in the square of the point and the next ones towards the Sun: no facet is as steep against the Sun as the lowest
-  ray to the disc, and no boulder touches the cells, so that the ray's height above the ground never decreases;
+- near, in the square of the point and the next ones towards the Sun: no facet rises towards the Sun as steeply as the
+  lowest ray to the disc, and no boulder touches the cells, so that the ray's height above the ground never decreases;
 - far, in the squares beyond: their highest points are below the lowest ray to the disc.
 """
 
@@ -23,8 +23,8 @@ _CELLS = 4
 _NEAR = 4
 """Number of squares of the near part."""
 _WIDEST = 0.2
-"""Largest tangent of half the disc's range of azimuths for which one more square on each side of the near part
-suffices."""
+"""Largest tangent of half the disc's range of azimuths. Up to it, rays to the disc deviate by less than one square to
+each side over the near part."""
 _MARGIN = 1e-3
 """Margin of slopes for rounding errors of the rays."""
 _MARGIN_M = 0.01
@@ -48,7 +48,7 @@ class Horizon(NamedTuple):
 
 
 NOWHERE = Horizon(np.full((1, 1), np.inf, np.float32), 1.0, 0.0, 0.0, 1.0)
-"""A horizon by which no point is surely lit."""
+"""A horizon that marks no point as surely lit."""
 
 
 def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
@@ -81,7 +81,7 @@ def horizon_of(ground: Ground, sun: Array, disc_rad: float) -> Horizon:
     for row in range(n - 2, -1, -1):
         clear[row] = np.maximum(highest[row + 1], clear[row + 1] - rise)
         if row % every == 0:
-            # The disc's range of azimuths extends over one more square on each side.
+            # Over `every` squares, the disc's range of azimuths widens by less than one square on each side.
             clear[row] = _widened(clear[row : row + 1])[0]
     far = np.full((n, n), -np.inf, np.float32)
     far[: 1 - _NEAR] = clear[_NEAR - 1 :] - rise * np.float32(_NEAR - 1)
@@ -100,10 +100,8 @@ def _widened(raster: np.ndarray) -> np.ndarray:
 def _fill(ground, raster, steepest, turned, steep):
     """Write into `raster.clear_m` the highest point of each square, and into `steep` whether it is rough.
 
-    A square is rough if it touches a cell with a boulder or a steep facet.
-
-    A facet is steep if its slope along a direction within an angle of the Sun's azimuth, of sine `turned`, is larger
-    than `steepest`.
+    A square is rough if it touches a cell with a boulder or a steep facet. A facet is steep if its slope is larger than
+    `steepest` along any direction near the Sun's azimuth; `turned` is the sine of the largest angle to the azimuth.
     """
     n = ground.n_half
     for part in range(5):

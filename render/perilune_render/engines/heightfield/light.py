@@ -111,7 +111,10 @@ def _slopes(f, cosine):
 
 @njit(**WITHOUT_COUNTS)
 def _hapke(f, angles, result):
-    """Write `photometry.hapke` times albedo and cosine of incidence of each sample: angles (5, N), result (N,)."""
+    """Write the radiance factor of each sample to `result` (N,), given `angles` (5, N).
+
+    It is the product of `photometry.hapke`, albedo and cosine of incidence, which is 0 in shadow.
+    """
     for k in range(len(result)):
         mu0, mu, cos_phase = angles[0, k], angles[1, k], angles[2, k]
         cos_l, cos_s = min(mu0, mu), max(mu0, mu)

@@ -19,8 +19,8 @@ class Rocks(NamedTuple):
     planes: Array
     """Outer unit normal and distance from the centre of each face, for a rock of diameter 1 (F, 4)."""
     cell_start: np.ndarray
-    """Index in `cell_rock` of each cell's first boulder, then the total number (C + 1,) int64: cells of the inner
-    square by y and x, then cells of the sectors by side, ring and spoke."""
+    """Index in `cell_rock` of each cell's first boulder (C + 1,) int64; the last element is the length of `cell_rock`.
+    The cells of the inner square come first, by y and x, then the cells of the sectors, by side, ring and spoke."""
     cell_rock: np.ndarray
     """Indices of the boulders in each cell (M,) int64."""
 
@@ -76,8 +76,8 @@ def cells_of_rocks(
 def _fill(rows, n, half_widths, tops, position, numbers):
     """Write the boulders of each cell into `numbers`, starting at the cell's `position`, and advance this position.
 
-    If `numbers` is empty, only count the boulders in `position`. Raise the heights in `tops`, for the inner square and
-    the sectors, to the boulders.
+    If `numbers` is empty, only add the number of boulders of each cell to `position`. `tops` holds the largest heights
+    of the cells, for the inner square and the sectors; raise each to the highest boulder of the cell.
     """
     (inner, sectors), write = tops, len(numbers) > 0
     step = half_widths[0] / n

@@ -141,8 +141,9 @@ def ground_at(ground, facet, x, y):
 def lift_at(ground, facet, x, y):
     """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle at (x, y), metres.
 
-    It points along the interpolated normal. Its length reaches the lowest of the vertices' tangent planes, each raised
-    above the triangle, or half the height of a quadratic patch with these vertex normals, whichever is higher.
+    It points along the interpolated normal. It reaches one of two heights, whichever is larger: the lowest of the
+    vertices' tangent planes, after each is shifted until the triangle is below it, or half the height of a quadratic
+    patch with these vertex normals.
     """
     vertices = ground.vertex
     v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, facet, x, y)
@@ -156,7 +157,7 @@ def lift_at(ground, facet, x, y):
     edge_2 = (cx - ax) * e2x + (cy - ay) * e2y + (cz - az) * e2z
     edge_3 = (cx - bx) * (e2x - e1x) + (cy - by) * (e2y - e1y) + (cz - bz) * (e2z - e1z)
     bulge = u * v * edge_1 + u * w * edge_2 + v * w * edge_3
-    # Height at the point of each vertex's tangent plane, raised above the other two vertices.
+    # Shift each vertex's tangent plane until no vertex is above it, and take its height above the point.
     px, py, pz = v * e1x + w * e2x, v * e1y + w * e2y, v * e1z + w * e2z
     over_0 = max(max(_dot(e1x, e1y, e1z, ax, ay, az), _dot(e2x, e2y, e2z, ax, ay, az)), 0.0)
     over_1 = max(max(-_dot(e1x, e1y, e1z, bx, by, bz), _dot(e2x - e1x, e2y - e1y, e2z - e1z, bx, by, bz)), 0.0)

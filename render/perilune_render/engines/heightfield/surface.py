@@ -108,7 +108,7 @@ def _ring_table(half_widths: Array) -> tuple[np.ndarray, float]:
 
 
 def _levels(tops: np.ndarray) -> list[np.ndarray]:
-    """Levels from 1 of the largest values of `tops` (sides, rows, columns), each flat."""
+    """Pyramid of the largest values of `tops` (sides, rows, columns): its levels, from 1, as flat arrays."""
     levels: list[np.ndarray] = []
     level = tops
     while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MAX_LEVELS - 1):
@@ -121,7 +121,7 @@ def _levels(tops: np.ndarray) -> list[np.ndarray]:
 def _coarser(tops):
     """The largest values in blocks of 2 x 2 of `tops` (sides, rows, columns).
 
-    Blocks at an odd end are smaller.
+    If the number of rows or columns is odd, the last blocks are smaller.
     """
     n_sides, n_rows, n_columns = tops.shape
     coarse = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)

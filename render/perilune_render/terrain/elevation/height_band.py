@@ -30,7 +30,7 @@ _LOWEST_M, _HIGHEST_M = -9_900.0, 11_500.0
 _MIN_RELIEF = 7e-4
 """Range of heights, as a share of the ground's width, below which heights without a unit may be kilometres."""
 _WIDEST_RELIEF = 25.0
-"""Range of heights of the whole Moon, in kilometres, with a margin: larger ones are not kilometres."""
+"""Range of heights of the whole Moon, in kilometres, with a margin. Values with a larger range are not kilometres."""
 _MIN_EXTENT_M = 1000.0
 """Smallest width of the ground, metres, at which heights are tested for kilometres."""
 _MIN_PLATEAU = 4

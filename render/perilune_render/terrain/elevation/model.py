@@ -73,9 +73,10 @@ def read_elevation(
 ) -> ElevationModel:
     """Read an elevation model; its site is the site of `config`, or the middle of the raster.
 
-    `ground_m` is the side of the ground around the site for which the model is needed, metres. If the raster has more
-    than LARGEST_PIXELS, only this part is read, at a lower resolution if the part is that large too; None reads a part
-    of a usual size. If an edge of the raster's map crosses this ground, the columns are rearranged or resampled.
+    `ground_m` is the side of the ground around the site for which the model is needed, metres; None stands for
+    UNSTATED_GROUND_M. If the raster has more than LARGEST_PIXELS, only this ground is read. If the ground has more than
+    LARGEST_PIXELS too, it is read at a lower resolution. If an edge of the raster's map crosses the ground, the columns
+    are rearranged or resampled.
 
     Raises UserError if the model is missing, unreadable or empty, if it lacks a pixel size or a projection of the Moon,
     if the site is outside the model or in a hole, and if the values cannot be heights (`elevation.height_band`).

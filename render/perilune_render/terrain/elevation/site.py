@@ -72,7 +72,10 @@ class RasterMap:
         return None if self.circle is None or turned else self.circle / abs(self.transform.a)
 
     def part(self, top: int, left: int, shape: tuple[int, int], step: int = 1) -> RasterMap:
-        """The map of a part of this raster from `top` and `left` on, with pixels of step x step of its pixels."""
+        """The map of a part of this raster, whose first pixel is at row `top` and column `left`.
+
+        Each pixel of the part covers step x step pixels of this raster.
+        """
         import rasterio
 
         transform = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(step)

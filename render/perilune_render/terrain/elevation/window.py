@@ -19,12 +19,12 @@ LARGEST_PIXELS = 2**24
 UNSTATED_GROUND_M = 20_000.0
 """Side of the ground for which a large model is read if the caller does not state one, metres."""
 _AROUND = 1.25
-"""Half-width of a window divided by the ground's half-width; the margin serves statistics and interpolation."""
+"""Half-width of a window divided by the ground's half-width; the margin is for terrain statistics and interpolation."""
 _MIN_PX = 64
-"""Smallest number of pixels around the ground in a window."""
+"""Smallest margin between the ground and the edge of a window of a large raster, pixels."""
 _NET = 65
 _ROUGH_PX = 0.5
-"""Deviation of a map from smooth coordinates above which the map is cut or resampled, pixels."""
+"""Largest error of interpolated raster coordinates, pixels; above it, the map is discontinuous or too distorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +44,9 @@ class Window:
 
 
 def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Window:
-    """The part of a raster to read for square ground of a side around a site, metres.
+    """The part of a raster to read for square ground around a site.
 
-    None reads a part of a usual size.
+    `ground_m` is the side of the ground, metres; None stands for UNSTATED_GROUND_M.
     """
     rows, columns = raster.shape
     net = np.linspace(-0.5, 0.5, 9) * (UNSTATED_GROUND_M if ground_m is None else ground_m) * _AROUND
@@ -133,7 +133,10 @@ def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tupl
 
 
 def _runs(raster: RasterMap, window: Window) -> list[tuple[int | None, int]]:
-    """First column in the raster (None without one) and number of columns of each part of a window."""
+    """Split the columns of a window into runs: first raster column of each run, and its number of window columns.
+
+    The first raster column is None if the raster has no columns there.
+    """
     columns, step, around = raster.shape[1], window.step, repeat_px(raster)
     runs: list[tuple[int | None, int]] = []
     column, left = window.left, window.shape[1]
