@@ -11,10 +11,10 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors cgroups threads console run_record content config storage pictures geometry client dataset labels "
+        "errors cgroups threads config console run_record content storage pictures geometry client dataset labels "
         "validation editing export cli"
     ),
-    "shared/perilune_shared/console": "interrupts terminal progress command_line",
+    "shared/perilune_shared/console": "interrupts terminal progress usage command_line",
     "shared/perilune_shared/config": "yaml_text errors resolve page",
     "render/perilune_render": (
         "config streams provenance terrain flight poses imaging labels engines outputs dataset preview server scenes "

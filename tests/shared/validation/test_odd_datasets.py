@@ -142,7 +142,7 @@ def test_the_working_folder_can_be_the_output(tmp_path, monkeypatch):
     ],
 )
 def test_endless_or_empty_conditions_are_refused(little, tmp_path, where):
-    with pytest.raises(UserError, match="condition"):
+    with pytest.raises(UserError, match="--where: got"):
         subset(open_dataset(little), tmp_path / "out", [where])
 
 
