@@ -32,7 +32,7 @@ def report(
     """Write the report of a demo, a paper run or a benchmark as one HTML file, with a summary in Markdown.
 
     report.html needs no server and no network. It shows datasets, detection, navigation, explanation, the source of
-    each figure, and a viewer of one descent. The report lists the parts that do not exist.
+    each figure, and a viewer of one descent. The report names each part whose files are missing.
     """
     # matplotlib and pandas take seconds to load.
     from perilune_train.report.page import SUMMARY, write_report

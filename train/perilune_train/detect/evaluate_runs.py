@@ -64,7 +64,7 @@ def evaluate_again(
 ) -> Path:
     """Evaluate a run's best weights on a split of a dataset; all output is in the returned folder.
 
-    `threshold` is a score; "run" takes the threshold that the run chose, and "validation" chooses a new one on the
+    `threshold` is a score, "run" for the threshold that the run chose, or "validation" to choose a new threshold on the
     validation split of the dataset. Without `out`, the folder is `evaluation` in the run's folder.
     """
     folder = out or run / "evaluation"
@@ -140,7 +140,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         cells = [for_markdown(name), *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        # Take AP from the metrics: the curve in the file has fewer points.
+        # Take AP from the metrics: the curve in the file has fewer points, so its area differs from AP.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]
@@ -175,7 +175,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def _name(folder: Path) -> str:
-    """Name of a run, or run/evaluation for an evaluation of it."""
+    """Name of a run, such as small; for an evaluation, the last two folders, such as small/evaluation."""
     parts = folder.resolve().parts
     return "/".join(parts[-2:]) if not (folder / "checkpoints").is_dir() else parts[-1]
 

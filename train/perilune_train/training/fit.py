@@ -57,8 +57,8 @@ class StopDiverged(Callback):
         self.first = state_dict["first"]
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # Reading the loss makes the GPU wait, so do it rarely. The last batch is checked always:
-        # validation and the saving of the state follow.
+        # Reading the loss makes the GPU wait, so do it rarely. Always check the last batch,
+        # before validation runs and the state is saved.
         early = trainer.global_step <= _EARLY_STEPS
         if early or trainer.is_last_batch or batch_idx % _STEPS_BETWEEN_CHECKS == 0:
             loss = float(outputs["loss"]) * trainer.accumulate_grad_batches
@@ -106,7 +106,7 @@ class KeepBest(Callback):
 
 
 class KeepLast(Callback):
-    """Save the whole state after every validated epoch and, with `minutes`, within an epoch at this interval.
+    """Save the whole state after every validated epoch and, if `minutes` is set, every `minutes` within an epoch.
 
     If a run resumes within an epoch, Lightning skips the task's `on_train_epoch_start`; this callback calls it.
     """
@@ -132,8 +132,8 @@ class KeepLast(Callback):
             pl_module.on_train_epoch_start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # The last batch is followed by validation and the checkpoint of the epoch. A state between the batches of one
-        # step would lack the gradients summed so far.
+        # After the last batch, validation and the checkpoint of the epoch follow. Between the batches of one step, do
+        # not save: the state would lack the gradients summed so far.
         between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
         if self.minutes is None or trainer.is_last_batch or between:
             return
@@ -149,8 +149,8 @@ class KeepLast(Callback):
             self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        # Loaders raise DataLost between two batches, when the state is complete. Do not save with several processes,
-        # since others may still train, nor before the first batch of an epoch: that state is already saved.
+        # Loaders raise DataLost between two batches, when the state is complete. With several processes, do not save:
+        # the others may still train. Before the first batch of an epoch, do not save: last.ckpt already has this state.
         done = trainer.fit_loop.epoch_loop.batch_progress.current
         between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
         if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
@@ -226,7 +226,7 @@ def process_layout(devices: int, num_nodes: int) -> tuple[int, int]:
 
 
 def own_share(devices: int, num_nodes: int) -> Share:
-    """The share of the data that this process trains on; known before training too (see `is_first_process`)."""
+    """The share of the data that this process trains on. Also valid before training (see `is_first_process`)."""
     return Share(int(rank_zero_only.rank), math.prod(process_layout(devices, num_nodes)))
 
 
@@ -288,10 +288,10 @@ def fit(
 
     Returns the training time in seconds, including the time before a resume.
 
-    The task creates its loaders once. Each epoch calls `set_epoch` on the `sampler` of a batch sampler (see
-    data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several processes, each
-    loader provides the batches of its own process. The task logs `schedule.monitor` in validation, and has
-    `architecture` and `evaluated` (see KeepBest).
+    The task creates its loaders once. Before each epoch, Lightning passes the epoch's number to `set_epoch` of the
+    batch sampler's `sampler` (see data/epochs.py). Order and augmentation can thus depend on seed and epoch only. With
+    several processes, each loader provides the batches of its own process. The task logs `schedule.monitor` in
+    validation, and has `architecture` and `evaluated` (see KeepBest).
 
     With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
     uninterrupted run. The state is saved after every validation. With `schedule.checkpoint_minutes` it is also saved
@@ -318,7 +318,7 @@ def fit(
     warn_if_crowded()
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    # Deterministic algorithms would otherwise also fill all memory that is about to be overwritten.
+    # By default, deterministic algorithms fill new tensors with a value before use, which only costs time here.
     setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -19,16 +19,17 @@ COLUMNS: dict[str, Kind] = {
     "y1_px": "number",
     "score": "number",
 }
-"""Columns of a submission. A box contains the whole ellipse, also its part outside the image; the first pixel
-extends from 0 to 1."""
+"""Columns of a submission. A box contains the whole ellipse, including any part outside the image. In x and y, the
+first pixel extends from 0 to 1."""
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 
 
 def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[Detections]]:
-    """Read detections by dataset, one entry for each frame; `frames` has the frame_ids of each dataset.
+    """Read the detections of each dataset, as a list with one entry per frame.
 
-    Frames without rows have no detections. Raises UserError if the file cannot be read, lacks a column, names another
-    dataset or frame, or contains a number that is not finite, a box without area, or a score outside 0 to 1.
+    `frames` has the frame_ids of each dataset; the lists have their order. Frames without rows have no detections.
+    Raises UserError if the file cannot be read, lacks a column, names another dataset or frame, or contains a number
+    that is not finite, a box without area, or a score outside 0 to 1.
     """
     table = read_table(path, DETECTIONS, COLUMNS)
     _check_numbers(table)

@@ -7,8 +7,8 @@ For each scale:
 3. Predictors whose cells touch the middle of an ignored label become ignored (`_cells_touched`).
 4. All other predictors are negative.
 
-The number of positive predictors depends on the labels. On a GPU the process would have to wait for that number.
-Therefore the loader assigns predictors on the CPU, and the loss only gathers them.
+The number of positive predictors depends on the labels. If the GPU assigned predictors, the CPU would have to wait for
+this number in every step. Therefore the loader assigns predictors on the CPU, and the loss only gathers them.
 """
 
 from collections.abc import Callable
@@ -69,7 +69,7 @@ class Assignment:
 
 
 def flat_predictors(predictors: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Indices (P,) into a flattened tensor (N, 3, h, w) of predictors (4, P): frame, anchor, row and column."""
+    """Indices (P,) of predictors (frame, anchor, row and column: (4, P)) in a flattened tensor of this shape."""
     frame, anchor, row, column = predictors
     _, anchors, height, width = shape
     return ((frame * anchors + anchor) * height + row) * width + column
@@ -104,14 +104,15 @@ def assign(
 ) -> Targets:
     """Positive and ignored predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
 
-    A predictor is positive if its anchor is within the factor `ratio` of a selected label and its cell contains the
-    label's centre or is the nearest neighbour of that cell along x or y (as in later YOLO versions). Deviation: YOLOv3
-    makes one predictor of one scale positive for each label. Our rule gives about nine times as many positives, so a
-    short training suffices. Without `ratio`, one predictor is positive, as in YOLOv3.
+    A predictor is positive if its anchor matches a selected label (`matching_anchors`) and its cell is one of three:
+    the cell that contains the label's centre, its nearest neighbour along x, or its nearest neighbour along y (as in
+    later YOLO versions). Deviation: YOLOv3 makes one predictor of one scale positive for each label. Our rule gives
+    about nine times as many positives, so a short training suffices. Without `ratio`, one predictor is positive, as in
+    YOLOv3.
 
     A predictor is ignored if its anchor matches and its cell touches the middle half of an ignored label's box. All
-    other predictors are negative, including those around a selected label. YOLOv3 ignores predictors around a label if
-    their boxes overlap it by more than 0.5; the loss then does not push their scores below the scores of better boxes.
+    other predictors are negative, including those around a selected label. Deviation: YOLOv3 ignores predictors around
+    a label if their boxes overlap it by more than 0.5. Here the loss lowers their scores, so better boxes score higher.
     """
     matches = matching_anchors(labels.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
     centre = (labels.boxes[:, :2] + labels.boxes[:, 2:]) / 2
@@ -147,8 +148,9 @@ def assign(
 
 
 def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shape: tuple[int, int, int, int]) -> Tensor:
-    """Cells (N, 3, h, w) with a centre closer to a box's centre than a quarter of the box plus half a cell.
+    """Whether each cell touches the middle half of a box, along x and along y (N, 3, h, w).
 
+    The centre of such a cell is less than a quarter of the box's side plus half a cell from the centre of the box.
     `at` and `size` (P, 2) are the centres and sizes of the boxes in cells.
     """
     touched = torch.zeros(shape, dtype=torch.bool, device=at.device)

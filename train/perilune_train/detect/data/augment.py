@@ -29,8 +29,8 @@ def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
 def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, float]) -> tuple[NDArray, Array]:
     """Enlarge or shrink a frame (height, width) and its boxes (M, 4); the image size is kept.
 
-    `offset` in [0, 1] selects, in x and y, the part of an enlarged frame to keep or the position of a shrunk one. A
-    shrunk frame is surrounded by its mean grey.
+    `offset` (x and y, each 0 to 1) selects which part of an enlarged frame is kept, or where a shrunk frame is placed.
+    A shrunk frame is surrounded by its mean grey.
     """
     height, width = image.shape
     shift = np.array([width, height]) * (1 - 1 / factor) * np.array(offset)

@@ -39,7 +39,7 @@ class FrameLabels:
     selected: NDArray[np.bool_]
     """False for a crater to ignore: hardly visible, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
-    """False for a crater that is not in the manifest's labels: slightly too small, too large, or off the image (M,)."""
+    """False for a crater without a label: its radius is slightly out of range, or its centre is off the image (M,)."""
     depth_ratio: Array | None = None
     """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
     crowd: NDArray[np.bool_] | None = None
@@ -98,10 +98,11 @@ def read_split_labels(
     share: Share,
     limits: LabelLimits,
 ) -> tuple[SplitLabels, Array]:
-    """Labels and ignored craters of the share's frames, and sizes (S, 2) of the selected labels of all frames.
+    """Labels and ignored craters of this process's share of the frames, and sizes (S, 2) of selected labels.
 
-    `table` has all frames of the split (`frame_table`). Memory holds the result and one scene's craters and labels at a
-    time. Raises UserError if a part cannot be read, or if a key refers to a missing row or is not unique.
+    The sizes are those of all frames of the split, not only of the share, in pixels. `table` has all frames of the
+    split (`frame_table`). Memory holds the result and one scene's craters and labels at a time. Raises UserError if a
+    part cannot be read, or if a key refers to a missing row or is not unique.
     """
     rows = dataset.table("frames", FRAME_COLUMNS)
     check = KeyCheck(dataset, rows)
@@ -122,7 +123,7 @@ def read_split_labels(
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
                 raise UserError(dataset.store, "labels: frame_id", got, expected)
             craters = read_craters(dataset, str(scene_id))
-            # Labels of another split have the index -1.
+            # Drop labels of other splits: their frame is -1, so they are first in the order.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
             labels, bounds = labels.take(order), np.searchsorted(frame[order], [*scene_frames, scene_frames[-1] + 1])
             scene_labels = _SceneLabels.of(labels, craters, limits.selection)

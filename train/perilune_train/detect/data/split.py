@@ -84,7 +84,11 @@ def check_frame_size(dataset: Dataset) -> None:
 
 
 def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
-    """Smallest and largest selected radius, pixels. A limit that the settings leave open comes from all labels."""
+    """Smallest and largest selected radius, pixels.
+
+    If the settings have no radii, these are the extremes of all labels of the dataset. If they have no largest radius,
+    it is the largest radius that the dataset labels.
+    """
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()
         least, largest = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))

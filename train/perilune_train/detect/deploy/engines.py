@@ -53,7 +53,7 @@ def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engi
 
 
 def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
-    """ONNX Runtime engine of an .onnx file; `threads` 0 uses one per core, within a container's CPU quota."""
+    """ONNX Runtime engine of an .onnx file. `threads` 0: one thread per core, within a container's CPU quota."""
     onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or _within_quota()
@@ -100,9 +100,9 @@ def openvino_engine(
 
 
 def _within_quota() -> int:
-    """Number of threads for an engine that ignores a container's CPU quota; 0 without a limiting quota.
+    """Number of threads for an engine that ignores a container's CPU quota.
 
-    With 0, the engine decides.
+    Returns 0 if no quota limits the cores; the engine then chooses the number of threads.
     """
     return usable_cores() if usable_cores() < cores_in_affinity() else 0
 

@@ -1,4 +1,4 @@
-"""Detection metrics in every bootstrap resample of units (spread.py)."""
+"""Detection metrics in every bootstrap resample of scenes, trajectories or images (records/spread.py)."""
 
 import numpy as np
 from numpy.typing import NDArray

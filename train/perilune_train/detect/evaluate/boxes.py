@@ -25,7 +25,7 @@ def coverage_matrix(first: ArrayLike, second: ArrayLike) -> Array:
 def _intersections(first: ArrayLike, second: ArrayLike) -> tuple[Array, Array]:
     """Areas (N, M) of the intersections of boxes (N, 4) and (M, 4), and areas (N,) of the first boxes."""
     a, b = (np.asarray(boxes, np.float64).reshape(-1, 4).T for boxes in (first, second))
-    # One matrix per side, because a last axis of length two takes twice as long.
+    # Separate matrices for width and height: one array with a last axis of length two would take twice the time.
     width, height = (
         np.maximum(np.minimum(a[i + 2, :, None], b[i + 2]) - np.maximum(a[i, :, None], b[i]), 0) for i in (0, 1)
     )
@@ -65,7 +65,7 @@ def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np
         low[axis], high[axis] = middle.min(), middle.max()
     cell = np.maximum((high - low) / side, 1e-6)
     heads = np.full((side, side), -1)
-    # Chains of entries: the kept box, and the next entry of its cell.
+    # Each cell has a linked list. An entry is the index of a kept box and the index of the next entry, or -1.
     entries, n_entries = np.empty((4 * n + most, 2), np.int64), 0
     kept, n_kept = np.empty(min(n, max_count), np.int64), 0
     large, n_large = np.empty(n, np.int64), 0

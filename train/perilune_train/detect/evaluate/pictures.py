@@ -37,7 +37,8 @@ def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] |
 def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
     """Draw AP by radius, altitude and Sun as bars.
 
-    Also draws 95 % intervals or single units, label counts, and the goal 0.85 as a dashed line.
+    Each bar has its 95 % interval, or a dot per unit if there is no interval, and its number of labels. A dashed line
+    shows the goal of 0.85.
     """
     unit = bins[0].ap50_paper_spread.unit if bins else "unit"
     drawn = [(by, title) for by, title in _PANELS.items() if any(part.by == by for part in bins)]
@@ -69,10 +70,10 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
 
 
 def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) -> dict[str, list[int]]:
-    """Choose `count` frames each with the best, typical (nearest the median) and worst F1 (N,).
+    """Choose the `count` best, the `count` typical and the `count` worst frames by their F1 (N,).
 
-    Prefers frames of different `groups` (trajectories). Never chooses a frame twice, or a frame without selected labels
-    (NaN).
+    Typical frames have an F1 near the median. Prefers frames of different `groups` (trajectories). Never chooses a
+    frame twice, or a frame without selected labels (NaN).
     """
     known = np.flatnonzero(np.isfinite(f1))
     middle = np.median(f1[known]) if len(known) else 0.0

@@ -28,9 +28,10 @@ class Truth:
 
 
 def read_truth(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Truth:
-    """Read truth.csv for frames at times (n,), or the poses of the body in an EuRoC file.
+    """Read the true camera poses of frames at times (n,) from truth.csv or from an EuRoC file.
 
-    Raises UserError if it has other times or a value that is not a number.
+    An EuRoC file has poses of the body: they are interpolated, and `rotation_camera_from_body` (3, 3) converts them.
+    Raises UserError if the times do not fit the frames, or if a value is not a number.
     """
     if any("p_RS_R_x" in name for name in column_names(path, POSES)):
         return _of_euroc(path, time_s, rotation_camera_from_body)
@@ -61,7 +62,10 @@ def _of_euroc(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Tr
 
 
 def with_errors_of(estimates: pd.DataFrame, truth: Truth | None) -> pd.DataFrame:
-    """Add errors to estimates of the first frames: position minus truth (metres, O_L) and attitude angle."""
+    """Add columns with the errors of estimated poses; row k belongs to frame k of `truth`.
+
+    The position error is estimate minus truth (metres, O_L). The attitude error is the angle between both attitudes.
+    """
     if truth is None:
         return estimates
     n = len(estimates)

@@ -103,7 +103,7 @@ class LabelFile:
     categories: Mapping[str, str] = field(default_factory=dict)
     """Name of each category, by its id in the file."""
     clip: bool = True
-    """Whether boxes end at the edges of the picture."""
+    """Whether to clip boxes at the edges of the picture."""
     notes: tuple[str, ...] = ()
     """Lines for the user."""
 
@@ -140,16 +140,16 @@ def choose_categories(
 ) -> tuple[set[str] | None, str]:
     """The ids of the categories that are craters, and a text that names them.
 
-    Without `wanted`, these are all categories named crater or craters, in upper or lower case; a file may have several,
-    since exports of Roboflow also have a placeholder category. Without `wanted`, and with fewer than two categories,
-    every object is a crater, and the ids are None.
+    `wanted` names the categories. Without it, these are all categories named crater or craters, in upper or lower case;
+    there may be several, because Roboflow adds a placeholder category to its exports. Exception: without `wanted`, in a
+    file with fewer than two categories, every object is a crater, and the ids are None.
     """
     names = {key: " ".join(name.split()) for key, name in categories.items()}
     asked = [name.strip().lower() for name in wanted]
     if not asked and len(names) < 2:
         odd = [name for name in names.values() if name.lower() not in (*_CRATER_NAMES, "")]
         return None, "".join(f"every object is taken as a crater; their category is {name}" for name in odd)
-    # With names only, as in Pascal VOC, a name is its own id.
+    # Formats without category ids, such as Pascal VOC, use the name as the id.
     described = {key: name if name == key else f"{name} ({key})" for key, name in names.items()}
     known = ", ".join(names.values())
     for name, original in zip(asked, wanted, strict=True):

@@ -71,7 +71,8 @@ def find_picture(path: Path, name: Any, field: str, image_folder: Path | None) -
 
     Searches only `image_folder` if it is given. Otherwise searches the file's folder, its subfolder images, ../images,
     ../images/NAME and ../NAME, where NAME is the last part of the file's name (train2017 for
-    instances_train2017.json). A file in a folder of a perilune dataset may also name the dataset's frames.
+    instances_train2017.json). If the label file is in a direct subfolder of a perilune dataset, the
+    dataset's folder is searched too.
     """
     root = path.resolve().parent
     ending = path.stem.rpartition("_")[2]
