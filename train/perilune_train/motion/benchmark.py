@@ -47,8 +47,8 @@ _SUNS_DEG = (0, 15, 30, 45, 60, 90)
 def score_navigator(run: Path, data: Address, manifests: Address, out: Path, allow_overlap: bool = False) -> Metrics:
     """Score a run's best weights, the classical methods and the nominal motion; return the figures.
 
-    Writes the page, figures, tables and pictures. Raises UserError if the benchmark is missing or was changed. Unless
-    `allow_overlap`, also raises it if the network was fitted to terrain of the benchmark.
+    Writes the page, figures, tables and pictures. Raises UserError if the benchmark is missing or was changed, or if
+    the network was trained on terrain of the benchmark; `allow_overlap` accepts such a network.
     """
     parts = open_parts("nav", data, manifests)
     best = RunFolder(run).best

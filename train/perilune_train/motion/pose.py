@@ -20,8 +20,8 @@ from perilune_train.motion.data.trajectories import Pose, Trajectory
 from perilune_train.motion.network import Scales, decoded_rotation
 
 _PAIRS = {"cpu": 16, "cuda": 32}
-"""Number of pairs that pass the backbone together, by device. It bounds the memory. A GPU takes more pairs, because it
-would otherwise wait for kernel launches."""
+"""Number of pairs that pass the backbone together, by device. It bounds the memory. A GPU gets more pairs at a time,
+because with few pairs it waits for kernel launches."""
 
 
 def normalised_frames(frames: Tensor) -> Tensor:

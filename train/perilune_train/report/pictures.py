@@ -81,7 +81,7 @@ def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def logarithmic(axes: Axes, *which: Literal["x", "y"]) -> None:
-    """Make axes logarithmic, labelled with plain numbers at the powers of ten; axes within two decades have more."""
+    """Make axes logarithmic, with plain numbers at the powers of ten. Axes within two decades also have 2 and 5."""
     for name in which:
         (axes.set_xscale if name == "x" else axes.set_yscale)("log")
         axis = axes.xaxis if name == "x" else axes.yaxis

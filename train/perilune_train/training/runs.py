@@ -65,7 +65,7 @@ class RunFolder:
 
     @property
     def damaged(self) -> Path | None:
-        """The weights or the metrics if that file is empty or truncated; None if both are complete or missing."""
+        """The first damaged file: weights or metrics that are empty or truncated. None if no file is damaged."""
         if self.best.is_file() and not (half_is_whole if self.best.suffix == SUFFIX else is_whole)(self.best):
             return self.best
         if self.metrics.is_file() and not has_metrics(self.root):

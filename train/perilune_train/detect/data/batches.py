@@ -72,7 +72,7 @@ class Collate:
     """Makes a batch of frames. A class, so that `spawn` can pickle it."""
 
     anchors: Tensor | None
-    """Widths and heights of the anchors in pixels (scales, 3, 2), on the CPU; None without assignment."""
+    """Widths and heights of the anchors in pixels (scales, 3, 2), on the CPU; None to return no assignments."""
     strides: tuple[int, ...]
     """Strides of the scales, pixels."""
     ratio: float | None

@@ -20,7 +20,7 @@ class FrameFacts:
     sizes_px: NDArray[np.int64]
     """Width and height (N, 2)."""
     scene: list[str]
-    """Terrain, the unit of the bootstrap intervals (spread.py); "" if unknown (N)."""
+    """Name of the terrain; "" if unknown (N). Bootstrap intervals resample whole scenes (records/spread.py)."""
     trajectory: list[str]
     """Trajectory over the terrain, with a unique name; "" if unknown (N)."""
     altitude_m: Array

@@ -130,7 +130,10 @@ def _detect_tiles(
 
 
 def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: int) -> Array:
-    """Distance (D, T) of spans (D, 2) to the nearest border of each tile along a side; image edges do not count."""
+    """Distance (D, T) from spans (D, 2) along one axis to the nearest border of each tile.
+
+    Tile borders at the edge of the image do not count.
+    """
     low = np.where(starts > 0, spans[:, :1] - starts, np.inf)
     high = np.where(starts + tile_px < length_px, starts + tile_px - spans[:, 1:], np.inf)
     return np.minimum(low, high)

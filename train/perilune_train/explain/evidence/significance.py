@@ -61,11 +61,13 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
     PCC1 may have either sign. The values of each map are therefore multiplied by the map's sign on validation frames
     (`signs`), and no sign is chosen on the frames of the table.
 
-    p_bootstrap is one-sided: (1 + number of resampled differences at most 0) / 1001, resampled over units. Its
-    resolution is 0.001, but with S units it reaches 0.001 by chance with probability 2^-S. It is too small for S below
-    about 20. p is from a one-sided sign-flip test over units, which is exact if differences are symmetric around 0. It
-    uses all 2^S flips for up to 12 units, else 4096. Its resolution is 2^-S: 0.031 with 5 scenes, 0.002 with 9 scenes.
-    Use p for decisions.
+    Use p for decisions: it is from a one-sided sign-flip test over units, which is exact if differences are symmetric
+    around 0. The test uses all 2^S flips of S units for S up to 12, and 4096 flips for more. Its resolution is 2^-S:
+    0.031 with 5 scenes, 0.002 with 9 scenes.
+
+    p_bootstrap is one-sided too. It is (1 + the number of resampled differences that are at most 0) / 1001, resampled
+    over units. Its resolution is 0.001, but it reaches 0.001 by chance with probability 2^-S. With fewer than about 20
+    units, p_bootstrap is therefore too small.
 
     Raises ValueError if the sign of a PCC1 measure is missing.
     """

@@ -51,7 +51,7 @@ def grid_of(points: Array) -> Grid:
 
 @compiled
 def _cell(coordinate: float, corner: float, side: float, n: int) -> int:
-    """Index along one axis of the cell at a coordinate; outside the grid, of the nearest cell."""
+    """Index along one axis of the cell that contains a coordinate, or of the nearest cell of the grid."""
     return int(min(max((coordinate - corner) / side, 0.0), n - 1.0))
 
 

@@ -50,7 +50,7 @@ class Area:
     altitude_m: tuple[float, float]
     """Smallest and largest altitude above the ground, metres."""
     heading_rad: float
-    """Largest difference between the heading and the heading of the assumed attitude, radians; pi if it is unknown."""
+    """Largest deviation of the true heading from the heading of the assumed attitude, radians; pi if unknown."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ _ERRORS = {"position_error_m": "position error (m)", "orientation_error_deg": "o
 
 
 def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -> None:
-    """Draw AP of YOLOv3 against equilibrium_share, with evenly spaced runs; mark the paper's AP and the headline."""
+    """Draw AP of YOLOv3 against equilibrium_share; mark the paper's AP and the headline. Runs are evenly spaced."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     shares = list(curve)

@@ -117,7 +117,10 @@ def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
 
 
 def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
-    """Whether the mean pose or motion already predicts the orientation; without a mean, whether all networks do."""
+    """Whether the orientation is nearly constant: predicting the mean pose or motion has a small error.
+
+    Without figures of the mean, the errors of all networks must be small.
+    """
     means = [f"baseline/{name}/{key.removeprefix('test/')}" for name in ("mean", "mean_pose")]
     known = [value for mean in means for value in numbers(trained, mean)] or numbers(trained, key)
     return max(known) < _CONSTANT_DEG
