@@ -67,7 +67,7 @@ def _endless_line(folder, columns):
 def _endless_quote(folder, columns):
     path = folder / "table.csv"
     path.write_text(",".join(columns) + '\n"' + "1,2\n" * 5_000_000)
-    return path, "a quote without its end"
+    return path, "a closing quote may be missing"
 
 
 def _many_columns(folder, columns):
