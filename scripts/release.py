@@ -191,7 +191,7 @@ def distributions(root: Path) -> list[Path]:
 def try_installed(version: str, wheels: list[Path]) -> None:
     """Use the wheels in a new environment.
 
-    Only the wheels are installed there; their dependencies come from the current environment, so that no network is
+    Only the wheels are installed there. Their dependencies come from the current environment, so no network is
     needed. scripts/test-wheels also installs the dependencies.
     """
     packages = [wheel.name.split("-")[0] for wheel in wheels]

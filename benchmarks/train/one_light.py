@@ -34,10 +34,12 @@ def main(
                 boxes = craters.table[["x0_px", "y0_px", "x1_px", "y1_px"]].to_numpy()
                 values.append(agreement_of_light(craters.image, Detections(boxes, craters["score"])))
         for half, label in ((values[::2], "chosen on"), (values[1::2], "tested on")):
-            judged = [agreement for agreement, count in half if count >= MIN_CRATERS]
-            doubted = sum(agreement < MIN_AGREEMENT for agreement in judged)
-            text = f"{min(judged):.2f} to {max(judged):.2f}" if judged else "none"
-            answer(f"{name}, {label}: {len(half)} pictures, {len(judged)} judged, agreement {text}, {doubted} doubted")
+            agreements = [agreement for agreement, count in half if count >= MIN_CRATERS]
+            n_below = sum(agreement < MIN_AGREEMENT for agreement in agreements)
+            text = f"{min(agreements):.2f} to {max(agreements):.2f}" if agreements else "none"
+            answer(
+                f"{name}, {label}: {len(half)} pictures, {len(agreements)} tested, agreement {text}, {n_below} too low"
+            )
 
 
 if __name__ == "__main__":

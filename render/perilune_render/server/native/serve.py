@@ -12,7 +12,7 @@ from perilune_render.server.native.answers import ANSWERED_BY_CONNECTIONS, answe
 from perilune_render.server.serve import Interface, answers
 
 MAX_REFUSED = 256
-"""Largest number of clients connected beyond the limit; the server only replies that it is busy."""
+"""Largest number of connected clients beyond the limit. Each gets the reply that the server is busy."""
 HEALTH = b'{"request": "health"}'
 """The health request of `perilune_shared.client`, which is also answered beyond the limit of clients."""
 _HEALTH_S = 5.0
@@ -31,7 +31,7 @@ class Native:
     grounds: Grounds
     """The scenes."""
     limits: Limits
-    """Limits on the clients. To clients beyond the limit, the server replies that it is busy."""
+    """Limits on the clients. Clients beyond the limit get the reply that the server is busy."""
     note: Callable[[str], object]
     """Called with one line for each error that is not caused by a client."""
     interfaces: list[Interface] = field(default_factory=list)

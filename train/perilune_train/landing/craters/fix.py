@@ -1,8 +1,8 @@
 """Estimate a camera's pose by matching craters to a catalogue, from a start near the true pose.
 
 Each round projects the catalogue into the image, matches sightings and craters, and takes a Gauss-Newton step that fits
-the centres and sizes of the ellipses. The first rounds are soft: every crater near a sighting counts with the
-probability that it is the sighting's crater, for an error of the pose that shrinks from round to round (annealed
+the centres and sizes of the ellipses. The first rounds are soft: each crater near a sighting is weighted by the
+probability that the two match. The assumed error of the pose shrinks from round to round (annealed
 expectation-maximisation, as in Chui & Rangarajan 2003, doi 10.1016/S1077-3142(03)00009-2). One-to-one matches within a
 wide gate would converge to a wrong pose where craters are dense, even from the true pose. The last rounds match one to
 one, with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171). The ellipse centres are computed
