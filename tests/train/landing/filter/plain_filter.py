@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from perilune_shared.geometry.frames import matrix_from_rotation_vector
+from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_train.landing.filter.state import N_ERRORS
 from perilune_train.landing.filter.update import GATE_SHARE
@@ -41,6 +41,7 @@ def propagated(state, end_s, rate, force, noise, relief_m):
         velocity_mps=state.velocity_mps + acceleration * step,
         rotation_site_from_body=middle @ half,
         ground_m=float(kept * state.ground_m),
+        angular_rate_radps=rate,
         covariance=change @ state.covariance @ change.T + np.diag(added),
     )
 
@@ -63,6 +64,46 @@ def updated(state, innovation, by_error, noise, gated=True):
         return state
     gain = state.covariance @ whole.T @ np.linalg.inv(spread)
     return state.corrected(gain @ innovation, state.covariance - gain @ spread @ gain.T)
+
+
+def numeric(state, expected_of, n):
+    """The derivative (n, 25) of an expected measurement by the error state, by central differences."""
+    by_error, step = np.zeros((n, N_ERRORS)), 1e-6
+    for k in range(N_ERRORS):
+        error = np.zeros(len(state.covariance))
+        error[k] = step
+        above, below = (expected_of(state.corrected(sign * error, state.covariance)) for sign in (1, -1))
+        by_error[:, k] = (above - below) / (2 * step)
+    return by_error
+
+
+def along(state, range_m, ground_m, sigma_m, beam):
+    """The state after a range along a beam, with a numeric derivative."""
+
+    def expected_of(state):
+        height_m = state.position_m[2] - ground_m - state.ground_m
+        return np.array([height_m / -(state.rotation_site_from_body @ beam)[2]])
+
+    by_error = numeric(state, expected_of, 1)
+    return updated(state, range_m - expected_of(state), by_error, np.array([[sigma_m**2]]))
+
+
+def sped(state, speed_mps, sigma_mps, beam):
+    """The state after a speed along a beam, with a numeric derivative."""
+
+    def expected_of(state):
+        return np.array([state.velocity_mps @ state.rotation_site_from_body @ beam])
+
+    by_error = numeric(state, expected_of, 1)
+    return updated(state, speed_mps - expected_of(state), by_error, np.array([[sigma_mps**2]]))
+
+
+def turned(state, rotation_site_from_body, sigmas_rad):
+    """The state after an attitude."""
+    innovation = rotation_vectors(state.rotation_site_from_body.T @ rotation_site_from_body)
+    by_error = np.zeros((3, N_ERRORS))
+    by_error[:, 6:9] = np.eye(3)
+    return updated(state, innovation, by_error, np.diag(np.square(sigmas_rad)))
 
 
 def ranged(state, range_m, ground_m, sigma_m):

@@ -26,6 +26,8 @@ def some_state(seed):
             SIGMAS,
             [0.1] * 5,
             [5.0],
+            [1e-3] * 3,
+            [0.02],
             [1.0] * 2 * N_CRATERS,
             N_PAST * [10.0, 10, 10, 5e-3, 5e-3, 5e-3],
         ]
@@ -90,6 +92,57 @@ def test_measurements_between_frames_have_the_effect_of_whole_updates(n_flights)
     for found, expected in zip(stretch.states(), states, strict=True):
         assert_same(found, expected)
         np.testing.assert_array_equal(found.covariance, found.covariance.T)
+
+
+BEAM = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
+
+
+@pytest.mark.parametrize("n_flights", [1, 3])
+def test_beams_and_star_trackers_have_the_effect_of_whole_updates(n_flights):
+    rng, states = np.random.default_rng(5), [some_state(seed) for seed in range(n_flights)]
+    stretch = Stretch(states, NOISE, RELIEF_M)
+    force, rate = np.tile([0.1, -0.1, 1.6], (3, 1)), 0.02 * rng.normal(size=(3, 3))
+    attitude = states[0].rotation_site_from_body @ matrix_from_rotation_vector(np.array([4e-4, -2e-4, 3e-4]))
+    sigmas, ground_m = np.array([1e-4, 2e-4, 3e-4]), np.array([10.0, 11.0, 12.0])[:n_flights]
+    for k in range(3):
+        end_s = 3.05 + 0.05 * k
+        stretch.inertial(Increments(np.array([end_s]), np.array([0.05]), rate[[k]], force[[k]]))
+        assert stretch.range(1000.0, ground_m, 3.0, BEAM).all()
+        assert stretch.line_speed(25.0, 0.05, BEAM)[0]
+        accepted = stretch.attitude(attitude, sigmas)
+        for number, state in enumerate(states):
+            state = plain_filter.propagated(state, end_s, rate[k], force[k], NOISE, RELIEF_M)
+            state = plain_filter.along(state, 1000.0, ground_m[number], 3.0, BEAM)
+            state = plain_filter.sped(state, 25.0, 0.05, BEAM)
+            states[number] = plain_filter.turned(state, attitude, sigmas)
+            assert accepted[number] == (states[number] is not state)
+    for found, expected in zip(stretch.states(), states, strict=True):
+        scale = np.sqrt(np.diag(expected.covariance))
+        # The three axes of an attitude are applied one after the other, which differs by second-order terms.
+        error = np.concatenate(
+            [
+                found.pose_error(expected.position_m, expected.rotation_site_from_body),
+                expected.velocity_mps - found.velocity_mps,
+                expected.gyro_bias_radps - found.gyro_bias_radps,
+            ]
+        )
+        of_error = [*range(3), *range(6, 9), *range(3, 6), *range(9, 12)]
+        assert np.abs(error / scale[of_error]).max() < 0.05
+        difference = (found.covariance - expected.covariance) / scale / scale[:, None]
+        np.testing.assert_allclose(difference, 0, atol=1e-4)
+
+
+def test_contradicting_measurements_are_refused_and_counted():
+    state = some_state(0)
+    stretch = Stretch([state], NOISE, RELIEF_M)
+    upside_down = state.rotation_site_from_body @ np.diag([1.0, -1.0, -1.0])
+    # The rotation vector of half a turn has no direction: turn a little less.
+    upside_down = upside_down @ matrix_from_rotation_vector(np.array([0.3, 0, 0]))
+    assert not stretch.attitude(upside_down, np.full(3, 1e-3))[0]
+    assert not stretch.line_speed(500.0, 0.05, BEAM)[0]
+    assert not stretch.range(5.0, np.zeros(1), 1.0, -BEAM)[0]
+    assert stretch.n_refused.tolist() == [3]
+    assert_same(stretch.states()[0], state)
 
 
 def test_a_gap_is_coasted_to_the_begin_of_the_next_measurement():

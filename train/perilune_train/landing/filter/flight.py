@@ -10,12 +10,38 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_train.landing.craters.locate import Located
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.filter.lander import Lander, Status, range_update
+from perilune_train.landing.filter.lander import Beam, Lander, LidarErrors, Status, beam_update, range_update
 from perilune_train.landing.filter.propagate import Increments
 from perilune_train.landing.filter.state import State
 from perilune_train.landing.filter.stretch import Stretch
 
 _SAME_S = 1e-9
+_ATTITUDE, _BEAM, _RANGE, _FRAME = range(4)
+"""Kinds of measurements, in the order in which those of one time are processed."""
+
+
+@dataclass(frozen=True, slots=True)
+class StarTracker:
+    """Attitudes measured by a star tracker."""
+
+    time_s: Array
+    """Times (n,), seconds since the first frame."""
+    rotation_body_from_site: Array
+    """Attitudes (n, 3, 3); NaN where the tracker saw no stars."""
+    sigmas_rad: Array
+    """Standard deviations (3,) about the body's axes, radians."""
+
+
+@dataclass(frozen=True, slots=True)
+class DopplerLidar:
+    """Ranges and speeds along the beams of a Doppler lidar, one row for each beam and time."""
+
+    time_s: Array
+    """Times (n,), seconds since the first frame."""
+    beams: list[Beam]
+    """Measurements (n)."""
+    errors: LidarErrors
+    """Standard deviations of the measurements."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +54,10 @@ class Instruments:
     """Times of the ranges (n,), seconds since the first frame."""
     range_m: Array
     """Distances to the ground along -Z_B (n,), metres; NaN where the altimeter measured no distance."""
+    star_tracker: StarTracker | None = None
+    """Attitudes of a star tracker."""
+    doppler_lidar: DopplerLidar | None = None
+    """Ranges and speeds of a Doppler lidar."""
 
     @classmethod
     def of_trajectory(cls, dataset: Dataset, ids: tuple[str, str], grade: InertialGrade) -> "Instruments":
@@ -65,6 +95,8 @@ class Estimate:
     """Whether the state can be trusted."""
     located: Located | None
     """The accepted fix, if there is one."""
+    n_refused: int = 0
+    """Number of ranges, speeds and attitudes since the previous frame that contradict the state and were refused."""
 
 
 def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
@@ -87,11 +119,19 @@ def fly_together(
     `seen` yields the sightings of all flights, frame by frame. The first lander sets the inertial noise, range noise
     and relief of all flights.
     """
-    times = np.concatenate([instruments.range_time_s, frame_time_s])
-    is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])
-    number = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
-    # At equal times, the range comes first.
-    order = np.lexsort([is_frame, times])
+    stars, lidar = instruments.star_tracker, instruments.doppler_lidar
+    none = np.zeros(0)
+    of_kind = {
+        _ATTITUDE: none if stars is None else stars.time_s,
+        _BEAM: none if lidar is None else lidar.time_s,
+        _RANGE: instruments.range_time_s,
+        _FRAME: frame_time_s,
+    }
+    times = np.concatenate(list(of_kind.values()))
+    kind = np.concatenate([np.full(len(time_s), key) for key, time_s in of_kind.items()])
+    number = np.concatenate([np.arange(len(time_s)) for time_s in of_kind.values()])
+    # At equal times, the frame comes last.
+    order = np.lexsort([kind, times])
     sightings, surroundings = iter(seen), [lander.surroundings for lander in landers]
     measured, n_done = instruments.inertial.measured(), 0
     stretch = _stretch(landers)
@@ -102,16 +142,23 @@ def fly_together(
         if times[k] > stretch.time_s + _SAME_S:
             following = measured.part(slice(n_done, n_done + 1))
             stretch.inertial(following.until(times[k])) if len(following) else stretch.coast(times[k])
-        if is_frame[k]:
+        if kind[k] == _FRAME:
             estimates, frame_sightings = [], next(sightings)
-            for lander, state, frame in zip(landers, stretch.states(), frame_sightings, strict=True):
+            refused = stretch.n_refused
+            for f, (lander, state, frame) in enumerate(zip(landers, stretch.states(), frame_sightings, strict=True)):
                 lander.state = state
                 located = lander.sightings(frame)
-                estimates.append(Estimate(int(number[k]), lander.state, lander.status, located))
+                estimates.append(Estimate(int(number[k]), lander.state, lander.status, located, int(refused[f])))
             yield estimates
             stretch = _stretch(landers)
-        else:
+        elif kind[k] == _RANGE:
             range_update(stretch, float(instruments.range_m[number[k]]), surroundings)
+        elif kind[k] == _BEAM and lidar is not None:
+            beam_update(stretch, lidar.beams[number[k]], lidar.errors, surroundings)
+        elif stars is not None:
+            rotation_body_from_site = stars.rotation_body_from_site[number[k]]
+            if np.isfinite(rotation_body_from_site).all():
+                stretch.attitude(rotation_body_from_site.T, stars.sigmas_rad)
     for lander, state in zip(landers, stretch.states(), strict=True):
         lander.state = state
 

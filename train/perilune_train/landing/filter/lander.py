@@ -2,6 +2,8 @@
 
 inertial, coast   propagate the state
 range             update the state with the distance to the ground below
+beam              update the state with the range and the speed along a beam of a Doppler lidar
+attitude          update the state with the attitude from a star tracker
 sightings         match craters (locate.py), then one of three:
                   - the fix fits the state: update with its craters (`craters_update`)
                   - the fix contradicts the state, and the previous fix did so too, with an equal offset: replace
@@ -23,12 +25,11 @@ from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import Fix, PosePrior
 from perilune_train.landing.craters.locate import Located, locate
-from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.filter.measurements import craters_update, pose_fits
+from perilune_train.landing.filter.measurements import camera_pose, craters_update, pose_fits
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
-from perilune_train.landing.filter.state import ATTITUDE, POSITION, VELOCITY, State
-from perilune_train.landing.filter.stretch import Stretch
+from perilune_train.landing.filter.state import ATTITUDE, CAMERA, N_ERRORS, POSITION, VELOCITY, State
+from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Stretch
 from perilune_train.landing.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
@@ -65,13 +66,62 @@ def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surrou
 
     A range that is not a positive, finite length is refused.
     """
+    return _range_along(stretch, range_m, surroundings, surroundings[0].range_sigma_m, DOWN)
+
+
+def _range_along(
+    stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings], sigma_m: float, beam_in_body: Array
+) -> NDArray[np.bool_]:
     if not (np.isfinite(range_m) and range_m > 0):
         return np.zeros(len(surroundings), bool)
-    positions_and_surroundings = zip(stretch.position_m, surroundings, strict=True)
+    ends = stretch.position_m
+    if beam_in_body is not DOWN:
+        ends = ends + range_m * (stretch.rotation_site_from_body @ beam_in_body)
     ground_m = np.array(
-        [local.catalogue.ground_m(position, _NEAREST) for position, local in positions_and_surroundings]
+        [local.catalogue.ground_m(end, _NEAREST) for end, local in zip(ends, surroundings, strict=True)]
     )
-    return stretch.range(range_m, ground_m, surroundings[0].range_sigma_m)
+    return stretch.range(range_m, ground_m, sigma_m, beam_in_body)
+
+
+@dataclass(frozen=True, slots=True)
+class Beam:
+    """A measurement of one beam of a Doppler lidar."""
+
+    direction_in_body: Array
+    """Unit vector (3,), O_B, from the lander towards the ground."""
+    speed_mps: float
+    """Speed over ground along the beam, positive towards the ground, metres per second; NaN if it is missing."""
+    range_m: float
+    """Distance to the ground along the beam, metres; NaN if it is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class LidarErrors:
+    """Standard deviations of a Doppler lidar."""
+
+    speed_sigma_mps: float
+    """Standard deviation of a speed, metres per second."""
+    range_sigma_m: float
+    """Standard deviation of a range, metres."""
+    step_s: float
+    """Time between two measurements of one beam, seconds."""
+
+    def range_deviation_m(self, relief_m: float) -> float:
+        """Standard deviation of a range as the filter uses it, metres.
+
+        The ground at a slanted beam's end differs from the ground below, and the difference repeats from one range to
+        the next. Without a state for each beam, each range gets its share of the information of one range per
+        correlation time.
+        """
+        return float(np.hypot(self.range_sigma_m, relief_m * np.sqrt(max(1.0, GROUND_S / self.step_s))))
+
+
+def beam_update(stretch: Stretch, beam: Beam, errors: LidarErrors, surroundings: Sequence[Surroundings]) -> None:
+    """Update flights by the range and the speed along a beam; missing ones are left out."""
+    sigma_m = errors.range_deviation_m(surroundings[0].relief_m)
+    _range_along(stretch, beam.range_m, surroundings, sigma_m, beam.direction_in_body)
+    if np.isfinite(beam.speed_mps):
+        stretch.line_speed(beam.speed_mps, errors.speed_sigma_mps, beam.direction_in_body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +200,17 @@ class Lander:
         """
         return bool(range_update(self._stretch, range_m, [self._around])[0])
 
+    def beam(self, beam: Beam, errors: LidarErrors) -> None:
+        """Update by the range and the speed along a beam at the current time."""
+        beam_update(self._stretch, beam, errors, [self._around])
+
+    def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> bool:
+        """Update by an attitude (3, 3) at the current time; returns whether it was accepted.
+
+        `sigmas_rad` (3,) are the standard deviations about the body's axes, radians.
+        """
+        return bool(self._stretch.attitude(rotation_site_from_body, sigmas_rad)[0])
+
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the current time; returns the fix if it was accepted."""
         located = self._matched(seen)
@@ -200,31 +261,27 @@ class Lander:
 
     def _restart(self, located: Located) -> None:
         """Take position and attitude from a fix, and enlarge the velocity's uncertainty by `_UNKNOWN_VELOCITY_MPS`."""
-        fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
-        state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
+        fix, state = located.fix, self.state.with_craters(np.zeros(0, int), np.zeros(0))
+        expected, by_error = camera_pose(state, self._around.rotation_camera_from_body)
         covariance = state.covariance.copy()
+        of_camera = by_error[:, CAMERA] @ covariance[CAMERA, CAMERA] @ by_error[:, CAMERA].T
         for part in (POSITION, ATTITUDE):
             covariance[part], covariance[:, part] = 0, 0
         covariance[VELOCITY, VELOCITY] += np.eye(3) * _UNKNOWN_VELOCITY_MPS**2
         body = np.zeros((6, 6))
-        body[:3, :3], body[3:, 3:] = np.eye(3), -rotation_camera_from_body.T
-        of_body = body @ fix.covariance @ body.T
+        body[:3, :3], body[3:, 3:] = np.eye(3), by_error[3:, ATTITUDE].T
+        of_body = body @ (fix.covariance + of_camera) @ body.T
         covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = of_body[:3, :3], of_body[3:, 3:]
         covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = of_body[:3, 3:], of_body[3:, :3]
+        turned = expected.rotation_camera_from_site.T @ fix.pose.rotation_camera_from_site
         self.state = replace(
             state,
-            position_m=fix.pose.position_m,
-            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ rotation_camera_from_body,
+            position_m=fix.pose.position_m - (expected.position_m - state.position_m),
+            rotation_site_from_body=turned.T @ state.rotation_site_from_body,
             covariance=covariance,
         )
 
     def _expected(self) -> PosePrior:
         """The expected camera pose and the covariance (6, 6) of its error, as in `PosePrior`."""
-        rotation_camera_from_body, state = self._around.rotation_camera_from_body, self.state
-        pose_parts = [*range(3), *range(6, 9)]
-        to_camera = np.zeros((6, 6))
-        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -rotation_camera_from_body
-        covariance = to_camera @ state.covariance[np.ix_(pose_parts, pose_parts)] @ to_camera.T
-        return PosePrior(
-            Pose(state.position_m, rotation_camera_from_body @ state.rotation_site_from_body.T), covariance
-        )
+        pose, by_error = camera_pose(self.state, self._around.rotation_camera_from_body)
+        return PosePrior(pose, by_error @ self.state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.compiled import compiled
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import Fix
@@ -13,8 +13,10 @@ from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.landing.filter.state import (
     ATTITUDE,
     COMMON,
+    MOUNTING,
     N_ERRORS,
     POSITION,
+    TIME_TAG,
     State,
     common_pattern,
 )
@@ -22,8 +24,10 @@ from perilune_train.landing.filter.update import passes_gate, updated
 
 _MIN_WEIGHT = 0.1
 """Matches with a smaller weight in the fix are ignored."""
-_ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
+_ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON, MOUNTING, TIME_TAG]
 """Parts of the error state that displace every sighting."""
+_COMMON_SEEN = slice(6, 11)
+"""The part COMMON within `_ALL_SEE`."""
 
 
 def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
@@ -36,15 +40,31 @@ def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_
     return passes_gate(innovation, spread)
 
 
-def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Translation and rotation (6,) from the expected pose, and their derivative (6, 21) by the error state."""
-    expected = rotation_camera_from_body @ state.rotation_site_from_body.T
-    turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
+def camera_pose(state: State, rotation_camera_from_body: Array) -> tuple[Pose, Array]:
+    """The expected pose of the camera at the exposure of a frame with the state's time, and its derivative (6, 25).
+
+    Mounting and time tag are corrected by the state's estimates. The derivative, by the error state, is of the pose
+    error as in `PosePrior`.
+    """
+    mounted = matrix_from_rotation_vector(state.mounting_rad) @ rotation_camera_from_body
+    later = matrix_from_rotation_vector(-state.angular_rate_radps * state.time_tag_s)
+    camera_from_body = mounted @ later
     by_error = np.zeros((6, N_ERRORS))
     by_error[:3, POSITION] = np.eye(3)
+    by_error[:3, TIME_TAG] = state.velocity_mps[:, None]
     # R_camera_from_site = C R^T. Replacing R by R exp(e) rotates it by -C e from the left.
-    by_error[3:, ATTITUDE] = -rotation_camera_from_body
-    return np.concatenate([pose.position_m - state.position_m, turn]), by_error
+    by_error[3:, ATTITUDE] = -camera_from_body
+    by_error[3:, MOUNTING] = np.eye(3)
+    by_error[3:, TIME_TAG] = -(mounted @ state.angular_rate_radps)[:, None]
+    position_m = state.position_m + state.velocity_mps * state.time_tag_s
+    return Pose(position_m, camera_from_body @ state.rotation_site_from_body.T), by_error
+
+
+def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
+    """Translation and rotation (6,) from the expected pose, and their derivative (6, 25) by the error state."""
+    expected, by_error = camera_pose(state, rotation_camera_from_body)
+    turn = rotation_vectors(pose.rotation_camera_from_site @ expected.rotation_camera_from_site.T)
+    return np.concatenate([pose.position_m - expected.position_m, turn]), by_error
 
 
 def craters_update(
@@ -71,9 +91,9 @@ def craters_update(
     state = state.with_craters(known, np.hypot(catalogue.position_sigma_m, STATIC_SHARE * catalogue.radius_m[known]))
     seen = projected(catalogue.part(crater), camera, fix.pose, margin_px=np.inf, least_radius_px=0.0)
     by_pose = seen.jacobian()[:, :2]
-    expected = rotation_camera_from_body @ state.rotation_site_from_body.T
-    turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
-    from_fix = np.concatenate([state.position_m - fix.pose.position_m, turn])
+    expected, pose_by_error = camera_pose(state, rotation_camera_from_body)
+    turn = rotation_vectors(expected.rotation_camera_from_site @ fix.pose.rotation_camera_from_site.T)
+    from_fix = np.concatenate([expected.position_m - fix.pose.position_m, turn])
     # Shifting a crater has the effect of shifting the camera in the opposite direction.
     by_offset = -by_pose[:, :, :2]
     pattern = common_pattern(camera.rays(seen.centre_px)[:, :2])
@@ -83,7 +103,8 @@ def craters_update(
         + np.einsum("nij,nj->ni", by_offset, state.offsets_m[seen.index])
         + pattern @ state.common_px
     )
-    by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
+    by_error = by_pose @ pose_by_error[:, _ALL_SEE]
+    by_error[:, :, _COMMON_SEEN] += pattern
     innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
     # Height errors of the catalogue shift craters in the image radially. They are added as noise. As parts of the state
@@ -99,7 +120,7 @@ def craters_update(
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
     """Covariances of N sightings without noise: with the error state (2 N, M) and with each other (2 N, 2 N).
 
-    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are the derivatives of the sightings with respect to the errors
+    `by_error` (N, 2, 15) and `by_offset` (N, 2, 2) are the derivatives of the sightings with respect to the errors
     `_ALL_SEE` and to the offsets of their craters. `crater` (N,) gives the index in the state of each sighting's
     crater. All other derivatives are zero.
     """

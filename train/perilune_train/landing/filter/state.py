@@ -9,6 +9,8 @@ Parts of the error state, in this order:
     FORCE_BIAS   error of the accelerometer's bias, metres per second^2, O_B     3
     COMMON       image error that all sightings of craters share, pixels         5
     GROUND       height of the ground below, metres                              1
+    MOUNTING     rotation of the camera from its stated mounting, radians, O_C   3
+    TIME_TAG     time of exposure after the frame's time tag, seconds            1
     (craters)    offset of each crater in view over ground, metres, O_L          2 each
     (poses)      translation and rotation of each kept pose, as above            6 each
 
@@ -29,7 +31,10 @@ from perilune_train.compiled import compiled
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
 COMMON, GROUND = slice(15, 20), slice(20, 21)
-N_ERRORS = 21
+MOUNTING, TIME_TAG = slice(21, 24), slice(24, 25)
+CAMERA = slice(21, 25)
+"""Mounting and time tag of the camera."""
+N_ERRORS = 25
 """Number of elements of the error state without craters and kept poses."""
 
 _LOW_SUN_DEG, _HIGH_SUN_DEG = 35.0, 60.0
@@ -46,6 +51,22 @@ def common_sigmas_px(sun_elevation_deg: float | None) -> Array:
         return _HIGH_SUN_SIGMAS_PX
     high_share = np.clip((sun_elevation_deg - _LOW_SUN_DEG) / (_HIGH_SUN_DEG - _LOW_SUN_DEG), 0, 1)
     return _LOW_SUN_SIGMAS_PX + high_share * (_HIGH_SUN_SIGMAS_PX - _LOW_SUN_SIGMAS_PX)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraErrors:
+    """What is known of the camera's errors before the flight."""
+
+    sun_elevation_deg: float | None = None
+    """Elevation of the Sun above the site, degrees, which sets the error that all sightings share; None if unknown."""
+    mounting_sigma_deg: float = 0.0
+    """Standard deviation of the camera's mounting about each axis, degrees."""
+    time_tag_sigma_s: float = 0.0
+    """Standard deviation of the constant difference between exposure and time tag, seconds."""
+
+
+EXACT_CAMERA = CameraErrors()
+"""A camera with exact mounting and time tags, under an unknown Sun."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +94,17 @@ class State:
     offsets_m: Array
     """Offsets (n, 2), metres, x and y in O_L, of the detected centres of these craters from the catalogue's centres."""
     covariance: Array
-    """Covariance of the error state (21 + 2 n + 6 m, 21 + 2 n + 6 m)."""
+    """Covariance of the error state (25 + 2 n + 6 m, 25 + 2 n + 6 m)."""
     past_position_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """Positions at earlier frames (m, 3), O_L."""
     past_rotation_site_from_body: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     """Attitudes at earlier frames (m, 3, 3)."""
+    mounting_rad: Array = field(default_factory=lambda: np.zeros(3))
+    """Rotation vector (3,), O_C, from the camera's stated mounting to the estimated mounting."""
+    time_tag_s: float = 0.0
+    """Estimated time of exposure after a frame's time tag, seconds."""
+    angular_rate_radps: Array = field(default_factory=lambda: np.zeros(3))
+    """Last measured angular rate (3,), O_B, without the estimated bias."""
 
     @classmethod
     def starting(
@@ -87,23 +114,23 @@ class State:
         rotation_site_from_body: Array,
         sigmas: Array,
         relief_m: float,
-        sun_elevation_deg: float | None = None,
+        camera: CameraErrors = EXACT_CAMERA,
     ) -> "State":
         """The state at the first frame.
 
         `sigmas` (15,) are the standard deviations of the first 15 errors; `relief_m` is the standard deviation of the
-        ground's height. `sun_elevation_deg` is the elevation of the Sun above the site, None if it is unknown; it sets
-        the expected error that all sightings share.
+        ground's height.
         """
         none = np.zeros(3)
-        covariance = np.diag(np.square(np.concatenate([sigmas, common_sigmas_px(sun_elevation_deg), [relief_m]])))
+        of_camera = [*np.radians([camera.mounting_sigma_deg] * 3), camera.time_tag_sigma_s]
+        deviations = np.concatenate([sigmas, common_sigmas_px(camera.sun_elevation_deg), [relief_m], of_camera])
         return cls(
             0.0, position_m, velocity_mps, rotation_site_from_body, none, none,
-            np.zeros(5), 0.0, np.zeros(0, int), np.zeros((0, 2)), covariance,
+            np.zeros(5), 0.0, np.zeros(0, int), np.zeros((0, 2)), np.diag(deviations**2),
         )  # fmt: skip
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """Remove an estimated error (21 + 2 n + 6 m,) from the state; `covariance` is the new, symmetric covariance."""
+        """Remove an estimated error (25 + 2 n + 6 m,) from the state; `covariance` is the new, symmetric covariance."""
         end = N_ERRORS + 2 * len(self.craters)
         past = error[end:].reshape(-1, 6)
         return State(
@@ -120,6 +147,9 @@ class State:
             covariance,
             self.past_position_m + past[:, :3],
             self.past_rotation_site_from_body @ rotation_matrices(past[:, 3:]),
+            self.mounting_rad + error[MOUNTING],
+            self.time_tag_s + float(error[TIME_TAG][0]),
+            self.angular_rate_radps,
         )
 
     def keeping_pose(self) -> "State":

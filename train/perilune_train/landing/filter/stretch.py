@@ -1,16 +1,17 @@
-"""Update flights between two frames by inertial measurements and ranges.
+"""Update flights between two frames by inertial measurements, ranges, speeds along a beam, and attitudes.
 
-Inertial measurements and ranges change and measure only 16 parts of the error state: the first 15 and the height of the
-ground (the core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
+These measurements change and measure only 16 parts of the error state: the first 15 and the height of the ground (the
+core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
 errors at the start of the stretch. The other parts are therefore updated once, at its end (compressed filter, Guivant
 & Nebot 2001, doi 10.1109/70.938382):
 
-1. `inertial`, `coast` and `range` change the core, its covariance and its derivative with respect to the core at the
+1. Every measurement changes the core, its covariance and its derivative with respect to the core at the start.
+2. `range`, `line_speed` and `attitude` also keep the innovation, and its derivative with respect to the core at the
    start.
-2. `range` also keeps the innovation, and the range's derivative with respect to the core at the start.
-3. `states` applies all kept ranges to the other parts at once.
+3. `states` applies all kept innovations to the other parts at once.
 
-The result equals that of the whole filter, and a range costs as much as if there were no craters. Only the attitudes of
+The filter that updates its whole covariance at every measurement gives an equal result; here a measurement costs as
+much as if there were no craters. Only the attitudes of
 earlier frames differ, by second-order terms: corrections are summed, not applied one after the other.
 
 All flights of a stretch have measurements at the same times, and every operation acts on all of them at once.
@@ -22,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.landing.filter.propagate import Increments, InertialNoise, Moving, integrated
 from perilune_train.landing.filter.state import (
     ATTITUDE,
@@ -41,7 +42,11 @@ _HEIGHT = _INERTIAL
 """Index of the ground's height in the core."""
 CORE = np.r_[0:_INERTIAL, GROUND]
 """Indices of the core in the error state."""
-_GROUND_S = 10.0
+DOWN = np.array([0.0, 0.0, -1.0])
+"""Direction of the altimeter's beam, O_B."""
+_MIN_COSINE = 0.1
+"""Smallest cosine of the angle between a beam and the vertical."""
+GROUND_S = 10.0
 """Correlation time of the height of the ground below a lander, seconds, at 10 to 30 m/s over ground."""
 _GAP_S = 0.05
 """Shortest gap between inertial measurements that counts as missing measurements, seconds."""
@@ -68,15 +73,24 @@ class Stretch:
         self._ground_m = np.array([state.ground_m for state in states])
         self._covariance = np.stack([state.covariance[np.ix_(CORE, CORE)] for state in states])
         self._change = np.tile(np.eye(len(CORE)), (len(states), 1, 1))
-        self._kept_ranges: list[tuple[Array, Array]] = []
+        self._rate_radps = np.stack([state.angular_rate_radps for state in states])
+        self._kept_updates: list[tuple[Array, Array]] = []
+        self.n_refused = np.zeros(len(states), int)
 
     time_s: float
     """Current time, seconds since the first frame."""
+    n_refused: NDArray[np.int_]
+    """Number of ranges, speeds and attitudes that each flight refused (F,)."""
 
     @property
     def position_m(self) -> Array:
         """Current positions (F, 3), O_L."""
         return self._moving.position_m
+
+    @property
+    def rotation_site_from_body(self) -> Array:
+        """Current attitudes (F, 3, 3)."""
+        return self._moving.rotation_site_from_body
 
     def inertial(self, measured: Increments) -> None:
         """Propagate to the end of inertial measurements; measurements that are older or not finite are ignored."""
@@ -100,7 +114,10 @@ class Stretch:
         measured = replace(measured, interval_s=np.diff(measured.time_s, prepend=self.time_s))
         motion = integrated(self._moving, measured, self._noise)
         self._moving = motion.end
-        kept = np.exp(-(measured.time_s[-1] - self.time_s) / _GROUND_S)
+        self._rate_radps = np.broadcast_to(
+            measured.angular_rate_radps[..., -1, :] - self._moving.gyro_bias_radps, self._rate_radps.shape
+        )
+        kept = np.exp(-(measured.time_s[-1] - self.time_s) / GROUND_S)
         self._ground_m = kept * self._ground_m
         self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
 
@@ -124,30 +141,80 @@ class Stretch:
         self._change = whole @ self._change
         self.time_s = time_s
 
-    def range(self, range_m: float, ground_m: Array, sigma_m: float) -> NDArray[np.bool_]:
-        """Update by a range to the ground along -Z_B; returns whether each flight accepted the range (F,).
+    def range(self, range_m: float, ground_m: Array, sigma_m: float, beam_in_body: Array = DOWN) -> NDArray[np.bool_]:
+        """Update by a range to the ground along a beam; returns whether each flight accepted the range (F,).
 
-        `ground_m` (F,) are the heights of the ground at the nearest craters; `sigma_m` is the standard deviation of
-        the instrument, metres.
+        `beam_in_body` (3,) is the beam's direction. `ground_m` (F,) are the heights of the ground at the craters
+        nearest to the beam's end; `sigma_m` is the standard deviation of the range, metres. A flight whose beam does
+        not point down refuses the range.
         """
         rotation, height_m = self._moving.rotation_site_from_body, self.position_m[:, 2] - ground_m - self._ground_m
-        cosine = rotation[:, 2, 2]
+        cosine = -(rotation[:, 2] @ beam_in_body)
+        points_down = cosine > _MIN_COSINE
+        cosine = np.where(points_down, cosine, 1.0)
         by_error = np.zeros((len(cosine), len(CORE)))
         by_error[:, 2], by_error[:, _HEIGHT] = 1 / cosine, -1 / cosine
-        by_error[:, ATTITUDE] = (-height_m / cosine**2)[:, None] * rotation[:, 2, [1, 0, 2]] * [-1, 1, 0]
+        by_error[:, ATTITUDE] = (height_m / cosine**2)[:, None] * np.cross(beam_in_body, rotation[:, 2])
+        return self._update(range_m - height_m / cosine, by_error, sigma_m, points_down)
+
+    def line_speed(self, speed_mps: float, sigma_mps: float, beam_in_body: Array) -> NDArray[np.bool_]:
+        """Update by the speed over ground along a beam; returns whether each flight accepted the speed (F,).
+
+        The speed is the component of the velocity along `beam_in_body` (3,), positive towards the beam's end.
+        """
+        rotation, velocity = self._moving.rotation_site_from_body, self._moving.velocity_mps
+        in_body = (velocity[:, None] @ rotation)[:, 0]
+        by_error = np.zeros((len(rotation), len(CORE)))
+        by_error[:, VELOCITY], by_error[:, ATTITUDE] = rotation @ beam_in_body, np.cross(beam_in_body, in_body)
+        return self._update(speed_mps - in_body @ beam_in_body, by_error, sigma_mps)
+
+    def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
+        """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
+
+        `sigmas_rad` (3,) are the standard deviations about the body's axes.
+        """
+        spread = self._covariance[:, ATTITUDE, ATTITUDE] + np.diag(sigmas_rad**2)
+        turn = self._turn_to(rotation_site_from_body)
+        accepted = (turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3)
+        for axis, sigma_rad in enumerate(sigmas_rad):
+            by_error = np.zeros((len(turn), len(CORE)))
+            by_error[:, ATTITUDE.start + axis] = 1
+            # The first axes have changed the attitude.
+            turn = self._turn_to(rotation_site_from_body)
+            self._apply(turn[:, axis], by_error, float(sigma_rad), accepted)
+        self.n_refused += ~accepted
+        return accepted
+
+    def _turn_to(self, rotation_site_from_body: Array) -> Array:
+        """Rotation vectors (F, 3), O_B, from the attitudes to another attitude."""
+        return rotation_vectors(np.swapaxes(self._moving.rotation_site_from_body, 1, 2) @ rotation_site_from_body)
+
+    def _update(
+        self, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
+    ) -> NDArray[np.bool_]:
+        """Update by one number if it passes the gate; returns whether it does (F,)."""
+        spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
+        accepted = (innovation**2 / spread <= gate(1)) & is_possible
+        self._apply(innovation, by_error, sigma, accepted)
+        self.n_refused += ~accepted
+        return accepted
+
+    def _apply(self, innovation: Array, by_error: Array, sigma: float, accepted: NDArray[np.bool_]) -> None:
+        """Update the flights that accept one number.
+
+        `innovation` (F,) is the measured minus the expected number, `by_error` (F, 16) its derivative by the core, and
+        `sigma` its standard deviation.
+        """
         crossed = (self._covariance @ by_error[:, :, None])[:, :, 0]
-        innovation = range_m - height_m / cosine
-        spread = (by_error * crossed).sum(axis=1) + sigma_m**2
-        accepted = innovation**2 / spread <= gate(1)
-        # Divide by the innovation's standard deviation; 0 where the range is rejected.
+        spread = (by_error * crossed).sum(axis=1) + sigma**2
+        # Divide by the innovation's standard deviation; 0 where the number is refused.
         scale = accepted / np.sqrt(spread)
         innovation, crossed, by_error = innovation * scale, crossed * scale[:, None], by_error * scale[:, None]
         by_start = (by_error[:, None] @ self._change)[:, 0]
-        self._kept_ranges.append((by_start, innovation))
+        self._kept_updates.append((by_start, innovation))
         self._change = self._change - crossed[:, :, None] * by_start[:, None, :]
         self._covariance = self._covariance - crossed[:, :, None] * crossed[:, None, :]
         self._correct(crossed * innovation[:, None])
-        return accepted
 
     def _correct(self, error: Array) -> None:
         """Remove estimated errors of the core (F, 16)."""
@@ -163,7 +230,7 @@ class Stretch:
 
     def states(self) -> list[State]:
         """The states at the current time."""
-        if not self._kept_ranges and self.time_s == self._begin[0].time_s:
+        if not self._kept_updates and self.time_s == self._begin[0].time_s:
             return self._begin
         return [self._state(number) for number in range(len(self._begin))]
 
@@ -171,10 +238,10 @@ class Stretch:
         before, moving, change = self._begin[number], self._moving, self._change[number]
         from_core = before.covariance[:, CORE]
         covariance, error = before.covariance.copy(), np.zeros(len(before.covariance))
-        if self._kept_ranges:
-            crossed = from_core @ np.stack([derivative[number] for derivative, _ in self._kept_ranges], axis=1)
+        if self._kept_updates:
+            crossed = from_core @ np.stack([derivative[number] for derivative, _ in self._kept_updates], axis=1)
             covariance -= crossed @ crossed.T
-            error = crossed @ np.array([innovation[number] for _, innovation in self._kept_ranges])
+            error = crossed @ np.array([innovation[number] for _, innovation in self._kept_updates])
         from_core = from_core @ change.T
         covariance[:, CORE], covariance[CORE] = from_core, from_core.T
         core = self._covariance[number]
@@ -188,4 +255,5 @@ class Stretch:
             gyro_bias_radps=moving.gyro_bias_radps[number],
             force_bias_mps2=moving.force_bias_mps2[number],
             ground_m=float(self._ground_m[number]),
+            angular_rate_radps=self._rate_radps[number],
         )

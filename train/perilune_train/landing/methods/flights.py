@@ -16,7 +16,7 @@ from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
 from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
 from perilune_train.landing.filter.propagate import InertialNoise, start_sigmas
-from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
+from perilune_train.landing.filter.state import ATTITUDE, POSITION, CameraErrors, State
 from perilune_train.landing.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
@@ -112,7 +112,8 @@ def lander_of(
     pose = descent.true[0].changed(np.concatenate([error[:3], rotation_camera_from_body @ error[6:]]))
     attitude = pose.rotation_camera_from_site.T @ rotation_camera_from_body
     velocity_mps = descent.velocity_mps + error[3:6]
-    state = State.starting(pose.position_m, velocity_mps, attitude, start.sigmas, RELIEF_M, descent.sun_elevation_deg)
+    camera = CameraErrors(descent.sun_elevation_deg)
+    state = State.starting(pose.position_m, velocity_mps, attitude, start.sigmas, RELIEF_M, camera)
     surroundings = Surroundings(descent.camera, rotation_camera_from_body, catalogue, RANGE_SIGMA_M, RELIEF_M)
     return Lander(state, InertialNoise.of(GRADES[start.grade]), surroundings, keep_poses=smooth)
 
