@@ -338,9 +338,14 @@ def fly(
     frames: Annotated[Path, typer.Option(help="Folder of images with frames.csv: file, time_s.")],
     camera: Annotated[Path, typer.Option(help="Intrinsics and mounting: camera.yaml.")],
     catalogue: Annotated[Path, typer.Option(help="Craters of the landing site, Parquet or CSV.")],
-    imu: Annotated[Path, typer.Option(help="Inertial measurements: imu.csv.")],
     prior: Annotated[Path, typer.Option(help="Expected state at the first frame, and errors of all: prior.yaml.")],
+    imu: Annotated[Path | None, typer.Option(help="Inertial measurements: imu.csv.")] = None,
+    no_imu: Annotated[bool, typer.Option("--no-imu", help="Fly without inertial measurements.")] = False,
     ranges: Annotated[Path | None, typer.Option(help="Ranges of a laser altimeter: ranges.csv.")] = None,
+    star_tracker: Annotated[Path | None, typer.Option(help="Attitudes of a star tracker: star_tracker.csv.")] = None,
+    doppler_lidar: Annotated[
+        Path | None, typer.Option(help="Speeds and ranges along the beams of a Doppler lidar: doppler_lidar.csv.")
+    ] = None,
     truth: Annotated[Path | None, typer.Option(help="True poses, for errors beside the estimates: truth.csv.")] = None,
     run: Annotated[
         Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
@@ -357,7 +362,7 @@ def fly(
     live: Annotated[Path | None, typer.Option(help="Picture that is drawn again after each frame, *.png.")] = None,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Estimate position, velocity and attitude at each frame of a descent from craters, inertial data and ranges.
+    """Estimate position, velocity and attitude at each frame of a descent from craters and other sensors.
 
     Prints one line per frame to standard output: time, status (tracking, coasting or lost), position in O_L and its
     standard deviations, largest standard deviation of the attitude, and number of matched craters. Writes
@@ -367,21 +372,27 @@ def fly(
         raise UserError("--live", "", live, "a name that ends in .png")
     if run is not None and detections is not None:
         raise UserError("--detections", "options", "together with --run", "one of them")
+    if (imu is None) != no_imu:
+        got = "missing" if imu is None else "together with --no-imu"
+        raise UserError("--imu", "options", got, "--imu FILE, or --no-imu to fly without inertial measurements")
     source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
     from perilune_train.landing.fly.detections import by_network, by_table
     from perilune_train.landing.fly.run import DescentFiles, doubts_of, fly_descent, read_descent
 
-    descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, ranges, truth))
+    optional = ranges, truth, star_tracker, doppler_lidar
+    descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, *optional))
     detect = by_table(source, descent.frames.paths) if detections else by_network(source)
     for doubt in doubts_of(descent):
         say(f"warning: {imu}: {doubt}")
-    inputs = (frames, camera, catalogue, imu, prior, source, *(path for path in (ranges, truth) if path is not None))
+    inputs = (frames, camera, catalogue, prior, source, *(path for path in (imu, *optional) if path is not None))
     with replaceable(out, ("estimates.parquet", "flight.png"), overwrite=overwrite, inputs=inputs) as folder:
         table = fly_descent(descent, detect, folder, answer_page, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
+    if n_refused := int(table["n_refused"].sum()):
+        say(f"refused {n_refused} ranges, speeds and attitudes that contradict the state: column n_refused by frame")
     if (table["status"] == "lost").any():
         for doubt in doubts_of(descent, is_lost=True):
             say(f"a possible cause of the status lost: {imu}: {doubt}")

@@ -51,7 +51,7 @@ def coasted(state, end_s):
     gap, change = end_s - state.time_s, np.eye(len(state.covariance))
     change[:3, 3:6] = gap * np.eye(3)
     covariance = change @ state.covariance @ change.T
-    covariance[range(9), range(9)] += np.repeat([gap**2, 2 * gap, 0.05 * gap], 3) ** 2
+    covariance[range(9), range(9)] += np.repeat([gap**2, 2 * gap, np.radians(3) * gap], 3) ** 2
     return replace(state, time_s=end_s, position_m=state.position_m + gap * state.velocity_mps, covariance=covariance)
 
 

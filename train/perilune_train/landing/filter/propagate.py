@@ -65,9 +65,13 @@ def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, un
     return np.repeat([position_m, velocity_mps, np.radians(attitude_deg), gyro_bias_radps, force_bias_mps2], 3)
 
 
+COAST_MPS2, COAST_DEGPS = 2.0, 3.0
+"""Default standard deviations of acceleration and angular rate while inertial measurements are missing."""
+
+
 @dataclass(frozen=True, slots=True)
 class InertialNoise:
-    """Variances that an inertial unit adds in one second, per axis."""
+    """Variances that an inertial unit adds in one second, per axis, and the motion while it measures nothing."""
 
     turn: float
     """Variance of the attitude, square radians."""
@@ -77,6 +81,10 @@ class InertialNoise:
     """Variance of the gyroscope's bias, square radians per square second."""
     force_bias: float
     """Variance of the accelerometer's bias, square metres per second^4."""
+    coast_mps2: float = COAST_MPS2
+    """Standard deviation of the acceleration while measurements are missing."""
+    coast_radps: float = float(np.radians(COAST_DEGPS))
+    """Standard deviation of the angular rate while measurements are missing."""
 
     @classmethod
     def of(cls, errors: InertialErrors) -> "InertialNoise":

@@ -50,8 +50,6 @@ GROUND_S = 10.0
 """Correlation time of the height of the ground below a lander, seconds, at 10 to 30 m/s over ground."""
 _GAP_S = 0.05
 """Shortest gap between inertial measurements that counts as missing measurements, seconds."""
-_UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
-"""Standard deviations of acceleration and angular rate while inertial measurements are missing."""
 
 
 class Stretch:
@@ -127,7 +125,8 @@ class Stretch:
         self._moving = replace(self._moving, position_m=self.position_m + self._moving.velocity_mps * gap_s)
         change = np.eye(_INERTIAL)
         change[POSITION, VELOCITY] = gap_s * np.eye(3)
-        sigmas = np.repeat([_UNKNOWN_MPS2 * gap_s**2 / 2, _UNKNOWN_MPS2 * gap_s, _UNKNOWN_RADPS * gap_s, 0.0, 0.0], 3)
+        speed_mps = self._noise.coast_mps2 * gap_s
+        sigmas = np.repeat([speed_mps * gap_s / 2, speed_mps, self._noise.coast_radps * gap_s, 0.0, 0.0], 3)
         self._moved(until_s, change, np.diag(sigmas**2), 1.0)
 
     def _moved(self, time_s: float, change: Array, added: Array, kept: float) -> None:

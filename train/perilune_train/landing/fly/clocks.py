@@ -7,29 +7,35 @@ import numpy as np
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 from perilune_train.landing.filter.flight import Instruments
-from perilune_train.landing.fly.tables import unit_of
+from perilune_train.landing.fly.tables import InstrumentFiles, unit_of
 
 _MIN_SHARE = 0.01
 """Share of the time of the frames that inertial measurements must cover."""
 
 
-def check_clocks(frames: Path, frame_time_s: Array, imu: Path, ranges: Path | None, instruments: Instruments) -> None:
-    """Raise UserError unless inertial measurements and ranges overlap the frames in time."""
-    inertial = instruments.inertial
+def check_clocks(frames: Path, frame_time_s: Array, files: InstrumentFiles, instruments: Instruments) -> None:
+    """Raise UserError unless the measurements of each instrument overlap the frames in time."""
+    inertial, stars, lidar = instruments.inertial, instruments.star_tracker, instruments.doppler_lidar
     start_s, end_s = float(frame_time_s[0]), float(frame_time_s[-1])
     if end_s <= start_s:
         return
-    first_s, last_s = float(inertial.time_s[0] - inertial.interval_s[0]), float(inertial.time_s[-1])
-    covered_s = min(last_s, end_s) - max(first_s, start_s)
-    if covered_s <= _MIN_SHARE * (end_s - start_s):
-        raise _other_clock(imu, (first_s, last_s), frames, (start_s, end_s))
-    time_s = instruments.range_time_s
-    if ranges is None or not len(time_s):
-        return
-    inside = (time_s >= start_s) & (time_s <= end_s)
-    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    if not inside.any() or step_s > end_s - start_s:
-        raise _other_clock(ranges, (float(time_s[0]), float(time_s[-1])), frames, (start_s, end_s))
+    if files.imu is not None:
+        first_s, last_s = float(inertial.time_s[0] - inertial.interval_s[0]), float(inertial.time_s[-1])
+        covered_s = min(last_s, end_s) - max(first_s, start_s)
+        if covered_s <= _MIN_SHARE * (end_s - start_s):
+            raise _other_clock(files.imu, (first_s, last_s), frames, (start_s, end_s))
+    others = (
+        (files.ranges, instruments.range_time_s),
+        (files.star_tracker, None if stars is None else stars.time_s),
+        (files.doppler_lidar, None if lidar is None else np.unique(lidar.time_s)),
+    )
+    for path, time_s in others:
+        if path is None or time_s is None or not len(time_s):
+            continue
+        inside = (time_s >= start_s) & (time_s <= end_s)
+        step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+        if not inside.any() or step_s > end_s - start_s:
+            raise _other_clock(path, (float(time_s[0]), float(time_s[-1])), frames, (start_s, end_s))
 
 
 def _other_clock(

@@ -12,24 +12,24 @@ import pandas as pd
 from perilune_shared.dataset.metadata import CameraRecord
 from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array, quaternion_from_matrix
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, quaternion_from_matrix
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
 from perilune_train.landing.filter.lander import Lander, Surroundings
-from perilune_train.landing.filter.propagate import InertialNoise
-from perilune_train.landing.filter.state import ATTITUDE, POSITION, State
+from perilune_train.landing.filter.state import ATTITUDE, MOUNTING, N_ERRORS, POSITION, State
 from perilune_train.landing.fly.catalogue import read_catalogue
 from perilune_train.landing.fly.clocks import check_clocks
 from perilune_train.landing.fly.detections import Detect, UnreadableFrame
 from perilune_train.landing.fly.picture import draw_flight
 from perilune_train.landing.fly.settings import FlightPrior, read_camera, read_prior
-from perilune_train.landing.fly.tables import FrameFiles, read_frame_files, read_instruments
+from perilune_train.landing.fly.tables import FrameFiles, InstrumentFiles, read_frame_files, read_instruments
 from perilune_train.landing.fly.truth import Truth, read_truth, with_errors_of
 from perilune_train.landing.fly.units import Prior, doubts
 
+OPTIONAL_FILES = ("ranges.csv", "truth.csv", "star_tracker.csv", "doppler_lidar.csv")
 ESTIMATES, PICTURE = "estimates", "flight.png"
 _NOTHING = Detections(np.zeros((0, 4)), np.zeros(0))
 
@@ -44,21 +44,30 @@ class DescentFiles:
     """Intrinsics and mounting: camera.yaml."""
     catalogue: Path
     """Craters of the landing site, Parquet or CSV."""
-    imu: Path
-    """Inertial measurements: imu.csv."""
+    imu: Path | None
+    """Inertial measurements: imu.csv; None without an inertial unit."""
     prior: Path
     """Expected state at the first frame, and errors of all measurements: prior.yaml."""
     ranges: Path | None = None
     """Ranges of a laser altimeter: ranges.csv."""
     truth: Path | None = None
     """True poses, from which errors of the estimates are computed: truth.csv."""
+    star_tracker: Path | None = None
+    """Attitudes of a star tracker: star_tracker.csv."""
+    doppler_lidar: Path | None = None
+    """Ranges and speeds along the beams of a Doppler lidar: doppler_lidar.csv."""
+
+    @property
+    def instruments(self) -> InstrumentFiles:
+        """The files of the measurements."""
+        return InstrumentFiles(self.imu, self.ranges, self.star_tracker, self.doppler_lidar)
 
     @classmethod
     def of_folder(cls, folder: str | PathLike[str]) -> "DescentFiles":
-        """The files of a folder under their usual names; ranges.csv and truth.csv may be absent."""
+        """The files of a folder under their usual names; those of `OPTIONAL_FILES` may be absent."""
         root = Path(folder)
         needed = (root / name for name in ("frames", "camera.yaml", "catalogue.parquet", "imu.csv", "prior.yaml"))
-        optional = (root / name for name in ("ranges.csv", "truth.csv"))
+        optional = (root / name for name in OPTIONAL_FILES)
         return cls(*needed, *(path if path.is_file() else None for path in optional))
 
 
@@ -73,7 +82,7 @@ class Descent:
     frames: FrameFiles
     """Frames and their times."""
     instruments: Instruments
-    """Inertial measurements and ranges."""
+    """Measurements other than frames."""
     catalogue: Catalogue
     """Craters of the landing site."""
     truth: Truth | None
@@ -87,8 +96,8 @@ def read_descent(files: DescentFiles) -> Descent:
     frames = read_frame_files(files.frames, record.intrinsics())
     mounting = np.array(record.rotation_camera_from_body)
     true = read_truth(files.truth, frames.time_s, mounting) if files.truth else None
-    instruments = read_instruments(files.imu, files.ranges)
-    check_clocks(files.frames, frames.time_s, files.imu, files.ranges, instruments)
+    instruments = read_instruments(files.instruments, expected.star_tracker_sigmas_rad, expected.lidar_errors)
+    check_clocks(files.frames, frames.time_s, files.instruments, instruments)
     return Descent(record, expected, frames, instruments, craters, true)
 
 
@@ -143,7 +152,7 @@ def _lander(descent: Descent) -> Lander:
     state = _start(descent)
     camera = descent.camera.intrinsics().covering_pinhole()
     around = Surroundings(camera, mounting, descent.catalogue, prior.range_sigma_m, prior.relief_m)
-    return Lander(state, InertialNoise.of(prior.unit), around)
+    return Lander(state, prior.noise, around)
 
 
 def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
@@ -176,7 +185,12 @@ def sightings_of(found: Detections, camera: Camera) -> Sightings:
 
 def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Array, fault: str) -> dict[str, object]:
     state = estimate.state
-    rotation = quaternion_from_matrix(rotation_camera_from_body @ state.rotation_site_from_body.T)
+    mounted = matrix_from_rotation_vector(state.mounting_rad) @ rotation_camera_from_body
+    rotation = quaternion_from_matrix(mounted @ state.rotation_site_from_body.T)
+    # The camera's attitude errs by the body's attitude and by the mounting.
+    errors = np.concatenate([np.eye(3), -mounted.T], axis=1)
+    parts = [*range(N_ERRORS)[ATTITUDE], *range(N_ERRORS)[MOUNTING]]
+    attitude_sigma = np.sqrt(np.diag(errors @ state.covariance[np.ix_(parts, parts)] @ errors.T))
     sigma = np.sqrt(np.diag(state.covariance))
     located = estimate.located
     pixels = located.fix.rms_px if located else np.nan
@@ -188,9 +202,10 @@ def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Arra
         **_named("velocity_{}_mps", "xyz", state.velocity_mps),
         **_named("rotation_{}", "wxyz", rotation),
         **_named("sigma_{}_m", "xyz", sigma[POSITION]),
-        **_named("sigma_attitude_{}_deg", "xyz", np.degrees(sigma[ATTITUDE])),
+        **_named("sigma_attitude_{}_deg", "xyz", np.degrees(attitude_sigma)),
         "n_matched": len(located.fix.crater) if located else 0,
         "rms_px": pixels,
+        "n_refused": estimate.n_refused,
         "fault": fault,
     }
 

@@ -1,7 +1,7 @@
 """camera.yaml and prior.yaml of a descent: what is known before the flight. Both are untrusted input."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -18,9 +18,9 @@ from perilune_shared.geometry.camera import NO_DISTORTION, ROTATION_CAMERA_FROM_
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.inertial_grades import GRADES, InertialErrors, InertialGrade
 from perilune_shared.storage.tables.catalogues import METRES
-from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M
-from perilune_train.landing.filter.propagate import start_sigmas
-from perilune_train.landing.filter.state import State
+from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, LidarErrors
+from perilune_train.landing.filter.propagate import COAST_DEGPS, COAST_MPS2, InertialNoise, start_sigmas
+from perilune_train.landing.filter.state import CameraErrors, State
 from perilune_train.landing.fly.catalogue import CatalogueUse
 
 _LARGEST_FILE_BYTES = 100_000
@@ -71,6 +71,20 @@ class FlightPrior(Section):
     """Standard deviation of a range."""
     relief_m: _Deviation = RELIEF_M
     """Standard deviation of the ground's height relative to the nearest craters."""
+    star_tracker_sigma_arcsec: tuple[_Positive, _Positive, _Positive] = (10.0, 10.0, 60.0)
+    """Standard deviations of the star tracker about the body's axes, seconds of arc."""
+    doppler_speed_sigma_mps: _Deviation = 0.02
+    """Standard deviation of a speed along a beam of the Doppler lidar."""
+    doppler_range_sigma_m: _Deviation = 2.0
+    """Standard deviation of a range along a beam of the Doppler lidar."""
+    camera_mounting_sigma_deg: Annotated[float, Field(ge=0, le=10)] = 0.02
+    """Standard deviation of the camera's mounting about each axis."""
+    camera_time_sigma_s: Annotated[float, Field(ge=0, le=1)] = 0.02
+    """Standard deviation of the constant difference between the exposure of the frames and their times."""
+    coast_acceleration_sigma_mps2: _Positive = COAST_MPS2
+    """Standard deviation of the acceleration while inertial measurements are missing."""
+    coast_rate_sigma_degps: _Positive = COAST_DEGPS
+    """Standard deviation of the angular rate while inertial measurements are missing, degrees per second."""
     catalogue_position_sigma_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Standard deviation of a crater's position in the catalogue on each axis."""
     catalogue_diameter_sigma_share: _Share = 0.03
@@ -122,8 +136,24 @@ class FlightPrior(Section):
             camera_from_site.T @ rotation_camera_from_body,
             start_sigmas(self.position_sigma_m, self.velocity_sigma_mps, self.attitude_sigma_deg, self.unit),
             self.relief_m,
-            self.sun_elevation_deg,
+            CameraErrors(self.sun_elevation_deg, self.camera_mounting_sigma_deg, self.camera_time_sigma_s),
         )
+
+    @property
+    def noise(self) -> InertialNoise:
+        """Noise of the inertial unit, and of the motion while its measurements are missing."""
+        coast = self.coast_acceleration_sigma_mps2, np.radians(self.coast_rate_sigma_degps)
+        return replace(InertialNoise.of(self.unit), coast_mps2=coast[0], coast_radps=float(coast[1]))
+
+    @property
+    def star_tracker_sigmas_rad(self) -> Array:
+        """Standard deviations (3,) of the star tracker about the body's axes, radians."""
+        return np.radians(np.array(self.star_tracker_sigma_arcsec) / 3600)
+
+    @property
+    def lidar_errors(self) -> LidarErrors:
+        """Standard deviations of the Doppler lidar, with one measurement of each beam per second."""
+        return LidarErrors(self.doppler_speed_sigma_mps, self.doppler_range_sigma_m, 1.0)
 
 
 def read_camera(path: Path) -> CameraRecord:

@@ -1,19 +1,20 @@
-"""Read frames.csv, imu.csv and ranges.csv of a descent, or files of EuRoC and TUM-VI. All are untrusted input."""
+"""Read the frames and measurements of a descent, or files of EuRoC and TUM-VI. All are untrusted input."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.storage.tables.columns import Columns, Kind
-from perilune_shared.storage.tables.limits import FRAMES, INERTIAL, RANGES, TableLimits
+from perilune_shared.storage.tables.limits import ATTITUDES, BEAMS, FRAMES, INERTIAL, RANGES, TableLimits
 from perilune_shared.storage.tables.read import open_table, read_table
 from perilune_train.detect.images.read import picture_size
-from perilune_train.landing.filter.flight import Instruments
+from perilune_train.landing.filter.flight import DopplerLidar, Instruments, StarTracker
+from perilune_train.landing.filter.lander import Beam, LidarErrors
 from perilune_train.landing.filter.propagate import Increments
 
 FRAMES_FILE = "frames.csv"
@@ -22,6 +23,9 @@ RATES = tuple(f"angular_rate_{axis}_radps" for axis in "xyz")
 FORCES = tuple(f"specific_force_{axis}_mps2" for axis in "xyz")
 INERTIAL_COLUMNS = ("time_s", "interval_s", *RATES, *FORCES)
 RANGE_COLUMNS = ("time_s", "range_m")
+STAR_TRACKER_COLUMNS = ("time_s", *(f"rotation_{axis}" for axis in "wxyz"))
+BEAM_DIRECTION = tuple(f"beam_{axis}_body" for axis in "xyz")
+DOPPLER_LIDAR_COLUMNS = ("time_s", *BEAM_DIRECTION, "speed_mps", "range_m")
 CRATER_COLUMNS = ("x_m", "y_m", "z_m", "diameter_m")
 NORMAL_COLUMNS = ("normal_x", "normal_y", "normal_z")
 _EUROC_FRAMES_FILE, _EUROC_FOLDER = "data.csv", "data"
@@ -31,6 +35,10 @@ _EUROC_SAMPLES = (
     tuple(f"{kind}_{axis}" for kind in ("omega", "alpha") for axis in "xyz"),
 )
 """Column names of rates and specific forces in files of EuRoC and TUM-VI, and in files of Kalibr."""
+_UNIT_TOLERANCE = 1e-3
+"""Largest accepted difference of a quaternion's or direction's length from 1."""
+_MIN_STEP_S = 1e-3
+"""Shortest time between two measurements of one beam that the filter assumes, seconds."""
 _GAP = 5
 """An interval between samples longer than this many times the median is a gap."""
 _LARGEST_S = 1e11
@@ -75,16 +83,68 @@ def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
     return FrameFiles(paths, time_s)
 
 
-def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
-    """Read imu.csv (or samples in EuRoC's format) and ranges.csv. Empty values and NaN are missing measurements.
+@dataclass(frozen=True, slots=True)
+class InstrumentFiles:
+    """Files of the measurements of a descent."""
 
-    Raises UserError on a missing column, a value that is not a number, or times that do not increase.
+    imu: Path | None
+    """Inertial measurements, imu.csv or samples in EuRoC's format; None without an inertial unit."""
+    ranges: Path | None = None
+    """Ranges of a laser altimeter, ranges.csv."""
+    star_tracker: Path | None = None
+    """Attitudes of a star tracker, star_tracker.csv."""
+    doppler_lidar: Path | None = None
+    """Ranges and speeds along the beams of a Doppler lidar, doppler_lidar.csv."""
+
+
+def read_instruments(files: InstrumentFiles, star_sigmas_rad: Array, lidar: LidarErrors) -> Instruments:
+    """Read the measurements of a descent. Empty values and NaN are missing measurements.
+
+    `star_sigmas_rad` (3,) are the standard deviations of the star tracker about the body's axes; `lidar` has the
+    standard deviations of the Doppler lidar. Raises UserError on a missing column, a value that is not a number, or
+    times that do not increase.
     """
-    inertial = _read_inertial(imu)
-    if ranges is None:
-        return Instruments(inertial, np.zeros(0), np.zeros(0))
-    lengths = read_table(ranges, RANGES, dict.fromkeys(RANGE_COLUMNS, "number"))
-    return Instruments(inertial, _increasing(lengths), lengths.numbers("range_m"))
+    inertial = _NO_INERTIAL if files.imu is None else _read_inertial(files.imu)
+    range_time_s, range_m = np.zeros(0), np.zeros(0)
+    if files.ranges is not None:
+        lengths = read_table(files.ranges, RANGES, dict.fromkeys(RANGE_COLUMNS, "number"))
+        range_time_s, range_m = _increasing(lengths), lengths.numbers("range_m")
+    stars = None if files.star_tracker is None else _read_star_tracker(files.star_tracker, star_sigmas_rad)
+    beams = None if files.doppler_lidar is None else _read_doppler_lidar(files.doppler_lidar, lidar)
+    return Instruments(inertial, range_time_s, range_m, stars, beams)
+
+
+_NO_INERTIAL = Increments(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def _read_star_tracker(path: Path, sigmas_rad: Array) -> StarTracker:
+    table = read_table(path, ATTITUDES, dict.fromkeys(STAR_TRACKER_COLUMNS, "number"))
+    time_s = _increasing(table)
+    quaternions = np.column_stack([table.numbers(name) for name in STAR_TRACKER_COLUMNS[1:]])
+    length = np.linalg.norm(quaternions, axis=1)
+    is_missing = np.isnan(quaternions).any(axis=1)
+    table.check("rotation_w", is_missing | (np.abs(length - 1) <= _UNIT_TOLERANCE), "a unit quaternion, or nothing")
+    rotations = np.full((len(time_s), 3, 3), np.nan)
+    rotations[~is_missing] = matrix_from_quaternion(quaternions[~is_missing] / length[~is_missing, None])
+    return StarTracker(time_s, rotations, sigmas_rad)
+
+
+def _read_doppler_lidar(path: Path, errors: LidarErrors) -> DopplerLidar:
+    table = read_table(path, BEAMS, dict.fromkeys(DOPPLER_LIDAR_COLUMNS, "number"))
+    time_s = _increasing(table, strictly=False)
+    directions = np.column_stack([table.finite(name, -1, 1) for name in BEAM_DIRECTION])
+    table.check(
+        BEAM_DIRECTION[2],
+        np.abs(np.linalg.norm(directions, axis=1) - 1) <= _UNIT_TOLERANCE,
+        "a unit vector beam_x_body, beam_y_body, beam_z_body",
+    )
+    table.check(BEAM_DIRECTION[2], directions[:, 2] < 0, "below 0: the beam points down, along -Z_B")
+    speeds, ranges = table.numbers("speed_mps"), table.numbers("range_m")
+    beams = [Beam(*row) for row in zip(directions, speeds.tolist(), ranges.tolist(), strict=True)]
+    _, first, counts = np.unique(directions.round(6), axis=0, return_index=True, return_counts=True)
+    of_beam = (directions.round(6) == directions[first[counts.argmax()]].round(6)).all(axis=1) if len(beams) else []
+    step_s = float(np.median(np.diff(time_s[of_beam]))) if np.sum(of_beam) > 1 else errors.step_s
+    return DopplerLidar(time_s, beams, replace(errors, step_s=max(step_s, _MIN_STEP_S)))
 
 
 def read_euroc(path: Path, limits: TableLimits, columns: dict[str, Kind]) -> Columns:
@@ -162,14 +222,16 @@ def nanoseconds_as_seconds(table: Columns) -> Array:
     return time_ns / 1e9
 
 
-def _increasing(table: Columns) -> Array:
-    """Times in seconds. Raises UserError if they do not increase or cannot be seconds."""
+def _increasing(table: Columns, strictly: bool = True) -> Array:
+    """Times in seconds. Raises UserError if they decrease or cannot be seconds; if `strictly`, also if they repeat."""
     time_s = table.finite("time_s")
     table.check("time_s", np.abs(time_s) <= _LARGEST_S, "seconds; these may be nanoseconds: divide by 1e9")
-    late = np.diff(time_s) <= 0
+    step_s = np.diff(time_s)
+    late = step_s <= 0 if strictly else step_s < 0
     if late.any():
         row = int(late.argmax()) + 1
-        raise table.fault(row, "time_s", f"above {time_s[row - 1]}, the time of the row before")
+        limit = "above" if strictly else "at least"
+        raise table.fault(row, "time_s", f"{limit} {time_s[row - 1]}, the time of the row before")
     return time_s
 
 
