@@ -22,7 +22,7 @@ from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 
 _SEARCHED = ("frames", "labels", "scenes", "craters", "trajectories")
-"""Tables in which a column name without a table is looked up, in this order."""
+"""Tables that conditions may use, in the order in which a column name without a table is looked up."""
 _COMPARISONS: dict[type, Callable] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
@@ -71,7 +71,7 @@ class Condition:
         return any(table in ("labels", "craters") for table, _ in self.columns)
 
     def columns_of_only(self, table: str) -> list[str] | None:
-        """Return the columns that the condition uses if all belong to `table`, otherwise None."""
+        """Return the columns that the condition uses, or None if not all of them belong to `table`."""
         return (
             sorted(name for _, name in self.columns) if {table} == {of_table for of_table, _ in self.columns} else None
         )
@@ -81,7 +81,10 @@ class Condition:
         return self._compiled(lambda table, name: name)
 
     def holds(self, rows: pa.Table) -> NDArray[np.bool_]:
-        """Evaluate the condition (N,) on columns named `table.column`. Raises UserError if numbers overflow."""
+        """Return for each row (N,) whether the condition is true. Raises UserError if numbers overflow.
+
+        The columns of `rows` are named `table.column`.
+        """
         mask = np.zeros(len(rows), np.bool_)
         try:
             rows_that_hold = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
@@ -255,5 +258,5 @@ def _constant(value: bool | float | str) -> _Value:
 
 
 def columns_of(conditions: Iterable[Condition]) -> set[tuple[str, str]]:
-    """Return all columns, as (table, name), that the conditions use."""
+    """Return the columns that the conditions use, each as (table, name)."""
     return {key for condition in conditions for key in condition.columns}
