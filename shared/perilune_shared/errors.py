@@ -23,7 +23,7 @@ DISK_FAULTS = (
     errno.EMFILE,
     errno.ENFILE,
 )
-"""Disk and file errors that a user can correct, such as a full disk or a missing folder or permission."""
+"""Disk and file errors that a user can correct, such as a full disk or a missing permission."""
 
 
 class UserError(Exception):
@@ -47,7 +47,7 @@ class UserError(Exception):
 
 
 def ends_run(error: BaseException) -> bool:
-    """Whether all further work would fail too: after a user error, or if the disk is full or inaccessible."""
+    """Whether all further work would fail too: a user error, or a full or inaccessible disk."""
     # Another process may have removed a missing file, so it does not end the run.
     return isinstance(error, UserError) or (
         isinstance(error, OSError) and error.errno in DISK_FAULTS and error.errno != errno.ENOENT
