@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-_ROOT, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_ROOT, _MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processor_quota() -> float | None:
@@ -49,7 +49,7 @@ def _folders(controller: str) -> list[Path]:
     container's own cgroup.
     """
     try:
-        lines = _OWN.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = _MEMBERSHIP.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
     folders = [_ROOT, _ROOT / controller, _ROOT / "cpu,cpuacct"]

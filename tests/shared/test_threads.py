@@ -19,7 +19,7 @@ def machine(tmp_path, monkeypatch):
     """A machine of 64 cores whose files on cgroups a test writes; returns the folder of the cgroups."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
     monkeypatch.setattr(cgroups, "_ROOT", tmp_path / "cgroup")
-    monkeypatch.setattr(cgroups, "_OWN", tmp_path / "own")
+    monkeypatch.setattr(cgroups, "_MEMBERSHIP", tmp_path / "own")
     (tmp_path / "cgroup").mkdir()
     return tmp_path / "cgroup"
 

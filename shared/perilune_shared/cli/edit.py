@@ -128,7 +128,7 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
     if not differing:
         answer("no difference")
         return
-    rows = [(each.place, each.column, each.rows, each.example, each.first, each.second) for each in differing]
+    rows = [(each.table, each.column, each.rows, each.example, each.first, each.second) for each in differing]
     answer_table(("where", "column", "rows", "example", "first", "second"), rows)
     raise typer.Exit(EXIT_DIFFERENT)
 

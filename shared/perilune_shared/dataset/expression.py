@@ -1,8 +1,8 @@
 """Conditions on columns for the option `--where`: arithmetic and comparisons in Python syntax.
 
 A condition is parsed with `ast`, type-checked against the schema, and compiled to an expression of pyarrow.compute. It
-is never executed as Python code. A column is given by its name, or as `table.column` if several tables have it;
-`position_m[2]` is an element of a vector. As in SQL, a comparison with null is neither true nor false.
+is never executed as Python code. A column is given by its name, or as `table.column` if several tables have a column of
+this name; `position_m[2]` is an element of a vector. As in SQL, a comparison with null is neither true nor false.
 """
 
 import ast
@@ -55,7 +55,7 @@ class _Value:
 
 
 class Condition:
-    """A parsed condition."""
+    """A parsed condition on frames or labels."""
 
     def __init__(self, text: str):
         """Parse `text`. Raises UserError on invalid syntax, unknown columns or mismatched types."""

@@ -38,7 +38,7 @@ _Row = tuple[float, float, float]
 def _printable(text: str) -> str:
     """Return `text`. Raises ValueError on unprintable characters, such as bidirectional marks."""
     if not text.isprintable():
-        raise ValueError("text should be printable")
+        raise ValueError("printable text")
     return text
 
 
@@ -74,10 +74,10 @@ class CameraRecord(_Info):
     @model_validator(mode="after")
     def _possible(self) -> "CameraRecord":
         if self.width_px * self.height_px > LARGEST_IMAGE_PX:
-            raise ValueError(f"width_px times height_px should be at most {LARGEST_IMAGE_PX}")
+            raise ValueError(f"width_px times height_px of at most {LARGEST_IMAGE_PX}")
         rows = np.array(self.rotation_camera_from_body)
         if not (np.abs(rows @ rows.T - np.eye(3)) < _ROTATION_TOLERANCE).all() or np.linalg.det(rows) < 0:
-            raise ValueError("rotation_camera_from_body should be a rotation")
+            raise ValueError("rotation_camera_from_body to be a rotation")
         return self
 
     @classmethod
@@ -124,7 +124,7 @@ class Origin(_Info):
     name: Name
     """Name of that dataset."""
     sha256: _Sha256
-    """SHA-256 of its dataset.json."""
+    """SHA-256 of that dataset's dataset.json."""
     camera_config: dict[str, Any] | None
     """Section `dataset.camera` (or `dataset.cameras`) of that dataset's configuration; null if unknown.
 
@@ -140,7 +140,7 @@ class Recipe(_Info):
     preset: Name
     """Preset on which the settings are based."""
     kind: Kind
-    """Which of the preset's datasets this is: detect or nav."""
+    """Purpose of the dataset, detect or nav; each preset has settings for both."""
     seed: Annotated[int, Field(ge=0)]
     """Random seed from which every random stream is derived."""
     config: dict[str, Any]
@@ -200,7 +200,7 @@ class DatasetInfo(_Info):
     exr_cameras: dict[_CameraName, CameraRecord] | None = None
     """Cameras of the EXRs by name; null without EXRs or if there is only one camera."""
     recipes: dict[str, Recipe]
-    """Recipes by key; each scene refers to one."""
+    """Recipes by key; each scene refers to one recipe by the column `recipe`."""
     history: tuple[_Line, ...] = ()
     """Edits since rendering, one line each."""
     counts: Counts
@@ -214,9 +214,9 @@ class DatasetInfo(_Info):
     def _names_agree(self) -> "DatasetInfo":
         names = list(self.cameras or {})
         if self.cameras is not None and (len(names) < 2 or self.cameras[names[0]] != self.camera):
-            raise ValueError("cameras should be two or more, the first of them equal to camera")
+            raise ValueError("two or more cameras, the first of them equal to camera")
         if self.exr_cameras is not None and list(self.exr_cameras) != names:
-            raise ValueError("exr_cameras should have the names of cameras")
+            raise ValueError("exr_cameras with the names of cameras")
         return self
 
     @model_serializer(mode="wrap")

@@ -25,9 +25,9 @@ def attach(
 
     Frames are copied, or hard-linked with `link`. Every file must match its hash in the manifest. With `rehash`, the
     hashes of the files replace the hashes in the manifest, for example if frames were rendered on another kind of
-    machine. For each scene, the EXRs are included if all of them exist; so are the flash lidar images and the hazard
-    map. Raises UserError if a frame is missing or a file does not match, or if the manifest has frames or is a plan
-    without labels.
+    machine. For each scene, EXRs, flash lidar images and the hazard map are each included only if all files of this
+    kind exist. Raises UserError if a frame is missing or a file does not match, or if the manifest has frames or is a
+    plan without labels.
     """
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":

@@ -18,14 +18,14 @@ _COPY_NUMBER = "copy"
 class Difference:
     """A column in which rows differ, or rows that exist in only one dataset."""
 
-    place: str
+    table: str
     """Name of the table, or dataset.json."""
     column: str
     """Column or field; empty if whole rows are missing."""
     rows: int
-    """Number of rows that differ."""
+    """Number of rows that differ or are missing."""
     example: str
-    """Key of the first such row."""
+    """Key of the first row that differs."""
     first: str
     """Value of the example in the first dataset."""
     second: str
@@ -44,12 +44,12 @@ def differences(first: Dataset, second: Dataset) -> list[Difference]:
         for name in TABLES:
             pair = (dataset.table(name, scene_id=scene_id).to_pandas() for dataset in (first, second))
             for each in _rows(name, *pair):
-                key = (each.place, each.column + (each.first if not each.column else ""))
+                key = (each.table, each.column + (each.first if not each.column else ""))
                 earlier = gathered.get(key)
                 total = each.rows + (earlier.rows if earlier else 0)
                 example = earlier or each
                 gathered[key] = Difference(
-                    example.place, example.column, total, example.example, example.first, example.second
+                    example.table, example.column, total, example.example, example.first, example.second
                 )
     return result + list(gathered.values())
 

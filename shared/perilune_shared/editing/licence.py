@@ -19,7 +19,7 @@ def _spdx() -> Licensing:
 
 
 def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
-    """Return the SPDX expression for data to which all given licences apply, joined by AND.
+    """Return the SPDX expression that joins the given licences by AND.
 
     `licences` are pairs of dataset (for error messages) and licence. Equal licences appear once; alternatives are in
     parentheses. A licence that SPDX does not list needs a name of the form LicenseRef-<name>. Raises UserError on an

@@ -28,13 +28,13 @@ class Rewriting:
     change: Callable[[SceneTables], SceneTables]
     """Returns the new tables of a scene from the old ones."""
     images: ImageMode
-    """How frames are written: copied, hard-linked, omitted, or omitted with all that a plan omits."""
+    """How frames are written; see `ImageMode`."""
     scene_ids: Sequence[str] | None = None
     """Scenes to write; None for all."""
 
 
 def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progress = NO_PROGRESS) -> None:
-    """Change the scenes of `source` and write them into `out`.
+    """Write the changed scenes of `source` as a new dataset `out`.
 
     Scenes and labels without frames are omitted. The caller must have checked the source (`check_source`).
     """
@@ -60,8 +60,8 @@ def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progr
 def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
-    This is so if the dataset is incomplete, if keys are broken, if files do not match the index (a new index would hide
-    the damage), or if `out` is inside the dataset.
+    The dataset must be complete, must match its index (a new index would hide damage) and must have valid keys. `out`
+    must be outside the dataset.
     """
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")

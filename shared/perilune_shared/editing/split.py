@@ -80,10 +80,10 @@ def split_dataset(
 def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     """Return a table of all frames, sorted by frame_id, with the columns `terrain`, `flight` and `pose`.
 
-    Rows with equal values of a column must be in the same split. `terrain` is the key from `terrain_of`. `pose` is a
-    number for each distinct position and rotation over a terrain; all cameras at one instant have the same number.
-    `flight` is a number for trajectories over one terrain that have equal random seeds or a common pose, for example
-    because a flight was developed again or rendered with another Sun.
+    A split by one of these columns keeps rows with equal values together. `terrain` is the key from `terrain_of`.
+    `pose` is a number for each distinct position and rotation over a terrain; all cameras at one instant have the same
+    number. `flight` is a number for trajectories over one terrain that have equal random seeds or a common pose, for
+    example because a flight was developed again or rendered with another Sun.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
     rows = dataset.table("frames", [*columns, "camera", "frame_index"]).sort_by("frame_id")

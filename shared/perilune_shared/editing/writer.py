@@ -34,7 +34,7 @@ _PER_TRAJECTORY = ("frames", "labels")
 
 
 class DatasetWriter:
-    """Writer of a dataset; created by `new_dataset`."""
+    """Writer of a new dataset. Create it with `new_dataset`."""
 
     def __init__(self, store: Store, info: DatasetInfo, *, max_rows: int = MAX_ROWS_WRITTEN):
         self.store, self.info = store, info
@@ -137,7 +137,7 @@ def new_dataset(
 ) -> Iterator[DatasetWriter]:
     """Yield a writer for a new dataset. The dataset appears at `out` only if the block succeeds.
 
-    Each table becomes one part, or several parts of at most `max_rows` rows. `info` provides the metadata that are not
+    Each table becomes one part, or several parts of at most `max_rows` rows. `info` provides the metadata that is not
     computed from the rows. Raises UserError if there are no frames or `out` is not empty.
     """
     # Pydantic does not validate copies with replaced fields.

@@ -1,6 +1,6 @@
 """Read a camera from a YAML file: settings, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
 
-In calibrations, the centre of the top-left pixel has the coordinates (0, 0), in perilune (0.5, 0.5), so half a pixel is
+In these calibrations the centre of the top-left pixel is at (0, 0). In perilune it is at (0.5, 0.5), so half a pixel is
 added to the principal point. The distortion model of perilune is Brown-Conrady (`plumb_bob`, `radtan`). An equidistant
 distortion (Kannala and Brandt 2006, doi 10.1109/TPAMI.2006.153) is replaced by the best-fitting Brown-Conrady
 distortion. The file is refused if the fit error exceeds 0.05 px.
@@ -35,7 +35,7 @@ _HALF_PX = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A camera from another program's file."""
+    """A camera from a calibration file of another program."""
 
     camera: Camera
     """Intrinsics."""

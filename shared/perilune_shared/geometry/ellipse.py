@@ -22,18 +22,18 @@ _UNIT_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 @dataclass(frozen=True, slots=True)
 class Ellipses:
-    """N ellipses in the image; NaN if the image of the circle is not an ellipse."""
+    """N ellipses in the image; NaN where the image of a circle is not an ellipse."""
 
     cx_px: Array
-    """Centre, pixels from the left edge (N,)."""
+    """Centres (N,), pixels from the left edge."""
     cy_px: Array
-    """Centre, pixels from the top edge (N,)."""
+    """Centres (N,), pixels from the top edge."""
     a_px: Array
-    """Semi-major axis, pixels (N,)."""
+    """Semi-major axes (N,), pixels."""
     b_px: Array
-    """Semi-minor axis, pixels (N,)."""
+    """Semi-minor axes (N,), pixels."""
     theta_rad: Array
-    """Direction of the semi-major axis, from x towards y, in [0, pi) (N,)."""
+    """Directions (N,) of the semi-major axes, from x towards y, in [0, pi)."""
 
     def bounding_boxes(self) -> Array:
         """Return the tight boxes (N, 4) x0, y0, x1, y1 of the ellipses, pixels, not clipped to the image."""
@@ -43,7 +43,7 @@ class Ellipses:
         return np.stack([self.cx_px - half_w, self.cy_px - half_h, self.cx_px + half_w, self.cy_px + half_h], axis=-1)
 
     def radius_px(self) -> Array:
-        """Return the radius of the circle of equal area, sqrt(a b), pixels (N,)."""
+        """Return the radii (N,) of the circles of equal area, sqrt(a b), pixels."""
         return np.sqrt(self.a_px * self.b_px)
 
 

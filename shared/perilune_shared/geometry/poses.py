@@ -25,11 +25,11 @@ class Pose:
     """Position, rotation and velocity of a camera."""
 
     position_m: Array
-    """Position, O_L, metres (3,)."""
+    """Position (3,), O_L, metres."""
     rotation_camera_from_site: Array
     """Rotation matrix (3, 3); O_C has x to the right of the image, y down and z along the line of sight."""
     velocity_mps: Array
-    """Velocity, O_L, metres per second (3,); causes motion blur."""
+    """Velocity (3,), O_L, metres per second; causes motion blur."""
 
     @property
     def rotation_wxyz(self) -> Array:

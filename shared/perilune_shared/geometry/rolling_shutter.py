@@ -20,13 +20,13 @@ class Moving:
     """Poses and velocities of N cameras: one camera for each of N points, or N = 1 for all points."""
 
     position_m: Array
-    """Positions at time 0, O_L, metres (N, 3)."""
+    """Positions (N, 3) at time 0, O_L, metres."""
     rotation_camera_from_site: Array
-    """Rotation matrices at time 0 (N, 3, 3)."""
+    """Rotation matrices (N, 3, 3) at time 0."""
     velocity_mps: Array
-    """Velocities, O_L, metres per second (N, 3)."""
+    """Velocities (N, 3), O_L, metres per second."""
     angular_velocity_radps: Array
-    """Angular velocities, O_C, radians per second (N, 3)."""
+    """Angular velocities (N, 3), O_C, radians per second."""
 
     def rotations_at(self, time_s: Array) -> Array:
         """Return rotation_camera_from_site (N, 3, 3) at times (N,)."""
@@ -34,7 +34,7 @@ class Moving:
         return _matrices(-time_s[:, None] * self.angular_velocity_radps) @ self.rotation_camera_from_site
 
     def seen_at(self, points_m: Array, time_s: Array) -> Array:
-        """Transform points (N, 3) from O_L to O_C at times (N,), metres."""
+        """Transform points (N, 3), metres, from O_L to O_C at times (N,)."""
         offset = points_m - self.position_m - time_s[:, None] * self.velocity_mps
         return np.einsum("nij,nj->ni", self.rotations_at(time_s), offset)
 
