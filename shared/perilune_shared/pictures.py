@@ -39,8 +39,8 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
     side = max(grey.shape)
     factor = max(_SMALLEST_PX // side, 1) if side <= _LARGEST_PX else _LARGEST_PX / side
     size = (max(round(grey.shape[1] * factor), 1), max(round(grey.shape[0] * factor), 1))
-    how = Image.Resampling.NEAREST if factor >= 1 else Image.Resampling.BOX
-    picture = Image.fromarray(grey).resize(size, how).convert("RGB")
+    resampling = Image.Resampling.NEAREST if factor >= 1 else Image.Resampling.BOX
+    picture = Image.fromarray(grey).resize(size, resampling).convert("RGB")
     draw = ImageDraw.Draw(picture)
     rows = np.asarray(ellipses, np.float64).reshape(-1, 5)
     for index, (x, y, a, b, theta) in enumerate(rows):

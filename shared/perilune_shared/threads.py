@@ -45,7 +45,7 @@ _PATTERNS = {
 """Pattern and description of the valid values of each variable."""
 _SPINNING = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 _STATISTICS = Path("/proc/stat")
-_set_here: set[str] = set()
+_set_by_program: set[str] = set()
 """Variables that `set_up_program` has set in this process."""
 _warned = False
 
@@ -83,7 +83,7 @@ def set_up_program() -> None:
 
 def _set(name: str, value: int) -> None:
     os.environ[name] = str(value)
-    _set_here.add(name)
+    _set_by_program.add(name)
 
 
 def _check() -> None:
@@ -102,7 +102,7 @@ def _load() -> float:
 
 def chosen_by_user(name: str) -> bool:
     """Whether an environment variable is set, but not by `set_up_program`."""
-    return name in os.environ and name not in _set_here
+    return name in os.environ and name not in _set_by_program
 
 
 def described_settings() -> str:

@@ -29,7 +29,7 @@ def environment(monkeypatch):
     """The environment without variables of threads; restored after the test."""
     for name in threads._PATTERNS:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(threads, "_set_here", set())
+    monkeypatch.setattr(threads, "_set_by_program", set())
     with monkeypatch.context():
         before = dict(os.environ)
         yield os.environ

@@ -72,5 +72,5 @@ class Frame:
 
     def __repr__(self) -> str:
         split, time_s, altitude_m = self.row["split"], self.row["time_s"], self.row["position_m"][2]
-        about = f"{split}, time {time_s:.1f} s, {altitude_m:.0f} m above the site, {len(self.labels)} labels"
-        return one_line(f"Frame({self.frame_id}: {about})")
+        summary = f"{split}, time {time_s:.1f} s, {altitude_m:.0f} m above the site, {len(self.labels)} labels"
+        return one_line(f"Frame({self.frame_id}: {summary})")

@@ -145,10 +145,10 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
     stated = part.stated_groups()
     for group in range(part.n_groups):
         # Check the paths of each small group before decompressing the next one.
-        in_group = part.file.metadata.row_group(group).num_rows
-        if part.n_rows > MAX_ROWS or in_group > _ROWS_PER_GROUP:
+        n_group_rows = part.file.metadata.row_group(group).num_rows
+        if part.n_rows > MAX_ROWS or n_group_rows > _ROWS_PER_GROUP:
             expected = f"at most {MAX_ROWS}, at most {_ROWS_PER_GROUP} in a row group"
-            raise UserError(where, "rows", f"{part.n_rows}, {in_group} in a row group", expected)
+            raise UserError(where, "rows", f"{part.n_rows}, {n_group_rows} in a row group", expected)
         rows = part.read(groups=[group])
         _check_rows(where, rows)
         for error in false_statistics(part, next(stated, {}), rows):

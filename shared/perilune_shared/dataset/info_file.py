@@ -29,10 +29,10 @@ def read_object(address: Address) -> dict[str, Any]:
     if store.folder is not None:
         path = store.folder / INFO_NAME
         if not path.exists() and not path.is_symlink():
-            within = [
+            subfolders = [
                 f"{store.folder / kind}" for kind in ("detect", "nav") if (store.folder / kind / INFO_NAME).is_file()
             ]
-            raise UserError(store, INFO_NAME, "no such file", " or ".join(within) or _EXPECTED)
+            raise UserError(store, INFO_NAME, "no such file", " or ".join(subfolders) or _EXPECTED)
         store.plain_size(INFO_NAME)
     try:
         text = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)

@@ -251,13 +251,13 @@ class DatasetInfo(_Info):
         used = set(names)
         if self.cameras is None or not used & self.cameras.keys() or used >= self.cameras.keys():
             return self
-        kept = [name for name in self.cameras if name in used]
+        remaining = [name for name in self.cameras if name in used]
         fields: dict[str, Any] = {}
         for single, several in (("camera", "cameras"), ("exr_camera", "exr_cameras")):
             records = getattr(self, several)
             if records is not None:
-                chosen = {name: records[name] for name in kept}
-                fields |= {single: chosen[kept[0]], several: chosen if len(kept) > 1 else None}
+                chosen = {name: records[name] for name in remaining}
+                fields |= {single: chosen[remaining[0]], several: chosen if len(remaining) > 1 else None}
         return self.model_copy(update=fields)
 
     def recipe(self) -> Recipe:

@@ -257,10 +257,12 @@ class Part:
         index = names.index(column) if column in names else -1
         chosen = []
         for group in range(footer.num_row_groups):
-            known = footer.row_group(group).column(index).statistics if index >= 0 else None
+            stated = footer.row_group(group).column(index).statistics if index >= 0 else None
             try:
                 excluded = (
-                    known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
+                    stated is not None
+                    and stated.has_min_max
+                    and not (str(stated.min) < high and str(stated.max) >= low)
                 )
             except (pa.ArrowException, ValueError):  # statistics of another type, or not UTF-8
                 excluded = False

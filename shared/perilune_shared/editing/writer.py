@@ -155,9 +155,9 @@ def check_scene(where: object, tables: SceneTables) -> None:
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
         raise UserError(where, "scenes", found, "one row for the scene; see `perilune-manifest validate`")
-    odd = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
-    if odd:
-        found = f"no {scenes[0].as_py()}/{min(odd)}"
+    missing = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
+    if missing:
+        found = f"no {scenes[0].as_py()}/{min(missing)}"
         raise UserError(where, "trajectories", found, "the trajectory of every frame; see `perilune-manifest validate`")
 
 

@@ -141,11 +141,11 @@ def _opencv(path: Path, content: dict[str, Any]) -> Calibration:
     if content.get("fisheye_model") == 1:
         stated = stated or "equidistant"
     region = content.get("roi")
-    changes = [content.get("binning_x"), content.get("binning_y")]
-    if any(value not in (None, 0, 1) for value in changes):
-        raise UserError(path, "binning_x", changes[0], "0 or 1: the camera of the whole image")
+    for name in ("binning_x", "binning_y"):
+        if content.get(name) not in (None, 0, 1):
+            raise UserError(path, name, content[name], "0 or 1: a calibration without binning")
     if isinstance(region, dict) and any(region.get(key) for key in ("x_offset", "y_offset", "width", "height")):
-        raise UserError(path, "roi", region, "zeros: the camera of the whole image")
+        raise UserError(path, "roi", region, "zeros: a calibration of the whole image")
     pair = _numbers(path, "image size", size, (2,))
     return Calibration(_camera(path, pair, (fx, fy, cx, cy), stated, coefficients), None, (0.0, 0.0, 0.0))
 

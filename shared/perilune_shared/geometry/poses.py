@@ -120,11 +120,11 @@ def _rotation(tilt_rad: float, azimuth_rad: float) -> Array:
     return np.stack([right, np.cross(sight, right), sight])
 
 
-def _check(where: str, field: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless a value is a number from `least` to `most`."""
+def _check(where: str, field: str, value: float, low: float, high: float) -> None:
+    """Raise UserError unless a value is a number from `low` to `high`."""
     is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not is_number or not least <= value <= most:
-        raise UserError(where, field, value, f"a number from {least:g} to {most:g}")
+    if not is_number or not low <= value <= high:
+        raise UserError(where, field, value, f"a number from {low:g} to {high:g}")
 
 
 def _position(field: str, value: ArrayLike) -> Array:

@@ -172,6 +172,7 @@ def without(content, *names):
         (ros(coefficients=[0.1, 0.1, 0, 0], model=""), "distortion_model: got no model for four coefficients"),
         (ros(coefficients=[0.1] * 3), "distortion_coefficients: got 3 values, expected 0 or 4 or 5"),
         (ros(binning_x=2), "binning_x: got 2"),
+        (ros(binning_y=2), "binning_y: got 2"),
         (ros(roi={"width": 20, "height": 20}), "roi: got"),
         (ros(np.array([[1, 0.1, 2], [0, 1, 2], [0, 0, 1]])), "camera_matrix: got"),
         (without(ros(), "image_width"), "image_width: got nothing"),
