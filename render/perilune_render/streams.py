@@ -17,5 +17,8 @@ def stream(seed: int, *names: object) -> np.random.Generator:
 
 
 def camera_seed(seed: int, camera: str | None) -> int:
-    """Random seed of a camera's frames or sensor: independent for each camera, `seed` for a single camera."""
+    """Random seed of the frames or the sensor of one of several cameras.
+
+    `camera` is None for a dataset with a single camera, which uses `seed` itself.
+    """
     return seed if camera is None else derived_seed(seed, "camera", camera)

@@ -40,7 +40,7 @@ from perilune_shared.storage.replacement import replaceable
 app = new_program(
     "perilune-render",
     perilune_render.__version__,
-    "Generate lunar terrain and trajectories, and render labelled frames with Blender.",
+    "Generate lunar terrain and trajectories, and render labelled frames.",
 )
 
 
@@ -99,8 +99,8 @@ def plan(
     manifest: Annotated[
         str | None,
         typer.Option(
-            help="Manifest whose table `frames` was left out, as in `data_manifests`: write it with this table, drawn "
-            "again by its recipe."
+            help="Manifest without the table `frames`, such as those in `data_manifests`: write it again with this "
+            "table, computed from its recipe."
         ),
     ] = None,
     overwrite: OverwriteFolder = False,
@@ -139,7 +139,9 @@ def regenerate(
     ] = None,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare frames, then delete them; a sample unless --frames or --all."),
+        typer.Option(
+            "--verify", help="Compare frames, then delete them. Without --frames or --all, a sample is compared."
+        ),
     ] = False,
     sample: Annotated[int, typer.Option(min=1, help="Number of frames in the sample, evenly spread.")] = 12,
     everything: Annotated[bool, typer.Option("--all", help="All frames of the manifest.")] = False,
@@ -149,7 +151,7 @@ def regenerate(
         Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
     ] = None,
 ) -> None:
-    """Render frames from a manifest alone and compare them with its hashes. Exit code 2 if a frame differs."""
+    """Render frames from a manifest and compare them with its hashes; exit with code 2 if frames or ground differ."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = ps.open_dataset(manifest)
@@ -189,7 +191,7 @@ def preview(
     scene: Annotated[
         Path | None, typer.Option(help="With --poses: settings of the scene, as for `frames`; equivalent to CONFIG.")
     ] = None,
-    camera: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="With --poses: file with the camera, as for `frames`.")] = None,
     camera_axes: CameraAxes = None,
     out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(
         "preview.png"
