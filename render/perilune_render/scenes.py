@@ -95,7 +95,7 @@ class RenderedFrame:
 
 
 class Scene:
-    """Lunar ground with craters, a Sun and a camera; renders labelled frames from any pose above the ground.
+    """Lunar ground with craters, a Sun and a camera; renders labelled frames from given poses.
 
     The ground is large enough for the descents of the configuration, which start at 1500 m by default. A pose from
     which the camera sees beyond this ground raises UserError. To see the horizon, set `dataset.scene.horizon=true`.

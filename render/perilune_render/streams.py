@@ -1,4 +1,4 @@
-"""Random streams derived by name from one seed, so that each scene, trajectory or frame can be regenerated alone."""
+"""Random streams derived from one seed by name, so that each frame can be regenerated alone."""
 
 import hashlib
 

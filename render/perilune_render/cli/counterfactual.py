@@ -43,10 +43,10 @@ def counterfactual(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render frames of a dataset again without some craters or with another Sun azimuth; nothing else changes.
+    """Render frames of a dataset again without some craters or with another azimuth of the Sun.
 
-    Frames and craters keep their ids. The removed craters are listed in OUT.removed.parquet. Run the same command again
-    to resume.
+    Everything else is unchanged; frames and craters keep their ids. The removed craters are listed in
+    OUT.removed.parquet. Run the same command again to resume.
     """
     # Check the options first, since reading the manifest takes seconds.
     resolve_over(CounterfactualConfig, "counterfactual", "--sun-azimuth-offset-deg", _sun(sun_azimuth_offset_deg))

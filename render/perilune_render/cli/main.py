@@ -76,7 +76,7 @@ def develop(
     ] = None,
     setting: Setting = None,
 ) -> None:
-    """Make a dataset from the EXRs of another dataset, with a different sensor or camera, without Blender."""
+    """Make a dataset with a different sensor or camera from the EXRs of another dataset, without Blender."""
     from perilune_render.dataset.develop import develop_dataset
 
     with progress_bar() as progress:
@@ -151,7 +151,7 @@ def regenerate(
         Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
     ] = None,
 ) -> None:
-    """Render frames from a manifest and compare them with its hashes; exit with code 2 if frames or ground differ."""
+    """Render frames from a manifest and compare them with its hashes. Exit code 2 if frames or ground differ."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = ps.open_dataset(manifest)
@@ -240,7 +240,10 @@ def ground(
         Path, typer.Option(help="File to write: .glb, .ply, .obj or .stl for a mesh, .tif for heights.")
     ] = Path("scene.glb"),
 ) -> None:
-    """Write the ground of a configuration's first scene as a mesh or a GeoTIFF (metres, O_L: Z up, Y south, X west)."""
+    """Write the ground of a configuration's first scene as a mesh or a GeoTIFF.
+
+    Coordinates are metres in O_L: Z up, Y south, X west.
+    """
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene

@@ -13,7 +13,7 @@ def status(
         str, typer.Argument(help="Folder or address of a dataset, or of the folder that contains `detect` and `nav`.")
     ],
 ) -> None:
-    """Print what is rendered, running and failed; any machine with access to the dataset's files can run this."""
+    """Print what is rendered, running and failed. Any machine that can read the dataset can run this."""
     from perilune_render.jobs.status import SILENT_S, datasets_below, status_of
 
     for store in datasets_below(open_store(address)):

@@ -54,7 +54,7 @@ class CameraConfig(Section):
 
 
 class MountingConfig(Section):
-    """Position and attitude of a camera on the body; by default those of the single camera, `dataset.camera`."""
+    """Position and attitude of a camera on the body; the defaults are the values for `dataset.camera`."""
 
     position_in_body_m: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
     """Centre of projection in O_B (the axes of the body), metres."""

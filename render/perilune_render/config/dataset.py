@@ -82,7 +82,7 @@ class FlightConfig(Section):
 
 
 class InstrumentsConfig(Section):
-    """Simulated measurements along each trajectory, for navigation filters: tables `inertial` and `ranges`."""
+    """Simulated measurements along each trajectory, in the tables `inertial` and `ranges`."""
 
     inertial_grades: tuple[InertialGrade, ...] = ()
     """Grades of inertial measurement units (gyroscopes and accelerometers) to simulate."""
@@ -249,7 +249,10 @@ class RenderConfig(Section):
 
 
 class LabelsConfig(Section):
-    """Limits on the radius of labels. A crater within these limits is labelled if its centre is in the frame."""
+    """Limits on the radius of labels.
+
+    A crater within these limits is labelled if its centre is in the frame.
+    """
 
     min_radius_px: Pixels = 2.0
     """Smallest radius of a label, sqrt(a b) of its ellipse, pixels."""

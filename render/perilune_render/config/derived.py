@@ -30,7 +30,10 @@ class SurveyConfig(Section):
 
 
 class CounterfactualConfig(Section):
-    """The frames of another dataset with changed ground or light. Poses, noise and all other ground are unchanged."""
+    """The frames of another dataset with changed ground or light.
+
+    Poses, noise and all other ground are unchanged.
+    """
 
     removed: dict[SceneSeed, tuple[CraterId, ...]] = Field(default_factory=dict)
     """Craters to remove from the ground: a list of `crater_id` for the random seed of each scene."""

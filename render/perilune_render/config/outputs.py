@@ -14,7 +14,7 @@ _ROUNDING = 1e-9
 
 
 class HazardConfig(Section):
-    """A hazard map of each scene for a lander of given size: slope, roughness, boulders, shadow, and safe places."""
+    """A hazard map of each scene: slope, roughness, boulders, shadow and safe places for a lander."""
 
     footprint_m: Length = 10.0
     """Diameter of the lander's footprint, metres."""
@@ -51,7 +51,7 @@ class HazardConfig(Section):
 
 
 class FlashLidarConfig(Section):
-    """A flash lidar along the camera's axis. It measures all its pixels at once, at the time of each frame."""
+    """A flash lidar along the camera's axis, which measures all pixels at the time of each frame."""
 
     width_px: Annotated[int, Field(ge=1, le=1024)] = 128
     """Image width, pixels."""

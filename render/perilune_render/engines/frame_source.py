@@ -75,7 +75,7 @@ class Engine(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """Camera of the renderings, without distortion. Its image covers the view of the camera of the frames."""
+        """Camera of the renderings, without distortion. It covers the view of the camera of the frames."""
 
     @property
     def sun(self) -> Array:
@@ -135,7 +135,10 @@ class FrameSource:
         return cls(engine, camera, circles, config.sensor, pattern, config.labels)
 
     def take(self, shot: Shot) -> Frame:
-        """Render and develop one frame. Raises the engine's errors, such as OSError if Blender wrote no frame."""
+        """Render and develop one frame.
+
+        Raises the engine's errors, for example OSError if Blender wrote no frame.
+        """
         return self.develop(shot, self.render(shot))
 
     def render(self, shot: Shot) -> Radiance:

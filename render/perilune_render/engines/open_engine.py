@@ -1,4 +1,4 @@
-"""Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays cast at the height field)."""
+"""Open the engine of a configuration: `cycles` (Blender) or `heightfield` (ray casting)."""
 
 import contextlib
 from contextlib import AbstractContextManager

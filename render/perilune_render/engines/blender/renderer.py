@@ -114,7 +114,7 @@ class Renderer:
     def render(
         self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0
     ) -> Radiance:
-        """Render one frame: mean radiance factor of each pixel, and depth of the ray through the pixel's centre.
+        """Render one frame: mean radiance factor of each pixel, and depth of the ray through its centre.
 
         With dataset.render.exr, the ray through the centre also gives the normal. Otherwise, the normal is the mean
         over the pixel's samples. `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable
@@ -203,7 +203,7 @@ def rows_only(stage: bpy.types.Scene, first: int, last: int, n_rows: int) -> Ite
 
 @contextlib.contextmanager
 def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
-    """Configure a stage to send one ray through each pixel's centre, to within 1e-5 px, until the block ends.
+    """Configure a stage for one ray through each pixel's centre, to within 1e-5 px, in the block.
 
     For any seed, Cycles puts the first sample of a pixel at the centre of the pixel filter. It reads this position from
     a table, which is off by 5e-4 px for a box filter one pixel wide. A narrower filter is more accurate. Cycles ignores

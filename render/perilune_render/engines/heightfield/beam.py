@@ -1,4 +1,4 @@
-"""Find the height at which the rays of a block of pixels may begin, and the part of the mesh that they hit.
+"""Find where the rays of a block of pixels may begin, and the part of the mesh that they hit.
 
 A raster of squares stores the largest height of the ground and its boulders in each square. The squares of the next
 coarser level of the raster are twice as wide. The search follows the rays of a block downwards, layer by layer. If the
@@ -107,10 +107,10 @@ def _highest(tops, x0, x1, y0, y1):
 
 @njit(**WITHOUT_COUNTS)
 def begin_m(tops, ground, origin, basis, rectangle):
-    """Height at which the rays through a rectangle of the image may begin, metres; inf if not all rays fall.
+    """Height at which the rays through a rectangle of the image may begin, metres.
 
-    Above this height, no ray through the rectangle (u0, u1, v0, v1), pixels, hits anything. The ray at image
-    coordinates (u, v) is u basis[0] + v basis[1] + basis[2].
+    Above this height, no ray through the rectangle (u0, u1, v0, v1), pixels, hits anything. The height is inf if not
+    all rays fall. The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2].
     """
     u0, u1, v0, v1 = rectangle
     x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf
@@ -142,10 +142,11 @@ def begin_m(tops, ground, origin, basis, rectangle):
 
 @njit(**WITHOUT_COUNTS)
 def only_part(ground, origin, basis, rectangle, begin):
-    """The part of the mesh in which all rays through a rectangle stay, from a height down to the lowest ground.
+    """The part of the mesh in which all rays through a rectangle of the image stay.
 
-    0 is the inner square, 1 to 4 are the sectors; -1 if the rays cross several parts, or if not all rays fall. `begin`
-    is the height, metres; the other arguments are those of `begin_m`.
+    The rays are followed from the height `begin`, metres, down to the lowest ground. 0 is the inner square, 1 to 4 are
+    the sectors. The result is -1 if the rays cross several parts, or if not all rays fall. The other arguments are as
+    in `begin_m`.
     """
     u0, u1, v0, v1 = rectangle
     if begin > min(ground.highest_m, origin[2]):

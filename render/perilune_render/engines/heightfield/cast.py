@@ -283,9 +283,10 @@ def first_hit(ground, rocks, horizon, ray, span):
 
 @njit(**INLINED)
 def first_hit_in_part(ground, rocks, part, ray, span):
-    """Like `first_hit` without horizon, for a ray that stays in one part of the mesh from t0 to the lowest ground.
+    """Like `first_hit` without horizon, for a ray that stays in one part of the mesh.
 
-    The borders of the parts are not tested. The ray must fall and begin below the highest ground.
+    The borders of the parts are not tested. From t0, the ray must fall, begin below the highest ground, and stay in the
+    part down to the lowest ground.
     """
     piece = span[0], min(span[1], (ground.lowest_m - ray.z) / ray.dz)
     if part == 0:

@@ -1,4 +1,4 @@
-"""Intersect a ray with the contents of one cell of the mesh: its two triangles and the boulders that touch it.
+"""Intersect a ray with the contents of a mesh cell: two triangles and the boulders that touch it.
 
 Over a triangle, the ray's height above the ground is linear. The ray crosses the ground where this height changes
 sign, so no ray slips between two triangles. A boulder is convex, so it is an intersection of half-spaces.
@@ -54,7 +54,7 @@ class Ray(NamedTuple):
 
 @njit(**WITHOUT_COUNTS)
 def enters_rock(rows, planes, k, ray, span):
-    """Parameter at which a ray enters boulder k within span, (t0, t1), and the face through which it enters.
+    """Parameter within span, (t0, t1), at which a ray enters boulder k, and the face that it enters.
 
     Returns inf and -1 if the ray does not enter it. `rows` and `planes` are the fields of `Rocks`.
     """
@@ -109,7 +109,7 @@ def first_rock(rocks, cell, ray, span):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def crossing(above_0, above_1, t0, t1):
-    """Parameter at which a height above a triangle, linear from t0 to t1, changes sign; inf if it keeps its sign."""
+    """Parameter at which a height that is linear from t0 to t1 changes sign; inf if it keeps its sign."""
     if (above_0 > 0) == (above_1 > 0):
         return np.inf
     return t0 + (t1 - t0) * above_0 / (above_0 - above_1)
@@ -117,9 +117,9 @@ def crossing(above_0, above_1, t0, t1):
 
 @njit(**INLINED)
 def cross_inner(ground, row, column, ray, span):
-    """Where a ray crosses the triangles of a cell of the inner square: parameter and triangle, or inf and -1.
+    """Where a ray crosses the triangles of a cell of the inner square: parameter and triangle.
 
-    `ray` is in cells: x is a column, y a row, z a height in metres.
+    Returns inf and -1 without a crossing. `ray` is in cells: x is a column, y a row, z a height in metres.
     """
     vertex, n, (t0, t1) = ground.vertex, ground.n_half, span
     p0, dp, q0, dq = ray.x, ray.dx, ray.y, ray.dy
@@ -158,9 +158,10 @@ def cross_inner(ground, row, column, ray, span):
 
 @njit(**INLINED)
 def cross_sector(ground, side, cell, ray, span):
-    """Where a ray crosses the triangles of a cell (ring, spoke) of a sector: parameter and triangle, or inf and -1.
+    """Where a ray crosses the triangles of a cell (ring, spoke) of a sector: parameter and triangle.
 
-    `ray` is in the sector's coordinates: x is `along`, y is d, z a height, metres.
+    Returns inf and -1 without a crossing. `ray` is in the sector's coordinates: x is `along`, y is d, z a height,
+    metres.
     """
     vertex, half_widths, n, (t0, t1) = ground.vertex, ground.half_widths_m, ground.n_half, span
     ring, spoke = cell

@@ -78,7 +78,7 @@ class HeightfieldEngine:
     def render(
         self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0
     ) -> Radiance:
-        """Render one frame: mean radiance factor of each pixel; depth and normal of the ray through its centre.
+        """Render one frame: mean radiance factor of each pixel, depth and normal of its central ray.
 
         `approach_deg` is not used, since the ground is one mesh.
         """
@@ -146,7 +146,10 @@ class HeightfieldEngine:
             cast(each)
 
     def _horizon_now(self) -> Horizon:
-        """The horizon for a frame, or `NOWHERE` while computing it would not save time. Frames do not depend on it."""
+        """The horizon, or `NOWHERE` while computing it would not save time.
+
+        Frames do not depend on the horizon.
+        """
         self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
         if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
             self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))
@@ -154,6 +157,9 @@ class HeightfieldEngine:
 
 
 def rays_of(camera: Camera) -> Array:
-    """Basis (3, 3) of the rays of a camera without distortion: change per pixel of u and of v, ray at u = v = 0."""
+    """Basis (3, 3) of the rays of a camera without distortion.
+
+    The rows are the change of the ray per pixel of u, the change per pixel of v, and the ray at u = v = 0.
+    """
     start, right, down = camera.rays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     return np.stack([right - start, down - start, start])

@@ -98,7 +98,7 @@ def _widened(raster: np.ndarray) -> np.ndarray:
 
 @njit(**WITHOUT_COUNTS)
 def _fill(ground, raster, steepest, turned, steep):
-    """Write into `raster.clear_m` the highest point of each square, and into `steep` whether the square is rough.
+    """Write the highest point of each square into `raster.clear_m`, and into `steep` if it is rough.
 
     A square is rough if it touches a cell with a boulder or a steep facet. A facet is steep if its slope is larger than
     `steepest` along any direction near the Sun's azimuth; `turned` is the sine of the largest angle to the azimuth.
@@ -112,7 +112,10 @@ def _fill(ground, raster, steepest, turned, steep):
 
 @njit(**WITHOUT_COUNTS)
 def _add_cell(ground, raster, cell, steepest, turned, steep):
-    """Add one cell to all squares that its bounding box touches (along and across the Sun's azimuth); see `_fill`."""
+    """Add one cell to all squares that its bounding box touches; see `_fill`.
+
+    The sides of the box are along and across the Sun's azimuth.
+    """
     (part, row, column), n, half, highest = cell, ground.n_half, ground.half_widths_m, raster.clear_m
     v0, v1 = vertex_index(part, row, column, 0, n), vertex_index(part, row, column, 1, n)
     v2, v3 = vertex_index(part, row, column, 2, n), vertex_index(part, row, column, 3, n)
@@ -152,7 +155,7 @@ def _add_cell(ground, raster, cell, steepest, turned, steep):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _against(first, second, turned):
-    """Upper bound on a triangle's slope along directions near the axis a, from two of its edges (a, b, z)."""
+    """Upper bound on a triangle's slope along directions near the axis a, from two edges (a, b, z)."""
     (a1, b1, z1), (a2, b2, z2) = first, second
     area = a1 * b2 - a2 * b1
     slope_a, slope_b = (z1 * b2 - z2 * b1) / area, (a1 * z2 - a2 * z1) / area

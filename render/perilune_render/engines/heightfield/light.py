@@ -71,7 +71,10 @@ def _factors(p: HapkeParameters) -> _Factors:
 
 
 def disc_places(drawn: np.ndarray, radius_rad: np.float32) -> np.ndarray:
-    """Uniform points (..., 2) on the Sun's disc at unit distance, from uniform random numbers (..., 2), float32."""
+    """Uniform points (..., 2) on the Sun's disc at unit distance, float32.
+
+    `drawn` (..., 2) are uniform random numbers.
+    """
     points = np.empty(drawn.shape, np.float32)
     _fill_disc(drawn, radius_rad, points)
     return points

@@ -1,4 +1,4 @@
-"""Boulders for casting rays: convex rocks as half-spaces, and the boulders in each cell of the ground."""
+"""Boulders for casting rays: convex rocks as half-spaces, and the boulders in each ground cell."""
 
 from typing import NamedTuple
 
@@ -58,9 +58,10 @@ def rocks_of(scene: Scene) -> tuple[Rocks, tuple[np.ndarray, np.ndarray]]:
 def cells_of_rocks(
     rows: Array, n_half: int, half_widths_m: Array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """`cell_start` and `cell_rock` for boulders with these `Rocks.rows`, and the highest boulder in each cell.
+    """The boulders in each cell, for boulders with these `Rocks.rows`.
 
-    The heights are two arrays, metres: inner square (2 n, 2 n) and sectors (4, R, 2 n), float32.
+    Returns `Rocks.cell_start`, `Rocks.cell_rock`, and the height of the highest boulder in each cell of the inner
+    square (2 n, 2 n) and of the sectors (4, R, 2 n), metres, float32.
     """
     n, n_rings = n_half, len(half_widths_m) - 1
     inner, sectors = np.full((2 * n, 2 * n), -np.inf, np.float32), np.full((4, n_rings, 2 * n), -np.inf, np.float32)
@@ -75,10 +76,11 @@ def cells_of_rocks(
 
 @njit()
 def _fill(rows, n, half_widths, tops, position, numbers):
-    """Write the boulders of each cell into `numbers`, starting at the cell's `position`, and advance this position.
+    """Write the boulders of each cell into `numbers`, or count them if `numbers` is empty.
 
-    If `numbers` is empty, only add the number of boulders of each cell to `position`. Also raise `tops`, the largest
-    heights of the cells of the inner square and of the sectors, to the highest boulder of each cell.
+    `position` is the index in `numbers` of the next boulder of each cell, and is advanced. Without `numbers`, it counts
+    the boulders of each cell. `tops`, the largest heights of the cells of the inner square and of the sectors, is
+    raised to the highest boulder of each cell.
     """
     (inner, sectors), write = tops, len(numbers) > 0
     step = half_widths[0] / n

@@ -97,9 +97,9 @@ def _normal(vertices, k):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _corners(ground, facet, x, y):
-    """Vertices of a triangle, edges from its first vertex, z of their cross product, and weights at (x, y).
+    """Vertices of a triangle, edges from its first vertex, z of their cross product, two weights.
 
-    The weights belong to the second and third vertex.
+    The weights are those of the second and third vertex at (x, y).
     """
     n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
     part, row, column = facet.part, facet.row, facet.column
@@ -139,11 +139,11 @@ def ground_at(ground, facet, x, y):
 
 @njit(**INLINED)
 def lift_at(ground, facet, x, y):
-    """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle at (x, y), metres.
+    """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle, metres.
 
-    The vector points along the interpolated normal. Its length is the larger of two heights. The first is the height of
-    the lowest tangent plane of the vertices, each shifted until the triangle is below it. The second is half the height
-    of a quadratic patch with these vertex normals.
+    The ray starts at (x, y). The vector points along the interpolated normal, and its length is the larger of two
+    heights. The first is the height of the lowest tangent plane of the vertices, each shifted until the triangle is
+    below it. The second is half the height of a quadratic patch with these vertex normals.
     """
     vertices = ground.vertex
     v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, facet, x, y)
@@ -292,9 +292,9 @@ def _read_ahead(ground, horizon, x, y):
 
 @njit(**WITHOUT_COUNTS)
 def see(ground, rocks, tops, view, tile):
-    """Cast the rays of a tile, and a shadow ray from each hit that may be dark; write the results into the tile.
+    """Render a tile: cast its rays, and a shadow ray from each hit that may be dark.
 
-    `tops` determines the height at which the rays of a block of pixels begin.
+    The results are written into the arrays of the tile. `tops` determines where the rays of a block of pixels begin.
     """
     n_samples, height, width, _ = tile.moved.shape
     origin, basis, (first_row, first_column) = view.origin, view.basis, tile.first

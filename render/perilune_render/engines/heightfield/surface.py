@@ -1,4 +1,4 @@
-"""The ground as arrays for casting rays: heights, vertex normals, albedo, and a pyramid of largest heights.
+"""The ground as arrays for casting rays: heights, normals, albedo, and a pyramid of largest heights.
 
 Blender renders the same mesh: `Grid.quads`, each quad split from its first to its third vertex. The mesh has two kinds
 of parts:
@@ -184,7 +184,7 @@ def _raise_to_ground(height, n, inner_top, sector_top):
 
 @njit()
 def _add_face(cell, n, half_widths, height, points, total):
-    """Add the normal of a cell to `total` (V, 3) at each of its vertices, weighted by the angle at the vertex.
+    """Add the normal of a cell to `total` (V, 3) at each vertex, weighted by the angle there.
 
     `cell` is (part, row, column); `points` (4, 3) is overwritten.
     """
