@@ -151,7 +151,7 @@ def regenerate(
         Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
     ] = None,
 ) -> None:
-    """Render frames from a manifest and compare them with its hashes. Exit code 2 if frames or ground differ."""
+    """Render frames from a manifest and compare them with its hashes; exit code 2 on a difference."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = ps.open_dataset(manifest)
@@ -197,7 +197,7 @@ def preview(
         "preview.png"
     ),
 ) -> None:
-    """Render a contact sheet of a configuration, with and without labels, and a map of its site, in seconds."""
+    """Render in seconds a contact sheet of a configuration, with and without labels, and a site map."""
     if poses is None and (scene is not None or camera is not None or camera_axes is not None):
         raise UserError("preview", "--scene, --camera or --camera-axes", "no --poses", "--poses as well")
     if scene is not None and config is not None:

@@ -57,7 +57,7 @@ def serve(
         typer.Option(min=1, max=2**31, help="Number of scenes from which clients of `perilune_shared.client` choose."),
     ] = 1,
 ) -> None:
-    """Serve images from any pose over a scene to clients of PANGU's protocol and of `perilune_shared.client`."""
+    """Serve images from any pose over a scene to PANGU clients and to `perilune_shared.client`."""
     config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True)
     if config.cameras:
         expected = "null: the server has one dataset.camera"

@@ -1,4 +1,4 @@
-"""Compiled loops over craters and pixels: selection, visible and sunlit share, contrast, crater index."""
+"""Compiled loops over craters and pixels: selection, visible share, sunlit share, contrast, index."""
 
 from typing import NamedTuple
 

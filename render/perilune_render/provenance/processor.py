@@ -1,4 +1,4 @@
-"""Settings with which numerical libraries compute equal digits on all x86-64 processors with AVX2 and FMA.
+"""Settings with which numerical libraries compute equal digits on all x86-64 CPUs with AVX2 and FMA.
 
 NumPy, OpenBLAS, OpenCV and numba select their code by the processor, and OpenBLAS also by the number of threads. Both
 choices change the last digits. The libraries read these environment variables when they are loaded, so
