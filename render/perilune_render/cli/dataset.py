@@ -218,7 +218,7 @@ def _run_job(job: "Job", out: Store, options: JobOptions, early: "Worker | None"
 
 
 def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
-    """Like `_run_job`, but print the failed trajectories and exit with code 1."""
+    """Like `_run_job`, but if trajectories failed, print them and exit with code 1."""
     from perilune_render.jobs.run import RenderingFailed
 
     try:

@@ -105,7 +105,7 @@ def plan(
     ] = None,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
+    """Write the plan of a dataset as a manifest without frames, with the hash of every generated scene."""
     from perilune_render.dataset.manifest_only import write_left_out_frames, write_manifest_only
 
     if manifest is not None:
@@ -197,7 +197,7 @@ def preview(
         "preview.png"
     ),
 ) -> None:
-    """Render in seconds a contact sheet of a configuration, with and without labels, and a site map."""
+    """Render frames of a configuration as a contact sheet, and a map of the landing site, in seconds."""
     if poses is None and (scene is not None or camera is not None or camera_axes is not None):
         raise UserError("preview", "--scene, --camera or --camera-axes", "no --poses", "--poses as well")
     if scene is not None and config is not None:

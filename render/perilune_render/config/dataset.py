@@ -27,7 +27,8 @@ from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.labels.thresholds import default_label_bound_px
 
 MAX_TRAJECTORIES, MAX_FRAMES = 200_000, 10_000_000
-"""Largest numbers of trajectories and frames of a dataset; all trajectories are planned before the first frame."""
+"""Largest numbers of trajectories and frames of a dataset. They are limited because all trajectories are planned before
+the first frame is rendered."""
 MAX_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
 _MIN_LIMIT_SIGMAS = 3.0
@@ -51,13 +52,13 @@ class FlightConfig(Section):
     position_sigma_m: Deviation = 8.0
     """Standard deviation of the position from the nominal parabola, per axis, metres."""
     attitude_sigma_deg: Annotated[float, Field(ge=0, le=90)] = 0.3
-    """Standard deviation of the attitude from level, per axis, degrees."""
+    """Standard deviation of the attitude from a level attitude, per axis, degrees."""
     correlation_time_s: Seconds = 3.0
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
     attitude_correlation_time_s: Seconds | None = None
     """Correlation time of the perturbation of the attitude, seconds; null takes correlation_time_s."""
     max_perturbation_mps2: Annotated[float, Field(gt=0, le=1000)] | None = None
-    """Largest acceleration due to the perturbation of the position, metres per second squared; null for no limit."""
+    """Largest acceleration by the perturbation of the position, metres per second squared; null for no limit."""
 
     @model_validator(mode="after")
     def _end_below_start(self) -> "FlightConfig":
@@ -128,11 +129,11 @@ class KindConfig(Section):
     test_share: Share = 0.1
     """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 puts all of them into it."""
     flight: FlightConfig = FlightConfig()
-    """Trajectories."""
+    """Shape and perturbations of the trajectories."""
     sun: SunConfig = SunConfig()
     """Direction of the Sun."""
     instruments: InstrumentsConfig = InstrumentsConfig()
-    """Measurements other than frames."""
+    """Simulated inertial and range measurements."""
 
     @model_validator(mode="after")
     def _fits(self) -> "KindConfig":
@@ -168,7 +169,7 @@ class LightConfig(Section):
     photometry: Literal["hapke_highland", "hapke_mare", "hapke_mean", "lommel_seeliger", "lunar_lambert", "lambert"] = (
         "hapke_highland"
     )
-    """Reflectance law and parameter set."""
+    """Reflectance law of the ground, with its parameters."""
     sun_angular_diameter_deg: Annotated[float, Field(ge=0, le=5)] = 0.533
     """Angular diameter of the Sun, degrees."""
     albedo_variation: Annotated[float, Field(ge=0, le=10)] = 1.0
@@ -204,7 +205,7 @@ class SensorConfig(Section):
     black_level_share: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
     """Offset added before quantisation, share of the largest grey value."""
     read_noise_e: Electrons = 15.0
-    """Standard deviation of the dark signal, electrons."""
+    """Read noise: standard deviation of the dark signal without dark current, electrons."""
     dark_current_e_per_s: Electrons = 50.0
     """Mean dark current, electrons per second."""
     dark_nonuniformity_e: Electrons = 3.0
@@ -212,7 +213,7 @@ class SensorConfig(Section):
     gain_nonuniformity: Annotated[float, Field(ge=0, le=0.5)] = 0.005
     """Standard deviation of the pixels' fixed relative response (PRNU)."""
     hot_pixel_share: Share = 2e-5
-    """Share of hot pixels."""
+    """Share of hot pixels, which have an extra dark signal."""
     hot_pixel_e: Electrons = 6_000.0
     """Mean extra signal of the hot pixels in a 2 ms exposure (exponential distribution), electrons."""
     psf_sigma_px: Annotated[float, Field(ge=0, le=50)] = 0.45
@@ -285,7 +286,7 @@ class DatasetConfig(Section):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     """Random seed; with the name it determines every random stream."""
     shared_terrain: bool = False
-    """Whether both kinds use the same scenes, as in the paper; otherwise each kind has its own."""
+    """Whether the datasets `detect` and `nav` use the same scenes, as in the paper, or each has its own scenes."""
     camera: CameraConfig = CameraConfig()
     """The lander's single camera."""
     cameras: dict[CameraName, MountedCameraConfig] = Field(default_factory=dict)

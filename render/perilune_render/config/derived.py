@@ -22,7 +22,7 @@ class SurveyConfig(Section):
     pixel_m: Annotated[float, Field(gt=0, le=1000)] = 0.6
     """Size of a pixel on level ground straight below the camera, metres."""
     convergence_deg: Annotated[float, Field(ge=5, le=60)] = 30.0
-    """Angle between the camera axes, degrees; a wider angle gives better heights but less overlap."""
+    """Angle between the camera axes, degrees. A wider angle gives more accurate heights but less overlap."""
     sun_azimuth_offset_deg: Annotated[float, Field(ge=-180, le=180)] = 90.0
     """Azimuth of the Sun, clockwise from the Sun's azimuth in the other dataset, degrees."""
     sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0

@@ -64,7 +64,7 @@ class FlashLidarConfig(Section):
     range_sigma_share: Share = 0.0
     """Standard deviation that is added in proportion to the range, share of the range."""
     quantisation_m: Deviation = 0.01
-    """Step of the ranges, metres; 0 for none."""
+    """Step to which ranges are rounded, metres; 0 for no rounding."""
     max_range_m: Length = 2000.0
     """Largest range that the lidar measures, metres."""
     threshold_range_m: Length = 1500.0

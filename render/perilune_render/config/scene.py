@@ -24,9 +24,9 @@ class SceneConfig(Section):
     """One scene with given poses, in place of drawn scenes and descents."""
 
     sun_azimuth_deg: Annotated[float, Field(ge=-720, le=720)] = 90.0
-    """Azimuth of the Sun, clockwise from north, degrees; a column of the poses overrides it."""
+    """Azimuth of the Sun, clockwise from north, degrees; a column of the file of poses overrides it."""
     sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
-    """Elevation of the Sun above the ground plane, degrees; a column of the poses overrides it."""
+    """Elevation of the Sun above the ground plane, degrees; a column of the file of poses overrides it."""
     views: tuple[ViewConfig, ...] = ()
     """Views for which the ground is made, from the lowest to the highest. They determine the extent of the ground and
     its vertex spacing at each distance from the site. By default, they are derived from the poses."""

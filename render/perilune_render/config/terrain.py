@@ -63,7 +63,7 @@ class ReliefConfig(Section):
     rms_slope_deg: Annotated[Span, Within(0, 30)] = Span(low=2.0, high=4.5)
     """RMS slope over wavelengths down to 1 m, without craters, drawn for each scene, degrees."""
     longest_wavelength_m: Length = 1600.0
-    """Longest wavelength, metres."""
+    """Longest wavelength of the relief, metres."""
 
     @model_validator(mode="after")
     def _slope_in_range(self) -> "ReliefConfig":
@@ -144,7 +144,7 @@ class ElevationConfig(Section):
     allow_unseen: bool = False
     """Whether to accept a model that has no heights within the ground in view."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
-    """Columns of the catalogue."""
+    """Columns of the crater catalogue."""
     rims: RimSource = "measured"
     """Source of position and size of a catalogue's craters: measured in the model where a rim is found there, or
     always taken from the catalogue."""
@@ -180,7 +180,7 @@ class TerrainConfig(Section):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing, as a multiple of the smallest ground size of a pixel at that point."""
+    """Vertex spacing at a point of the ground, as a multiple of the smallest pixel size on the ground there."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
     """Largest number of ground vertices of one mesh (about 450 bytes of memory per vertex). If the ground needs more,
     each trajectory is rendered with several meshes, each for a range of altitudes; the ground may then have up to ten

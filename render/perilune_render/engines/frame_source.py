@@ -189,7 +189,10 @@ class FrameSource:
         return depth_m * np.stack(turned, axis=-1) + position[rows.row]
 
     def develop(self, shot: Shot, radiance: Radiance) -> Frame:
-        """Develop the rendering of a shot. Another thread may do this while the engine renders the next shot."""
+        """Apply the sensor model to the rendering of a shot.
+
+        Another thread may do this while the engine renders the next shot.
+        """
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
         turn = shot.angular_velocity_radps
         exposure = expose(radiance, self.sensor, self.camera, self.engine.camera, velocity, turn)
@@ -209,7 +212,7 @@ class FrameSource:
         return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, grey)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
-        """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32, -1 for none."""
+        """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32; -1 without a crater."""
         circles = self._seen_circles(frame.shot)
         return crater_index(circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
 

@@ -30,7 +30,7 @@ _STRETCH = 1.5
 _MIN_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
 _FAINT_E = 100.0
-"""Signal above which a rounded Gaussian approximates Poisson noise, ten times faster, electrons."""
+"""Signal above which a rounded Gaussian approximates Poisson noise, electrons. It takes a tenth of the time."""
 HOT_PIXEL_S = 0.002
 """Exposure time to which `hot_pixel_e` refers, seconds; the signal is proportional to the exposure time."""
 

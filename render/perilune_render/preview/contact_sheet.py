@@ -35,10 +35,10 @@ _N_FRAMES = 4
 def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, map_path: Path) -> None:
     """Write a contact sheet of the first trajectory in the first scene, and a map of this scene.
 
-    The frames are evenly spaced in time. Below the frames of each camera, they are repeated with labels and, if there
-    is an elevation model, its outline. The map shows the trajectories over this ground. Prints a warning for each Sun
-    that leaves the site in shadow. Raises UserError if the engine is not installed or if poses do not fit the ground;
-    `where` names the source of the poses in the message.
+    The frames are evenly spaced in time. Each frame is shown twice: without labels, and with labels and the outline of
+    the elevation model, if there is one. The map shows all trajectories over the scene's ground. Prints a warning for
+    each Sun that leaves the site in shadow. Raises UserError if the engine is not installed or if poses do not fit the
+    ground; `where` names the source of the poses in the message.
     """
     check_installed(config.render.engine)
     scene_plan = plan.scenes[0]

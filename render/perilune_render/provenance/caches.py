@@ -54,8 +54,8 @@ def _has_home() -> bool:
 def machine_code_folder() -> Path:
     """The cache folder of the machine code for the current versions of the compiled functions.
 
-    The folder is in NUMBA_CACHE_DIR if this variable is set, else in `cache_home()`. Removes the least recently used
-    folders of other versions. If the folder cannot be written, a temporary folder is used.
+    The folder is in NUMBA_CACHE_DIR if this variable is set, else in `cache_home()`. Removes all but the _KEPT most
+    recently used folders. If the folder cannot be written, a temporary folder is used.
     """
     parent = _kernels()
     folder = parent / f"perilune-{_kept('compiled', lambda: fingerprint(*compiled_functions())).sha256[:16]}"

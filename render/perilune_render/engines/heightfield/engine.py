@@ -31,7 +31,7 @@ _RAYS_AT_ONCE = 8192
 _LIT = 1e-4
 """Radiance factor above which a pixel counts as sunlit."""
 _RAYS_PER_VERTEX = 0.3
-"""Rays per ground vertex after which the horizon is computed. For fewer rays, this takes more time than it saves."""
+"""Rays per ground vertex after which the horizon is computed. For fewer rays, this would take longer than it saves."""
 
 
 class HeightfieldEngine:

@@ -98,7 +98,7 @@ def _widened(raster: np.ndarray) -> np.ndarray:
 
 @njit(**WITHOUT_COUNTS)
 def _fill(ground, raster, steepest, turned, steep):
-    """Write the highest point of each square into `raster.clear_m`, and into `steep` if it is rough.
+    """Write the largest height of each square into `raster.clear_m`, and mark rough squares in `steep`.
 
     A square is rough if it touches a cell with a boulder or a steep facet. A facet is steep if its slope is larger than
     `steepest` along any direction near the Sun's azimuth; `turned` is the sine of the largest angle to the azimuth.

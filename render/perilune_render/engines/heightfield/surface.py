@@ -67,7 +67,7 @@ class Surface:
     """Ground and boulders of a scene."""
 
     ground: Ground
-    """Ground."""
+    """Arrays of the ground."""
     rocks: Rocks
     """Boulders, and the cells that each touches."""
     centre_m: tuple[float, float]
