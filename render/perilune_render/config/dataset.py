@@ -286,7 +286,7 @@ class DatasetConfig(Section):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     """Random seed; with the name it determines every random stream."""
     shared_terrain: bool = False
-    """Whether the datasets `detect` and `nav` use the same scenes, as in the paper, or each has its own scenes."""
+    """Whether the datasets `detect` and `nav` use the same scenes, as in the paper; if not, each has its own."""
     camera: CameraConfig = CameraConfig()
     """The lander's single camera."""
     cameras: dict[CameraName, MountedCameraConfig] = Field(default_factory=dict)
