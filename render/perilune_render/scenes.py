@@ -137,7 +137,7 @@ class Scene:
         every = (*(f"dataset.{name}={value}" for name, value in changes.items()), *settings)
         if isinstance(source, Dataset) or (Path(source) / "dataset.json").is_file() or "://" in str(source):
             if seed is not None or settings:
-                raise UserError("Scene", "seed and settings", "given", "neither: a dataset has its own")
+                raise UserError("Scene", "seed and settings", "given", "neither, since both come from the dataset")
             dataset = source if isinstance(source, Dataset) else open_single(source)
             self.name = str(dataset.store)
             self._simulated = _simulation_of(dataset, sun_azimuth_deg, sun_elevation_deg, engine)

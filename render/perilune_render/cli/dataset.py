@@ -84,7 +84,7 @@ class JobOptions:
         matched = re.fullmatch(r"([1-9]\d{0,6})/([1-9]\d{0,6})", shard) if shard is not None else None
         numbers = (int(matched[1]), int(matched[2])) if matched is not None else None
         if shard is not None and (numbers is None or numbers[0] > numbers[1]):
-            raise UserError("--shard", "", shard, "its number and the count of shards, from 1/64 to 64/64")
+            raise UserError("--shard", "", shard, "a number and the count of shards, such as 3/64")
         if address is not None and executor != "ray":
             raise UserError("--address", "", executor, "--executor ray, which connects to that cluster")
         if workers == 0 and executor == "ray":
