@@ -1,7 +1,7 @@
 """The scenes of a server: scene 0 of the configuration, and further scenes that clients request by number.
 
-A separate thread generates further scenes, one after another, while frames are rendered. A client has at most one scene
-in this queue. The most recently used scenes stay in memory.
+A separate thread generates the further scenes, one after another, while frames are rendered. Each client has at most
+one scene in its queue. The most recently used scenes stay in memory.
 """
 
 import queue
@@ -23,9 +23,9 @@ _STREAM = "served"
 
 
 def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
-    """Random seed and Sun of a further scene, from 1; the Sun is drawn from `dataset.nav.sun`.
+    """Random seed and Sun of the further scene `number`, from 1; the Sun is drawn from `dataset.nav.sun`.
 
-    The seed is derived as for the scenes of a dataset, but from another name, so that no dataset has this terrain.
+    The seed differs from the seeds of all scenes in datasets, so that no dataset has this terrain.
     """
     return drawn_scene(config, config.nav.sun, _STREAM, number)
 
@@ -58,11 +58,11 @@ class Grounds:
         self._kept.clear()
 
     def simulated(self, number: int, client: object) -> SimulatedScene | None:
-        """The simulated scene of a number, or None if it is not in memory yet.
+        """The simulated scene `number`, or None if it is not in memory yet.
 
-        After None, call again: the scene is being generated or queued, unless another scene of the client or
-        MAX_WAITING scenes are queued. Raises UserError for a number that the server does not have, and the original
-        error if generation failed.
+        If the result is None, call again later: the scene is in the queue, or enters it at a later call, since the
+        client already has a scene in the queue or the queue holds MAX_WAITING scenes. Raises UserError if the server
+        has no scene of this number, and the original error if the scene could not be generated.
         """
         if number >= self.n_scenes:
             raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")
@@ -87,7 +87,7 @@ class Grounds:
         return simulated
 
     def _collect(self) -> None:
-        """Take over generated scenes, and drop the least recently used scenes."""
+        """Take generated scenes out of the thread's results, and drop the least recently used scenes."""
         while not self._made.empty():
             number, result = self._made.get()
             del self._waiting[number]
@@ -99,7 +99,7 @@ class Grounds:
             self._kept[number] = result
 
     def _generate(self) -> None:
-        """The thread that generates scenes."""
+        """Generate requested scenes; the body of the thread."""
         while True:
             number = self._asked.get()
             try:
