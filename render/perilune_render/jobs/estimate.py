@@ -125,11 +125,11 @@ def _thinned(trajectory: TrajectoryPlan) -> TrajectoryPlan:
         trajectory,
         frame_index=tuple(trajectory.frame_index[i] for i in indices),
         splits=tuple(trajectory.splits[i] for i in indices),
-        draw_flight=partial(_same, thinned),
+        draw_flight=partial(_identity, thinned),
     )
 
 
-def _same(flight: Flight) -> Flight:
+def _identity(flight: Flight) -> Flight:
     return flight
 
 

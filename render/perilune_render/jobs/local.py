@@ -69,7 +69,7 @@ class LocalWorkers:
                     raise UserError(self._job.where, scene_id, asked[-1].how_ended, expected)
                 asked.append(ready[0])
                 ready[0].send("grow", scene_id)
-            for worker in self._heard():
+            for worker in self._wait_for_messages():
                 message = self._receive(worker)
                 if message is not None and message[0] == "grown":
                     worker.scene_id = scene_id
@@ -90,7 +90,7 @@ class LocalWorkers:
             for worker in list(self._workers.values()):
                 if worker.ready and worker.trajectory is None:
                     self._hand_out(worker, work, report)
-            for worker in self._heard():
+            for worker in self._wait_for_messages():
                 self._handle(worker, self._receive(worker), work, report)
 
     def _hand_out(self, worker: Worker, work: WorkList, report: Report) -> None:
@@ -118,7 +118,7 @@ class LocalWorkers:
                 report.failed(index, error, work.failed(index, error))
                 self._end(worker)
 
-    def _heard(self) -> list[Worker]:
+    def _wait_for_messages(self) -> list[Worker]:
         """Workers that have sent a message or ended; waits for at least one."""
         ready = wait(self._workers)
         return [worker for connection, worker in self._workers.items() if connection in ready]

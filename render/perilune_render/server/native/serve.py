@@ -36,7 +36,7 @@ class Native:
     """Function that is called with one line for each error that is not caused by a client."""
     interfaces: list[Interface] = field(default_factory=list)
     """All interfaces of the server, for the health request."""
-    _places: set[Connection] = field(default_factory=set)
+    _admitted: set[Connection] = field(default_factory=set)
     """Admitted clients: at most `limits.clients`, each from its first request until it disconnects."""
 
     def interface(self, host: str, port: int) -> Interface:
@@ -53,24 +53,24 @@ class Native:
         await zmtp.greet(connection)
         try:
             while True:
-                message = await zmtp.receive(connection, lambda: self._has_place(connection))
+                message = await zmtp.receive(connection, lambda: self._admit(connection))
                 connection.has_asked = True
                 empty = [b""] if message.n_parts > 1 and message.kept[:1] == [b""] else []
                 await zmtp.send(connection, [*empty, *await self._reply(connection, message, len(empty))])
         finally:
-            self._places.discard(connection)
+            self._admitted.discard(connection)
 
-    def _has_place(self, connection: Connection) -> bool:
+    def _admit(self, connection: Connection) -> bool:
         """Admit a client if fewer than `limits.clients` are admitted; return whether it is admitted."""
-        if connection not in self._places and len(self._places) < self.limits.clients:
-            self._places.add(connection)
-        return connection in self._places
+        if connection not in self._admitted and len(self._admitted) < self.limits.clients:
+            self._admitted.add(connection)
+        return connection in self._admitted
 
     async def _reply(self, connection: Connection, message: zmtp.Message, n_empty: int) -> list[bytes]:
         if message.n_parts != 1 + n_empty:
             return refusal(f"message: got {message.n_parts} parts, expected an empty one and JSON")
         # A server with the largest number of clients still answers health requests.
-        if not message.is_whole or (message.kept[-1] != HEALTH and not self._has_place(connection)):
+        if not message.is_whole or (message.kept[-1] != HEALTH and not self._admit(connection)):
             return refusal(f"{self.limits.clients} clients are connected; try again", busy=True)
         try:
             reply = await connection.ask(lambda: answer(self.grounds, message.kept[-1], connection))
