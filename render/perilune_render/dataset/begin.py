@@ -77,7 +77,7 @@ def is_complete(store: Store) -> bool:
 
 
 def is_begun(store: Store) -> bool:
-    """Whether an address holds a dataset. Raises UserError if it holds something else."""
+    """Whether an address holds a dataset, finished or not. Raises UserError if it holds other files."""
     if store.folder is not None:
         others = [p.name for p in (store.folder.iterdir() if store.folder.exists() else ()) if not _is_work(p.name)]
     else:
@@ -102,7 +102,7 @@ def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
     Raises UserError if the address holds other files, or a dataset with other settings or code.
     """
     if not is_begun(store):
-        # Another process may start the same dataset at the same time.
+        # The file exists if another process has started the same dataset in the meantime.
         with contextlib.suppress(FileExistsError):
             store.write(INFO_NAME, info_bytes(info, store.at(INFO_NAME)))
     existing = open_dataset(store).info
@@ -152,7 +152,7 @@ def _without_releases(versions: dict[str, str]) -> dict[str, str]:
 
 
 def first_difference(recorded: object, requested: object, path: str = "") -> str:
-    """Name and both values of the first setting, in alphabetical order, that differs between two nested dicts."""
+    """Text with the name and both values of the first setting that differs between two nested dicts."""
     if isinstance(recorded, dict) and isinstance(requested, dict):
         for key in sorted({*recorded, *requested}):
             if recorded.get(key) != requested.get(key):

@@ -106,7 +106,7 @@ class Recorded(Sequence[TrajectoryPlan]):
     first: np.ndarray
     """Index of the first frame of each trajectory, then the total number of frames (n_trajectories + 1,)."""
     columns: dict[str, np.ndarray]
-    """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
+    """Columns of the table `frames`, ordered by trajectory, then by `frame_index`; arrays (n_frames, ...)."""
     settings: FlightConfig | None
     """Settings of the flights, from which the motion between frames is drawn; None if this motion is not needed."""
     rig: Rig

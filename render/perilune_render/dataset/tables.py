@@ -111,7 +111,7 @@ def scene_tables(
 
 
 def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
-    """Rows of the table `trajectories` for some trajectories."""
+    """Rows of the table `trajectories`."""
     nominal = [trajectory.flight.nominal for trajectory in trajectories]
     return _table(
         "trajectories",

@@ -28,7 +28,7 @@ class Job:
     def planned(cls, config: DatasetConfig, kind: Kind, preset: str) -> "Job":
         """The job to render the dataset `detect` or `nav` of a configuration.
 
-        `preset` is the name of the configuration in the recipe. Raises UserError on impossible settings.
+        `preset` is the preset on which the settings are based, for the recipe. Raises UserError on impossible settings.
         """
         plan = make_plan(config, kind)
         return cls(

@@ -74,7 +74,7 @@ class RunningRecord:
 
 
 def write_failure(store: Store, trajectory: str, error: str) -> None:
-    """Record the error of a trajectory that failed repeatedly; its name is such as scene-0000/trajectory-0000."""
+    """Record the error of a trajectory that failed repeatedly, by its name, such as scene-0000/trajectory-0000."""
     _write(store, f"failed/{trajectory.replace('/', '.')}", {"trajectory": trajectory, "error": error[:2000]})
 
 

@@ -96,7 +96,7 @@ class SceneRenderer:
         if self._opened is None or self._opened[0] != (scene_id, camera):
             note(f"{scene_id}: generating ground")
             self._opened = None
-            self._closing.close()  # the engine of another camera of the scene
+            self._closing.close()  # closes the engine of the previous camera
             scene, plan, config = self.grow(scene_id), self._job.scene(scene_id), self._job.config
             outputs = self._outputs_of(scene_id, scene, note)
             files = self._write_hazard(scene_id, scene, outputs)

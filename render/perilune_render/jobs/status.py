@@ -28,7 +28,7 @@ class Status:
     n_frames: int
     """Number of frames."""
     frames_done: int
-    """Number of frames in finished trajectories: their number times the mean number of frames per trajectory."""
+    """Number of frames in finished trajectories, estimated from the mean number of frames per trajectory."""
     running: tuple[str, ...]
     """Trajectories that are being rendered."""
     n_silent: int

@@ -58,8 +58,8 @@ class Connection:
     async def first(self, n_bytes: int) -> bytes:
         """The first bytes of a message.
 
-        Raises TimeoutError if no byte arrives in `limits.idle_s`, or if the other bytes do not arrive in
-        `limits.message_s` after it.
+        Raises TimeoutError if no byte arrives in `limits.idle_s`, or if the other bytes do not follow the first byte in
+        `limits.message_s`.
         """
         async with asyncio.timeout(self.limits.idle_s):
             begun = await self.reader.readexactly(1)

@@ -1,7 +1,7 @@
 """The scenes of a server: scene 0 of the configuration, and further scenes that clients request by number.
 
 A separate thread generates the further scenes, one after another, while frames are rendered. Each client has at most
-one scene in its queue. The most recently used scenes stay in memory.
+one scene in the queue. The most recently used scenes stay in memory.
 """
 
 import queue
@@ -60,9 +60,9 @@ class Grounds:
     def simulated(self, number: int, client: object) -> SimulatedScene | None:
         """The simulated scene `number`, or None if it is not in memory yet.
 
-        If the result is None, call again later: the scene is in the queue, or enters it at a later call, since the
-        client already has a scene in the queue or the queue holds MAX_WAITING scenes. Raises UserError if the server
-        has no scene of this number, and the original error if the scene could not be generated.
+        If the result is None, call again later. The call queues the scene, unless another scene of the client or
+        MAX_WAITING scenes are in the queue. Raises UserError if the server has no scene of this number, and the
+        original error if the scene could not be generated.
         """
         if number >= self.n_scenes:
             raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")

@@ -122,7 +122,7 @@ class Server:
                 _answer(*item)
         finally:
             if self._loop is not None:
-                with contextlib.suppress(RuntimeError):  # closed already
+                with contextlib.suppress(RuntimeError):  # the loop is already closed
                     self._loop.call_soon_threadsafe(self._ending.set)
             if self._thread is not None:
                 self._thread.join(_STOP_S)
@@ -306,6 +306,6 @@ def _answer(work: Callable[[], Any], future: "Future[Any]") -> None:
     except Exception as error:
         future.set_exception(error)
     except BaseException:
-        # KeyboardInterrupt would end the event loop with a traceback.
+        # Passed on as the result, KeyboardInterrupt would end the event loop with a traceback.
         future.set_exception(ConnectionAbortedError("the server ends"))
         raise

@@ -99,7 +99,7 @@ class SimulatedScene:
         velocity_mps: Array | None = None,
         angular_velocity_radps: Array | None = None,
     ) -> Frame:
-        """Render and develop a frame. The velocities blur it.
+        """Render and develop a frame, blurred by the velocities.
 
         Raises UserError like `check_view`, and if a velocity exceeds LARGEST_MPS or LARGEST_RADPS.
         """

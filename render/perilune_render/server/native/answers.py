@@ -91,10 +91,10 @@ ANSWERED_BY_CONNECTIONS: list[bytes] = []
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
-    """The parts of the reply to a request, also if the request is wrong. Called in the thread that renders.
+    """The parts of the reply to a request. Called in the thread that renders.
 
-    If the scene of the request is not in memory, the reply is `"ready": false` without arrays, and the scene is
-    generated. `client` identifies the client.
+    An invalid request gets a reply with an error message. If the scene of the request is not in memory, the reply is
+    `"ready": false` without arrays, and the scene is queued. `client` identifies the client in the queue.
     """
     try:
         request = _parsed(content)

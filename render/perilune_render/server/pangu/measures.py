@@ -29,7 +29,7 @@ def seen(
     if (length == 0).any():
         raise ValueError("a direction of length 0")
     surface_m = simulated.heights_m(origins_m[:, 0], origins_m[:, 1], boulders=boulders)
-    under = origins_m[:, 2] < surface_m  # off the ground the surface is NaN, so not below it
+    under = origins_m[:, 2] < surface_m  # false beyond the edge of the ground, where the surface is NaN
     origins = np.broadcast_to(origins_m, directions.shape)
     distance, normal = simulated.hits(origins, directions, boulders=boulders)
     cosine = -np.einsum("ij,ij->i", normal, directions) / length
