@@ -53,9 +53,11 @@ TERRAINS: dict[str, tuple[str, ...]] = {
     "highland": _HIGHLAND,
     "polar": (*_HIGHLAND, "dataset.terrain.latitude_deg=-85.0", "dataset.scene.sun_elevation_deg=5.0"),
 }
-"""Named terrains: settings over the preset `small`. `mare`: dark, gentle slopes, few boulders; `highland`: bright,
-slopes 2.4 times as steep, denser craters (both as in configs/); `polar`: highland ground at latitude -85 degrees, where
-the Sun's elevation is at most 6.5 degrees, with the Sun at 5 degrees."""
+"""Named terrains: settings that override the preset `small`.
+
+- `mare`: dark ground, gentle slopes, few boulders (configs/mare.yaml).
+- `highland`: bright ground, slopes 2.4 times as steep as in `mare`, denser craters (configs/highland.yaml).
+- `polar`: highland ground at latitude -85 degrees, where the Sun is never higher than 6.5 degrees; here it is at 5."""
 _BASE = "small"
 _CONFIGURATIONS = (".yaml", ".yml")
 
@@ -67,20 +69,24 @@ class RenderedFrame:
     image: np.ndarray
     """Grey values, DN (h, w): uint8, or uint16 above 8 bits."""
     depth_m: np.ndarray
-    """Depth along the line of sight of the camera, metres (h, w) float32, infinite for the sky. With lens distortion,
-    it has the pixels of the pinhole camera that covers the view."""
+    """Depth along the camera's axis, metres (h, w) float32, infinite for the sky. With lens distortion, its pixels
+    belong to a pinhole camera that covers the view, so its shape may differ from the shape of `image`."""
     labels: pd.DataFrame
-    """One row per crater, with the columns of the table `labels` and the crater's `depth_m` and `diameter_m`."""
+    """One row per crater, with the columns of the table `labels` except `frame_id`, and with the depth and diameter of
+    the crater, `depth_m` and `diameter_m`, metres."""
     pose: Pose
     """Pose of the camera."""
 
     def plot(self) -> "Picture":
-        """Return a picture with the ellipses of the labels: green if `visible` selects them, otherwise orange."""
+        """Return a picture of the frame with the ellipses of its labels.
+
+        Labels that the selection `visible` keeps are green, all others are orange.
+        """
         colours = [GREEN if each else ORANGE for each in selected(self.labels, SELECTIONS["visible"])]
         return with_ellipses(self.image, self.labels[ELLIPSE_COLUMNS].to_numpy(), colours)
 
     def show(self) -> None:
-        """Show the picture of `plot` in the notebook, or in the system's viewer."""
+        """Show the picture of `plot` in the notebook or in the system's image viewer."""
         display(self.plot())
 
     def __repr__(self) -> str:
@@ -89,11 +95,11 @@ class RenderedFrame:
 
 
 class Scene:
-    """Lunar ground with craters, a Sun and a camera; renders labelled frames from any pose above it.
+    """Lunar ground with craters, a Sun and a camera; renders labelled frames from given poses.
 
-    `perilune-render serve` gives equal frames for equal settings and poses. The ground is made for the descents of the
-    configuration, up to 1500 m; a pose from which the camera sees beyond this ground raises UserError. To see the
-    horizon, set `dataset.scene.horizon=true`. Use a scene in one thread only.
+    The ground is large enough for the descents of the configuration, which start at 1500 m by default. A pose from
+    which the camera sees beyond this ground raises UserError. To see the horizon, set `dataset.scene.horizon=true`.
+    `perilune-render serve` renders equal frames for equal settings and poses. Use a scene in one thread only.
 
         scene = Scene("mare", seed=7, sun_elevation_deg=20)
         scene.render(look_down(altitude_m=800)).plot().save("frame.png")
@@ -112,9 +118,9 @@ class Scene:
         """Generate the ground, which takes seconds, or read it from the cache.
 
         `source` is the name of a terrain (mare, highland, polar) or of a preset, a YAML file of settings, an elevation
-        model, or a dataset or manifest, whose first scene is used. `settings` have the form of `--set`, for example
-        "dataset.camera.width_px=512". The engine `cycles` needs Blender. Raises UserError if an argument cannot be
-        used.
+        model, a dataset or a manifest. The first scene of a dataset or manifest is used. Arguments left at None keep
+        the values of the source. `settings` have the form of `--set`, for example "dataset.camera.width_px=512". The
+        engine `cycles` needs Blender. Raises UserError if an argument is invalid.
         """
         arguments: dict[str, Any] = {
             "scene.sun_elevation_deg": sun_elevation_deg,
@@ -131,7 +137,7 @@ class Scene:
         every = (*(f"dataset.{name}={value}" for name, value in changes.items()), *settings)
         if isinstance(source, Dataset) or (Path(source) / "dataset.json").is_file() or "://" in str(source):
             if seed is not None or settings:
-                raise UserError("Scene", "seed and settings", "given", "neither: a dataset has its own")
+                raise UserError("Scene", "seed and settings", "given", "neither, since both come from the dataset")
             dataset = source if isinstance(source, Dataset) else open_single(source)
             self.name = str(dataset.store)
             self._simulated = _simulation_of(dataset, sun_azimuth_deg, sun_elevation_deg, engine)
@@ -141,7 +147,7 @@ class Scene:
 
     @property
     def config(self) -> DatasetConfig:
-        """The settings."""
+        """All settings of the scene."""
         return self._simulated.config
 
     @property
@@ -161,8 +167,8 @@ class Scene:
     def render(self, poses: Pose | Sequence[Pose]) -> RenderedFrame | list[RenderedFrame]:
         """Render and label the frame of a pose, or the list of frames of several poses.
 
-        Frame i of a list has the noise of frame i of a sequence; a single frame has the noise of the first frame.
-        Raises UserError for a pose below the ground, or if the camera sees beyond the ground.
+        The index of a pose in the list determines the noise of its frame; a single pose has index 0. Raises UserError
+        for a pose below the ground, or if the camera sees beyond the ground.
         """
         frames = [self._render(pose, index) for index, pose in enumerate(listed(poses))]
         return frames[0] if isinstance(poses, Pose) else frames
@@ -180,7 +186,7 @@ class Scene:
         return RenderedFrame(frame.image, frame.radiance.depth_m, rows, pose)
 
     def close(self) -> None:
-        """Release the engine; this also happens at the end of the program."""
+        """Release the engine. It is also released at the end of the program."""
         self._simulated.close()
 
     def __enter__(self) -> "Scene":
@@ -202,7 +208,7 @@ class Scene:
 def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
     """The settings of a terrain, a preset, a file of settings or an elevation model.
 
-    Raises UserError otherwise.
+    Raises UserError for any other source.
     """
     name, path = str(source), Path(source)
     preset, file, settings_of_name, dem = _BASE, None, TERRAINS.get(name, ()), None
@@ -233,7 +239,7 @@ def _config_of(source: str | Path, settings: tuple[str, ...]) -> DatasetConfig:
 def _simulation_of(
     dataset: Dataset, sun_azimuth_deg: float | None, sun_elevation_deg: float | None, engine: EngineName
 ) -> SimulatedScene:
-    """The first scene of a dataset, with its ground and settings, and its Sun unless another Sun is given."""
+    """The first scene of a dataset; a Sun angle of None keeps the Sun of that scene."""
     info, where = dataset.info, dataset.store.at("dataset.json")
     if len(info.recipes) != 1:
         expected = "one recipe; select its scenes with `perilune-manifest subset`"

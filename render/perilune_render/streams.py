@@ -1,4 +1,4 @@
-"""Random streams derived by name from one seed, so that each scene, trajectory or frame can be regenerated alone."""
+"""Random streams derived from one seed by name, so that each frame can be regenerated alone."""
 
 import hashlib
 
@@ -17,5 +17,8 @@ def stream(seed: int, *names: object) -> np.random.Generator:
 
 
 def camera_seed(seed: int, camera: str | None) -> int:
-    """Random seed of a camera's frames or sensor: independent for each camera, `seed` for a single camera."""
+    """Random seed of the frames or the sensor of one of several cameras.
+
+    `camera` is None for a dataset with a single camera, which uses `seed` itself.
+    """
     return seed if camera is None else derived_seed(seed, "camera", camera)

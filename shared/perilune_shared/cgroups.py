@@ -3,17 +3,20 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-_ROOT, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+_ROOT, _MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def processor_quota() -> float | None:
-    """Smallest processor quota, in cores, of this process's cgroup and its parents; None without a quota."""
+    """Return the smallest processor quota, in cores, of this process's cgroup and its parents.
+
+    Returns None without a quota.
+    """
     quotas = [quota / period for quota, period in _pairs("cpu") if quota > 0 and period > 0]
     return min(quotas, default=None)
 
 
 def memory_left_bytes() -> float | None:
-    """Memory, in bytes, that the limits of this process's cgroup and its parents still allow.
+    """Return the memory, in bytes, that the limits of this process's cgroup and its parents still allow.
 
     Returns None without a limit.
     """
@@ -25,11 +28,11 @@ _FILES = {
     "cpu": (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")),
     "memory": (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")),
 }
-"""Files with the two numbers of each controller: version 2, then version 1."""
+"""Files with quota and period (cpu) or limit and usage (memory): cgroup version 2, then version 1."""
 
 
 def _pairs(controller: str) -> Iterator[tuple[int, int]]:
-    """Both numbers of each cgroup that states them. Skips "max" (no limit) and files that cannot be read."""
+    """Yield both numbers of each cgroup. Skips "max" (no limit) and files that cannot be read."""
     for folder in _folders(controller):
         for names in _FILES[controller]:
             try:
@@ -40,13 +43,13 @@ def _pairs(controller: str) -> Iterator[tuple[int, int]]:
 
 
 def _folders(controller: str) -> list[Path]:
-    """Folders of this process's cgroups for a controller, up to the roots.
+    """Return the folders of this process's cgroups for a controller, up to the roots.
 
     In a container, the path in /proc/self/cgroup may be outside the mounted tree; the mounted root is then the
     container's own cgroup.
     """
     try:
-        lines = _OWN.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = _MEMBERSHIP.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
     folders = [_ROOT, _ROOT / controller, _ROOT / "cpu,cpuacct"]

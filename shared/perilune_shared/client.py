@@ -1,6 +1,6 @@
 """A client of `perilune-render serve`: frames at any pose, as arrays.
 
-Needs the extra `client` (ZeroMQ).
+Needs ZeroMQ: `pip install 'perilune-shared[client]'`.
 
     from perilune_shared.client import SceneClient
 
@@ -8,10 +8,11 @@ Needs the extra `client` (ZeroMQ).
         frame = scene.frame((0.0, 0.0, 800.0), (0.0, 1.0, 0.0, 0.0), labels=True)
         print(frame.image.shape, len(frame.labels["crater_id"]))
 
-A request is a ZeroMQ message of one part: JSON. A reply has several parts: a head in JSON, then the bytes of each array
-that the head lists, in C order. Other languages therefore need only a ZeroMQ library and a JSON library. A head may ask
-the client to repeat the request later: `"ready": false` means that the scene is not generated yet, `"busy": true` that
-the server has too many clients. In any other head, `"error"` says what is wrong with the request.
+Clients in other languages need only a ZeroMQ library and a JSON library. A request is a ZeroMQ message with one part, a
+JSON object. A reply has several parts: a head (a JSON object), then the bytes of each array that the head lists, in C
+order. Two members of the head ask the client to repeat the request later: `"ready": false` means that the scene is not
+generated yet, `"busy": true` that the server has too many clients. In any other head, `"error"` says what is wrong with
+the request.
 """
 
 import json
@@ -28,14 +29,14 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 PORT = 10364
-"""Default port of the interface."""
+"""Default TCP port of the server for this client."""
 CRATER_COLUMNS = (
     "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m", "depth_m", "latitude_deg",
     "longitude_deg",
 )  # fmt: skip
-"""Columns of the craters, as in the table `craters` of a manifest."""
+"""Columns of the craters of a scene, as in the table `craters` of a manifest."""
 _TYPES = ("|u1", "<u2", "<f4", "<f8", "<i8")
-"""Types of arrays that a reply may have."""
+"""NumPy types that arrays of a reply may have."""
 _MAX_BYTES = 2_000_000_000
 _GROUND = {
     "dataset": str,
@@ -51,22 +52,23 @@ _GENERATION_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class ServedFrame:
-    """A frame of the server."""
+    """A frame rendered by the server."""
 
     image: np.ndarray
-    """Grey values, DN (h, w) uint8, or uint16 above 8 bits."""
+    """Grey values (h, w), DN: uint8, or uint16 for a sensor of more than 8 bits."""
     depth_m: np.ndarray | None
-    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not requested. If the lens
-    distorts, the pixels are those of an undistorted camera that covers the view."""
+    """Depth (h, w) along the camera's axis, metres, float32; infinite for the sky; None if not requested.
+
+    If the lens distorts, depth and normals have the pixels of an undistorted camera that covers the whole view."""
     normal: np.ndarray | None
-    """Unit normals, O_L (h, w, 3) float32, in the same pixels; None if not requested."""
+    """Unit normals (h, w, 3), O_L, float32, in the pixels of `depth_m`; None if not requested."""
     labels: dict[str, np.ndarray] | None
     """Columns of the table `labels` (N,); None if not requested."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServedScene:
-    """Camera, site and Sun of a server, with its number of scenes."""
+    """Camera, site, Sun and number of scenes of a server."""
 
     camera: Camera
     """Camera of the frames."""
@@ -81,15 +83,15 @@ class ServedScene:
     sun_elevation_deg: float
     """Elevation of the Sun unless a request states another, degrees."""
     n_scenes: int = 1
-    """Number of scenes, `perilune-render serve --scenes`; the other fields describe scene 0."""
+    """Number of scenes (`perilune-render serve --scenes`); the other fields describe scene 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServedGround:
-    """One of the scenes of a server."""
+    """Terrain and Sun of one scene of a server."""
 
     dataset: str
-    """Name of the server's configuration, `dataset.name`."""
+    """Value of `dataset.name` in the server's configuration."""
     sun_azimuth_deg: float
     """Azimuth of the Sun unless a request states another, clockwise from north, degrees."""
     sun_elevation_deg: float
@@ -103,7 +105,8 @@ class ServedGround:
 class SceneClient:
     """A connection to a server. Use it as a context manager, in one thread.
 
-    Every method raises UserError if the server refuses a request, or does not answer or is busy for `timeout_s`.
+    Every method raises UserError if the server refuses the request, or if it does not answer or is busy for longer than
+    `timeout_s`.
     """
 
     def __init__(self, address: str = f"tcp://127.0.0.1:{PORT}", timeout_s: float = 60.0):
@@ -139,18 +142,18 @@ class SceneClient:
         self._context.term()
 
     def scene(self) -> ServedScene:
-        """Camera, site and Sun of the server, with its number of scenes."""
+        """Return camera, site, Sun and number of scenes of the server."""
         head, _ = self._ask({"request": "scene"})
         camera = dict(head["camera"])
         camera["distortion"] = tuple(camera["distortion"])
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
     def health(self) -> dict[str, str]:
-        """Check that the server answers at each interface; return names and addresses (host:port).
+        """Check that every interface of the server answers; return the address (host:port) of each, by name.
 
-        The server connects to each interface before it replies. Raises UserError, as other requests do; the error names
-        an interface that does not answer. The reply comes after earlier requests of other clients, so it also shows
-        that frames are rendered.
+        The server connects to each of its interfaces before it replies. It first answers earlier requests of other
+        clients, so the reply also shows that frames are rendered. The UserError names an interface that does not
+        answer.
         """
         head, _ = self._ask({"request": "health"})
         try:
@@ -159,7 +162,10 @@ class SceneClient:
             raise UserError(self.address, "interfaces", "none", "a reply of `perilune-render serve`") from None
 
     def ground(self, scene: int, *, wait: bool = True) -> ServedGround | None:
-        """Wait for a scene to be generated, and describe it; without `wait`, None if it is not generated."""
+        """Return the description of a scene; first wait until the server has generated the scene.
+
+        Without `wait`, return None at once if the scene is not generated yet.
+        """
         head, _ = self._ask({"request": "ground", "scene": scene}, wait=wait)
         if head.get("ready") is False:
             return None
@@ -183,11 +189,13 @@ class SceneClient:
     ) -> ServedFrame:
         """Render a frame.
 
-        `position_m` (3,) is in O_L, `rotation_wxyz` (4,) is rotation_camera_from_site as in a manifest, `velocity_mps`
-        (3,), O_L, and `angular_velocity_radps` (3,), O_C, blur the frame, `sun_deg` is azimuth and elevation of the
-        Sun. `index` selects the noise; without it, the client counts the frames that it receives. With `depth` the
-        frame has depth and normals. `scene` is the number of the scene; the call waits for a scene that is not in the
-        server's memory.
+        - `position_m` (3,): position of the camera, O_L, metres.
+        - `rotation_wxyz` (4,): rotation_camera_from_site as a quaternion, as in a manifest.
+        - `velocity_mps` (3,), O_L, and `angular_velocity_radps` (3,), O_C: velocities that blur the frame.
+        - `sun_deg`: azimuth and elevation of the Sun, degrees; by default as in the scene.
+        - `index`: number that selects the noise; by default the number of frames received before.
+        - `depth`, `labels`: whether to return depth and normals, and labels.
+        - `scene`: number of the scene; the call waits until the scene is in the server's memory.
         """
         request: dict[str, Any] = {
             "request": "frame",
@@ -197,7 +205,7 @@ class SceneClient:
             "index": self._next_index if index is None else index,
             "depth": depth,
             "labels": labels,
-        } | _of(scene)
+        } | _scene_field(scene)
         if angular_velocity_radps is not None:
             request["angular_velocity_radps"] = [float(value) for value in angular_velocity_radps]
         if sun_deg is not None:
@@ -211,19 +219,22 @@ class SceneClient:
         return ServedFrame(arrays["image"], arrays.get("depth_m"), arrays.get("normal"), columns if labels else None)
 
     def craters(self, scene: int = 0) -> dict[str, np.ndarray]:
-        """All craters of the ground: CRATER_COLUMNS, each (N,)."""
-        return self._ask({"request": "craters"} | _of(scene))[1]
+        """Return all craters of a scene: the columns CRATER_COLUMNS, each (N,)."""
+        return self._ask({"request": "craters"} | _scene_field(scene))[1]
 
     def heights(
         self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True, scene: int = 0
     ) -> Array:
-        """Heights (N,) of the surface at points (N,) of O_L, metres; NaN outside the scene's ground."""
+        """Return the heights (N,) of the surface at points (N,), O_L, metres; NaN outside the scene's ground."""
         coordinates = [[float(value) for value in values] for values in (x_m, y_m)]
         request = {"request": "heights", "x_m": coordinates[0], "y_m": coordinates[1], "boulders": boulders}
-        return self._ask(request | _of(scene))[1]["height_m"]
+        return self._ask(request | _scene_field(scene))[1]["height_m"]
 
     def _ask(self, request: dict[str, Any], wait: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Head of the reply to a request, and its arrays by name; with `wait`, after the scene is generated."""
+        """Send a request; with `wait`, repeat it until the scene is generated.
+
+        Returns the head of the reply and its arrays by name.
+        """
         end = time.monotonic() + _GENERATION_S
         while True:
             head, arrays = self._ask_until_answered(request)
@@ -271,13 +282,13 @@ class SceneClient:
         return head, arrays_by_name
 
 
-def _of(scene: int) -> dict[str, int]:
-    """The field `scene` of a request; omitted for scene 0, which every server has."""
+def _scene_field(scene: int) -> dict[str, int]:
+    """Return the field `scene` of a request; omitted for scene 0, which every server has."""
     return {"scene": scene} if scene else {}
 
 
 def _array(stated: dict[str, Any], content: bytes) -> np.ndarray:
-    """An array of a reply. Raises ValueError if its size is not the stated one."""
+    """Return an array of a reply. Raises ValueError on an unknown type or a wrong number of bytes."""
     if stated["dtype"] not in _TYPES:
         raise ValueError(f"type {stated['dtype']!r}")
     shape = tuple(int(side) for side in stated["shape"])

@@ -16,7 +16,7 @@ _BOULDER = ("x_m", "y_m", "z_m", "diameter_m")
 
 
 def content_sha256(craters: pa.Table, boulders: pa.Table) -> str:
-    """Return the SHA-256 (hexadecimal) of one scene's rows of `craters` and `boulders`, in the order of their ids."""
+    """Return the SHA-256 (hexadecimal) of the craters and boulders of one scene, sorted by id."""
     digest = hashlib.sha256()
     for table, key, columns in ((craters, "crater_id", _CRATER), (boulders, "boulder_id", _BOULDER)):
         order = np.argsort(table[key].to_numpy(), kind="stable")
@@ -30,7 +30,7 @@ def content_sha256(craters: pa.Table, boulders: pa.Table) -> str:
 def terrain_of(dem_source: str, content_sha256: str) -> str:
     """Return a key that is equal for scenes with the same terrain.
 
-    The key is the elevation model if there is one, otherwise the hash of craters and boulders. Scenes on one elevation
-    model count as the same terrain, although different small craters are added to them.
+    The key is the SHA-256 of the elevation model if there is one, otherwise the hash of craters and boulders. Scenes on
+    one elevation model count as the same terrain, although different small craters are added to them.
     """
     return content_sha256 if dem_source == PROCEDURAL else dem_source.rpartition("sha256:")[2]

@@ -1,4 +1,4 @@
-"""Errors that a user can correct, each reported in one line, and their exit codes."""
+"""Errors that a user can correct, each reported in one line, and the exit codes of the command lines."""
 
 import errno
 
@@ -23,11 +23,14 @@ DISK_FAULTS = (
     errno.EMFILE,
     errno.ENFILE,
 )
-"""Disk and file errors that a user can correct: no space, no permission, no such folder, too few descriptors."""
+"""Disk and file errors that a user can correct, such as a full disk or a missing permission."""
 
 
 class UserError(Exception):
-    """An error in the user's input: file or option, field or "", value found, and value expected."""
+    """An error that the user can correct; its text is "where: field: got ..., expected ..." on one line.
+
+    `where` is the file or option, `field` the part of it, or "" if there is none.
+    """
 
     def __init__(self, where: object, field: str, found: object, expected: str):
         # These texts may come from untrusted files and have any length.
@@ -44,8 +47,8 @@ class UserError(Exception):
 
 
 def ends_run(error: BaseException) -> bool:
-    """Whether the rest of the work would fail with this error too: a user error, or a full or inaccessible disk."""
-    # A missing file does not end the run: another process may have removed it.
+    """Whether all further work would fail too: a user error, or a full or inaccessible disk."""
+    # Another process may have removed a missing file, so it does not end the run.
     return isinstance(error, UserError) or (
         isinstance(error, OSError) and error.errno in DISK_FAULTS and error.errno != errno.ENOENT
     )

@@ -1,6 +1,8 @@
-"""Draw ellipses onto images; the results are Pillow images, which notebooks display.
+"""Draw ellipses onto images. The results are Pillow images, which notebooks display.
 
-with_ellipses(frame.image, ellipses).save("frame.png")
+Example:
+
+    with_ellipses(frame.image, ellipses).save("frame.png")
 """
 
 import sys
@@ -15,17 +17,19 @@ if TYPE_CHECKING:
 GREEN, ORANGE, CYAN = (80, 220, 80), (255, 140, 60), (25, 211, 227)
 """Colours: selected labels, other labels, detections."""
 _SMALLEST_PX, _LARGEST_PX = 1024, 4096
-"""The longer side of a picture, pixels: small images are enlarged by a whole number, large ones reduced."""
+"""Limits of a picture's longer side, pixels.
+
+An image is enlarged by the largest whole factor that keeps its longer side within the first limit. An image above the
+second limit is reduced to it."""
 _ANGLES = np.linspace(0, 2 * np.pi, 65)
 
 
 def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, int, int]] | None = None) -> "Image":
-    """Draw ellipses (N, 5) onto a grey image (h, w), 8 or 16 bits.
+    """Draw ellipses (N, 5) onto a grey image (h, w) of 8 or 16 bits.
 
-    `colours` has N colours, by default all cyan.
-
-    An ellipse has the columns of labels: centre x and y, semi-axes a and b, pixels, and the direction of a,
-    radians. A 16-bit image is scaled so that its largest value is white.
+    A row of `ellipses` has centre x and y and semi-axes a and b, pixels, then the direction of a, radians, as in the
+    table `labels`. `colours` has N colours (red, green, blue); by default all are cyan. A 16-bit image is scaled so
+    that its largest value is white.
     """
     from PIL import Image, ImageDraw
 
@@ -35,8 +39,8 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
     side = max(grey.shape)
     factor = max(_SMALLEST_PX // side, 1) if side <= _LARGEST_PX else _LARGEST_PX / side
     size = (max(round(grey.shape[1] * factor), 1), max(round(grey.shape[0] * factor), 1))
-    how = Image.Resampling.NEAREST if factor >= 1 else Image.Resampling.BOX
-    picture = Image.fromarray(grey).resize(size, how).convert("RGB")
+    resampling = Image.Resampling.NEAREST if factor >= 1 else Image.Resampling.BOX
+    picture = Image.fromarray(grey).resize(size, resampling).convert("RGB")
     draw = ImageDraw.Draw(picture)
     rows = np.asarray(ellipses, np.float64).reshape(-1, 5)
     for index, (x, y, a, b, theta) in enumerate(rows):
@@ -55,7 +59,7 @@ def with_ellipses(image: NDArray, ellipses: ArrayLike, colours: list[tuple[int, 
 
 
 def display(picture: "Image") -> None:
-    """Display a picture in the notebook that runs this process, or else in the system's viewer."""
+    """Display a picture in the notebook if this process runs one, otherwise in the system's image viewer."""
     if "ipykernel" in sys.modules:
         from IPython.display import display as show_in_notebook
 

@@ -22,11 +22,11 @@ class RunRecord:
     """Commit, hardware, load, command and date of a run."""
 
     commit: str
-    """Commit (40 digits), followed by " modified" if tracked files were changed; "unknown" outside a checkout."""
+    """Commit (40 digits), then " modified" if tracked files were changed; "unknown" outside a checkout."""
     hardware: str
     """Number of cores, processor, memory."""
     load: float
-    """Load average over the minute before the program started; a high value means other work on the machine."""
+    """Load average over the minute before the program started; high if other programs were running."""
     command: str
     """The command line."""
     date: str

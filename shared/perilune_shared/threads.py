@@ -1,12 +1,12 @@
-"""Set the threads of the numerical libraries, and measure usable cores and the load of other processes.
+"""Set the threads of the numerical libraries; measure usable cores and the load of other processes.
 
-An OpenMP thread, as used by torch's operations, spins while it waits for other threads. If threads share cores with
-other work, a spinning thread may occupy the core that the other thread needs. Programs of perilune therefore call
+torch computes with OpenMP threads. A thread that waits for another thread spins, which occupies a core. If other
+programs use the cores too, the awaited thread may then have no core. Programs of perilune therefore call
 `set_up_program`, which limits spinning.
 
 The libraries read environment variables when they are loaded, so a program must call `set_up_program` before it imports
-torch, NumPy, OpenCV or numba. Importing perilune changes no environment variable: your program must set
-`GOMP_SPINCOUNT` or call `set_up_program`; otherwise `warn_if_crowded` may warn.
+torch, NumPy, OpenCV or numba. Importing perilune changes no environment variable. A program that imports perilune
+should therefore call `set_up_program` itself or set `GOMP_SPINCOUNT`; otherwise `warn_if_crowded` may warn.
 
 Example:
 
@@ -26,13 +26,13 @@ from perilune_shared.cgroups import processor_quota
 from perilune_shared.errors import UserError
 
 SPIN_COUNT, CROWDED_SPIN_COUNT = 30_000, 1000
-"""Rounds for which a waiting libgomp thread spins before it sleeps; the second value is for an overloaded machine.
+"""Rounds that a waiting libgomp thread spins before it sleeps: usual, and on an overloaded machine.
 
-libgomp's default is about 300,000. The values were chosen by measurement (docs/notebook/2026-11-27-speed.md): below
-30,000 training is slower on idle cores; beside a busy process training is fastest with 1000 or less.
+libgomp's default is about 300,000. The values were chosen by measurement (docs/notebook/2026-11-27-speed.md). On idle
+cores, training is slower below 30,000 rounds. Beside a busy process, training is fastest with 1000 rounds or less.
 """
 NUMBERS_OF_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""Environment variables for the number of threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL and OpenCV."""
+"""Environment variables that set the threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL, OpenCV."""
 _MAX_THREADS = 1024
 _PATTERNS = {
     **dict.fromkeys(
@@ -45,7 +45,7 @@ _PATTERNS = {
 """Pattern and description of the valid values of each variable."""
 _SPINNING = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 _STATISTICS = Path("/proc/stat")
-_set_here: set[str] = set()
+_set_by_program: set[str] = set()
 """Variables that `set_up_program` has set in this process."""
 _warned = False
 
@@ -58,8 +58,8 @@ def cores_in_affinity() -> int:
 def usable_cores() -> int:
     """Number of cores that this process may use, at least 1.
 
-    The affinity of the process limits it, and so does the processor quota of the container or batch job (Linux cgroups,
-    versions 1 and 2); a quota of 1.5 cores counts as 2. A cgroup that cannot be read sets no limit.
+    The number is limited by the affinity of the process and by the processor quota of the container or batch job (Linux
+    cgroups, versions 1 and 2). A quota of 1.5 cores counts as 2. A cgroup that cannot be read sets no limit.
     """
     quota = processor_quota()
     return cores_in_affinity() if quota is None else max(1, min(cores_in_affinity(), math.ceil(quota)))
@@ -69,7 +69,7 @@ def set_up_program() -> None:
     """Set the threads of the numerical libraries for this program and for the processes that it starts.
 
     Limits how long idle OpenMP threads spin. Limits the number of threads to the quota of the container, which the
-    libraries do not read. Values set by the user are kept. Call it before these libraries are imported. Raises
+    libraries do not read. Values set by the user are kept. Call this function before the libraries are imported. Raises
     UserError if the user has set a variable to a value that the libraries do not understand.
     """
     _check()
@@ -83,7 +83,7 @@ def set_up_program() -> None:
 
 def _set(name: str, value: int) -> None:
     os.environ[name] = str(value)
-    _set_here.add(name)
+    _set_by_program.add(name)
 
 
 def _check() -> None:
@@ -102,11 +102,11 @@ def _load() -> float:
 
 def chosen_by_user(name: str) -> bool:
     """Whether an environment variable is set, but not by `set_up_program`."""
-    return name in os.environ and name not in _set_here
+    return name in os.environ and name not in _set_by_program
 
 
 def described_settings() -> str:
-    """Return one line that states the usable cores and the thread variables, and which of them the user has set."""
+    """Return one line with the usable cores and the thread variables; values set by the user are marked."""
     names = [name for name in dict.fromkeys((*_SPINNING, *_PATTERNS)) if name in os.environ]
     values = [f"{name}={os.environ[name]}{' (from the environment)' if chosen_by_user(name) else ''}" for name in names]
     quota = processor_quota()
@@ -115,9 +115,9 @@ def described_settings() -> str:
 
 
 def warn_if_crowded() -> None:
-    """Warn once in this process if the machine has more work than cores and idle OpenMP threads spin for long.
+    """Warn once per process if the machine has more work than cores and OpenMP threads spin for long.
 
-    For functions that users call from their own programs; perilune's commands limit the spinning themselves.
+    Called by functions that users call in their own programs. perilune's commands limit the spinning themselves.
     """
     global _warned
     if _warned or any(name in os.environ for name in _SPINNING):
@@ -135,9 +135,9 @@ def warn_if_crowded() -> None:
 
 
 class OtherWork:
-    """Processor time that other processes take from the cores of this one (Linux; elsewhere always 0).
+    """Measures how many of the cores of this process other processes use (Linux; elsewhere always 0).
 
-    Example: `others = OtherWork()`, and later `others.cores()` for the mean since the last call.
+    Example: `others = OtherWork()`; later, `others.cores()` returns the mean since the last call.
     """
 
     def __init__(self) -> None:
@@ -152,7 +152,7 @@ class OtherWork:
         return max(0.0, (busy_s - own_s) / (elapsed_s / cores_in_affinity())) if elapsed_s > 0 else 0.0
 
     def _read(self) -> tuple[tuple[float, float], float, float]:
-        """Return core seconds: of all usable cores (elapsed, busy), of this process, and of its ended children."""
+        """Return seconds: of all usable cores (elapsed, busy), of this process and of its ended children."""
         times = os.times()
         return _core_seconds(), times.user + times.system, times.children_user + times.children_system
 

@@ -148,7 +148,7 @@ def test_what_is_no_scene_is_refused(given, message):
 
 
 def test_a_dataset_takes_no_other_settings(quick):
-    with pytest.raises(perilune.UserError, match="a dataset has its own"):
+    with pytest.raises(perilune.UserError, match="since both come from the dataset"):
         perilune.Scene(quick / "nav", seed=3)
     with pytest.raises(perilune.UserError, match="sun_elevation_deg: got 99"):
         perilune.Scene(quick / "nav", sun_elevation_deg=99)

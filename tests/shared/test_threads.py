@@ -19,7 +19,7 @@ def machine(tmp_path, monkeypatch):
     """A machine of 64 cores whose files on cgroups a test writes; returns the folder of the cgroups."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
     monkeypatch.setattr(cgroups, "_ROOT", tmp_path / "cgroup")
-    monkeypatch.setattr(cgroups, "_OWN", tmp_path / "own")
+    monkeypatch.setattr(cgroups, "_MEMBERSHIP", tmp_path / "own")
     (tmp_path / "cgroup").mkdir()
     return tmp_path / "cgroup"
 
@@ -29,7 +29,7 @@ def environment(monkeypatch):
     """The environment without variables of threads; restored after the test."""
     for name in threads._PATTERNS:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(threads, "_set_here", set())
+    monkeypatch.setattr(threads, "_set_by_program", set())
     with monkeypatch.context():
         before = dict(os.environ)
         yield os.environ

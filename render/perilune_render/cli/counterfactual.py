@@ -43,12 +43,12 @@ def counterfactual(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render frames of a dataset again without some craters or with another azimuth of the Sun; all else is equal.
+    """Render frames of a dataset again without some craters or with another azimuth of the Sun.
 
-    Frames and craters keep their ids. The removed craters are listed in OUT.removed.parquet. Run the same command again
-    to resume.
+    Everything else is unchanged; frames and craters keep their ids. The removed craters are listed in
+    OUT.removed.parquet. Run the same command again to resume.
     """
-    # Check before reading the manifest, which takes seconds.
+    # Check the options first, since reading the manifest takes seconds.
     resolve_over(CounterfactualConfig, "counterfactual", "--sun-azimuth-offset-deg", _sun(sun_azimuth_offset_deg))
     options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     source, store, table = ps.open_dataset(manifest), open_store(out), _table_beside(out)

@@ -39,16 +39,17 @@ if TYPE_CHECKING:
 
 
 _ENDED_S = 2.0
-"""Longest time from Ctrl-C to the end of the process, seconds. Finished trajectories survive even SIGKILL."""
+"""Time after Ctrl-C at which the process ends even if a call of Blender still runs, seconds. Finished trajectories are
+kept even if the process is killed."""
 _UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
 
 
 @dataclass(frozen=True, slots=True)
 class JobOptions:
-    """Options of a command that renders: which processes to use, and which part of the work to do."""
+    """Options of a command that renders: which processes to use, and what part of the work to do."""
 
     executor: Literal["local", "ray"]
-    """Processes on this machine, or actors of Ray."""
+    """`local` for processes on this machine, `ray` for actors of Ray."""
     address: str | None
     """Address of a running Ray cluster; None starts Ray on this machine."""
     workers: int | None
@@ -56,11 +57,11 @@ class JobOptions:
     threads: int | None
     """Number of threads of each process; None divides the cores among the workers."""
     shard: tuple[int, int] | None
-    """Number, from 1, and count of shards; None renders all trajectories."""
+    """Number of the shard, from 1, and number of all shards; None renders all trajectories."""
     finish: bool
-    """Whether to only finish a dataset whose shards are rendered."""
+    """Whether to render nothing and finish a dataset whose shards are all rendered."""
     dry_run: bool
-    """Whether to only estimate time and size."""
+    """Whether to render no dataset and only estimate time and size."""
 
     @classmethod
     def of(
@@ -73,14 +74,17 @@ class JobOptions:
         finish: bool,
         dry_run: bool,
     ) -> "JobOptions":
-        """Check the options of a command. Raises UserError on a malformed shard or on conflicting options."""
+        """Return the options after checking them.
+
+        Raises UserError on a malformed shard or on conflicting options.
+        """
         chosen = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
         if len(chosen) > 1:
             raise UserError("dataset", "options", " and ".join(chosen), "one of them")
         matched = re.fullmatch(r"([1-9]\d{0,6})/([1-9]\d{0,6})", shard) if shard is not None else None
         numbers = (int(matched[1]), int(matched[2])) if matched is not None else None
         if shard is not None and (numbers is None or numbers[0] > numbers[1]):
-            raise UserError("--shard", "", shard, "its number and the count of shards, from 1/64 to 64/64")
+            raise UserError("--shard", "", shard, "a number and the count of shards, such as 3/64")
         if address is not None and executor != "ray":
             raise UserError("--address", "", executor, "--executor ray, which connects to that cluster")
         if workers == 0 and executor == "ray":
@@ -132,11 +136,11 @@ def dataset(
     ] = None,
     shard: Annotated[
         str | None,
-        typer.Option(help="Render one share of the trajectories, as 3/64, without a lock; then --finish once."),
+        typer.Option(help="Render one part of the trajectories, such as 3/64; run with --finish after all parts."),
     ] = None,
     finish: Annotated[bool, typer.Option("--finish", help="Finish the datasets whose shards are rendered.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print frames, hours and bytes, measured on a few frames; write nothing.")
+        bool, typer.Option("--dry-run", help="Estimate frames, hours and bytes from a few frames; write nothing.")
     ] = False,
 ) -> None:
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
@@ -152,7 +156,7 @@ def dataset(
         warn_of_size(resolved)
     store, failed = open_store(out if out is not None else f"data/{preset}"), False
     with first_worker(options, resolved) as early:
-        # Import late: pyarrow and Numba take seconds, and the settings are checked first.
+        # Import late, after the settings are checked: importing pyarrow and Numba takes seconds.
         from perilune_render.jobs.job import Job
         from perilune_render.jobs.run import RenderingFailed
 
@@ -176,7 +180,10 @@ def dataset(
 
 
 def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.AbstractContextManager[Worker | None]":
-    """Start a worker while this process plans the job; yield None if no worker on this machine will render the job."""
+    """Start the first worker process while this process plans the job.
+
+    The context manager yields None if the job needs no worker process on this machine.
+    """
     if options.executor != "local" or options.workers == 0 or options.finish:
         return contextlib.nullcontext()
     from perilune_render.jobs.worker import early_worker
@@ -185,7 +192,10 @@ def first_worker(options: JobOptions, config: DatasetConfig) -> "contextlib.Abst
 
 
 def _run_job(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
-    """Estimate, render or finish; return a finished dataset. Raises RenderingFailed if trajectories failed."""
+    """Estimate, render or finish a job; return the dataset if it is finished, else None.
+
+    Raises RenderingFailed if trajectories failed.
+    """
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
     if options.workers is None and options.executor == "local":
@@ -208,7 +218,7 @@ def _run_job(job: "Job", out: Store, options: JobOptions, early: "Worker | None"
 
 
 def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker | None" = None) -> "Dataset | None":
-    """Estimate, render or finish; return the dataset if it is finished. Exit with code 1 if trajectories failed."""
+    """Like `_run_job`, but if trajectories failed, print them and exit with code 1."""
     from perilune_render.jobs.run import RenderingFailed
 
     try:
@@ -219,7 +229,7 @@ def finished_or_exit(job: "Job", out: Store, options: JobOptions, early: "Worker
 
 
 def _kill_processes() -> None:
-    """Kill all child processes; Ray's processes would otherwise run for another minute."""
+    """Kill all child processes, since Ray's processes would run for another minute."""
     import psutil
 
     for process in psutil.Process().children(recursive=True):
@@ -246,7 +256,7 @@ def _print_failures(error: "RenderingFailed") -> None:
 
 def _executor(options: JobOptions, early: "Worker | None") -> "MakeExecutor":
     if options.workers == 0:
-        # Imports Blender, which takes seconds.
+        # This import loads Blender, which takes seconds.
         from perilune_render.jobs.in_process import InProcess
 
         return InProcess

@@ -91,7 +91,10 @@ def frames(
 
 
 def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
-    """A configuration with the camera of a file, if one is given. Raises UserError if `dataset.cameras` is set too."""
+    """The configuration with the camera of the file `path`; unchanged if `path` is None.
+
+    Raises UserError if `dataset.cameras` is set too.
+    """
     if path is None:
         return config
     if config.cameras:
@@ -101,8 +104,11 @@ def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
 
 
 def read_camera(path: Path) -> CameraConfig:
-    """The camera of a file: settings of `dataset.camera`, or a calibration of another program. Raises UserError."""
-    # Imports NumPy, which a command that ends early does not need.
+    """The camera of a file with settings of `dataset.camera` or a calibration of another program.
+
+    Raises UserError if the file cannot be read or its values are invalid.
+    """
+    # This import loads NumPy, which a command that ends early does not need.
     from perilune_shared.geometry.calibration import Calibration, read_camera_file
 
     content = read_camera_file(path)

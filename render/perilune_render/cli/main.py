@@ -40,7 +40,7 @@ from perilune_shared.storage.replacement import replaceable
 app = new_program(
     "perilune-render",
     perilune_render.__version__,
-    "Generate lunar terrain and trajectories, and render labelled frames with Blender.",
+    "Generate lunar terrain and trajectories, and render labelled frames.",
 )
 
 
@@ -76,7 +76,7 @@ def develop(
     ] = None,
     setting: Setting = None,
 ) -> None:
-    """Make a dataset from the EXRs of another dataset, with a different sensor or camera, without Blender."""
+    """Make a dataset with a different sensor or camera from the EXRs of another dataset, without Blender."""
     from perilune_render.dataset.develop import develop_dataset
 
     with progress_bar() as progress:
@@ -99,13 +99,13 @@ def plan(
     manifest: Annotated[
         str | None,
         typer.Option(
-            help="Manifest whose table `frames` was left out, as in `data_manifests`: write it with this table, drawn "
-            "again by its recipe."
+            help="Manifest without the table `frames`, such as those in `data_manifests`: write it again with this "
+            "table, computed from its recipe."
         ),
     ] = None,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
+    """Write the plan of a dataset as a manifest without frames, with the hash of every generated scene."""
     from perilune_render.dataset.manifest_only import write_left_out_frames, write_manifest_only
 
     if manifest is not None:
@@ -139,7 +139,9 @@ def regenerate(
     ] = None,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare frames, then delete them; a sample unless --frames or --all."),
+        typer.Option(
+            "--verify", help="Compare frames, then delete them. Without --frames or --all, a sample is compared."
+        ),
     ] = False,
     sample: Annotated[int, typer.Option(min=1, help="Number of frames in the sample, evenly spread.")] = 12,
     everything: Annotated[bool, typer.Option("--all", help="All frames of the manifest.")] = False,
@@ -149,7 +151,7 @@ def regenerate(
         Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
     ] = None,
 ) -> None:
-    """Render frames from a manifest alone and compare them with its hashes. Exit code 2 if a frame differs."""
+    """Render frames from a manifest and compare them with its hashes; exit code 2 on a difference."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = ps.open_dataset(manifest)
@@ -189,13 +191,13 @@ def preview(
     scene: Annotated[
         Path | None, typer.Option(help="With --poses: settings of the scene, as for `frames`; equivalent to CONFIG.")
     ] = None,
-    camera: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="With --poses: file with the camera, as for `frames`.")] = None,
     camera_axes: CameraAxes = None,
     out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(
         "preview.png"
     ),
 ) -> None:
-    """Render a contact sheet of a configuration, with and without labels, and a map of its site, in seconds."""
+    """Render frames of a configuration as a contact sheet, and a map of the landing site, in seconds."""
     if poses is None and (scene is not None or camera is not None or camera_axes is not None):
         raise UserError("preview", "--scene, --camera or --camera-axes", "no --poses", "--poses as well")
     if scene is not None and config is not None:
@@ -238,7 +240,10 @@ def ground(
         Path, typer.Option(help="File to write: .glb, .ply, .obj or .stl for a mesh, .tif for heights.")
     ] = Path("scene.glb"),
 ) -> None:
-    """Write the ground of a configuration's first scene as a mesh or a GeoTIFF (metres, O_L: Z up, Y south, X west)."""
+    """Write the ground of a configuration's first scene as a mesh or a GeoTIFF.
+
+    Coordinates are metres in O_L: Z up, Y south, X west.
+    """
     resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene

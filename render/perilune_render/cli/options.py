@@ -16,7 +16,7 @@ from perilune_shared.errors import UserError
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""
 OneKind = Annotated[Kind, typer.Option(help="Dataset of the preset: detect (crater detection) or nav (navigation).")]
-"""Option of commands that use one dataset; each command gives `detect` as the default."""
+"""Option of the commands that use one dataset; in all of them the default is `detect`."""
 Preset = Annotated[
     str,
     typer.Option(
@@ -50,7 +50,7 @@ def was_given(context: typer.Context, name: str) -> bool:
 
 
 def warn_of_size(config: DatasetConfig) -> None:
-    """Warn before rendering if the detector cannot be trained on frames of this size."""
+    """Warn if the detector cannot be trained on frames of the configured size."""
     cameras: dict[str, CameraConfig] = {f"cameras.{name}": each for name, each in config.cameras.items()}
     cameras = cameras or {"camera": config.camera}
     sides = {
@@ -79,9 +79,10 @@ def resolved_config(
     *,
     given_scene: bool = False,
 ) -> DatasetConfig:
-    """The settings of a preset with the user's changes. Raises UserError on invalid ones.
+    """The settings of a preset with the user's changes.
 
-    `given_scene`: whether poses come from a file or from clients; the command then accepts `dataset.scene`.
+    `given_scene` is true for commands whose poses come from a file or from clients: they accept `dataset.scene`. Raises
+    UserError on invalid settings.
     """
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
     if resolved.scene is not None and not given_scene:

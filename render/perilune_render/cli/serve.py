@@ -30,20 +30,22 @@ def serve(
     dem: Dem = None,
     height_unit: Unit = None,
     catalogue: Catalogue = None,
-    engine: Annotated[Literal["heightfield", "cycles"], typer.Option(help="Renderer.")] = "heightfield",
+    engine: Annotated[
+        Literal["heightfield", "cycles"], typer.Option(help="Rendering engine; `cycles` needs Blender and is slower.")
+    ] = "heightfield",
     host: Annotated[
         str, typer.Option(help="Address to listen on; other machines can connect unless it is a loopback address.")
     ] = _LOOPBACK,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="PANGU: port; 0 takes a free one.")] = _PORT,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="PANGU: port; 0 takes a free port.")] = _PORT,
     native_port: Annotated[
         int,
-        typer.Option(min=0, max=65535, help="Port of the interface for `perilune_shared.client`; 0 takes a free one."),
+        typer.Option(min=0, max=65535, help="Port of the interface for `perilune_shared.client`; 0 takes a free port."),
     ] = _NATIVE_PORT,
     sun_azimuth: Annotated[
         _Zero, typer.Option(help="PANGU: direction in which the Sun's azimuth is 0, and the sense in which it grows.")
     ] = "clockwise-from-y",
     roll: Annotated[
-        Literal["left", "right"], typer.Option(help="PANGU: where positive roll leans the camera's top.")
+        Literal["left", "right"], typer.Option(help="PANGU: side to which positive roll tilts the camera's top.")
     ] = "left",
     allow_quit: Annotated[bool, typer.Option("--allow-quit", help="PANGU: let a client end the server.")] = False,
     max_clients: Annotated[int, typer.Option(min=1, max=1000, help="Maximum number of connected clients.")] = 16,
@@ -52,10 +54,10 @@ def serve(
     ] = 600.0,
     scenes: Annotated[
         int,
-        typer.Option(min=1, max=2**31, help="Scenes that clients of `perilune_shared.client` may ask for by number."),
+        typer.Option(min=1, max=2**31, help="Number of scenes from which clients of `perilune_shared.client` choose."),
     ] = 1,
 ) -> None:
-    """Serve images from any pose over a scene to clients of PANGU's protocol and of `perilune_shared.client`."""
+    """Serve images from any pose over a scene to PANGU clients and to `perilune_shared.client`."""
     config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True)
     if config.cameras:
         expected = "null: the server has one dataset.camera"
@@ -112,7 +114,7 @@ def serve(
 
 
 def _start(simulated: "SimulatedScene") -> tuple[int, int, float, "Array", int]:
-    """Width and height, pixels, field of view, radians, Sun and random seed for a new client of PANGU's protocol."""
+    """Width and height (pixels), field of view (radians), Sun and random seed for a new PANGU client."""
     import numpy as np
 
     from perilune_render.poses.plan import trajectory_seed

@@ -16,7 +16,7 @@ def spice(
     kernels: Annotated[list[Path], typer.Option(help="Kernel or meta-kernel; may be repeated, later ones override.")],
     spacecraft: Annotated[str, typer.Option(help="Name or NAIF id of the spacecraft (or camera) in the kernels.")],
     camera_frame: Annotated[str, typer.Option(help="Name of the camera's frame in the kernels.")],
-    start: Annotated[str, typer.Option(help="UTC of the first frame, as 2026-03-01T12:00:00.")],
+    start: Annotated[str, typer.Option(help="UTC of the first frame, such as 2026-03-01T12:00:00.")],
     end: Annotated[str, typer.Option(help="UTC of the last frame.")],
     out: Annotated[Path, typer.Option(help="CSV of poses to write, for `perilune-render frames --poses`.")],
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, evenly spaced.")] = None,

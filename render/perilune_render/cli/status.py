@@ -9,9 +9,11 @@ from perilune_shared.storage.store import open_store
 
 
 def status(
-    address: Annotated[str, typer.Argument(help="Address of a dataset, or of the folder of `detect` and `nav`.")],
+    address: Annotated[
+        str, typer.Argument(help="Folder or address of a dataset, or of the folder that contains `detect` and `nav`.")
+    ],
 ) -> None:
-    """Print what is rendered, running and failed. Reads only the dataset's files, so any machine can run it."""
+    """Print what is rendered, running and failed. Any machine that can read the dataset can run this."""
     from perilune_render.jobs.status import SILENT_S, datasets_below, status_of
 
     for store in datasets_below(open_store(address)):

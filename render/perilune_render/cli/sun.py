@@ -1,4 +1,4 @@
-"""Warn if the Sun is never as high at the landing site as the settings state."""
+"""Warn if the settings state a higher Sun than the landing site ever has."""
 
 from pathlib import Path
 
@@ -19,8 +19,8 @@ def highest_sun_deg(latitude_deg: float) -> float:
 def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None:
     """Warn if the Sun never reaches this elevation at the site; `where` names the setting.
 
-    Without an elevation model or a latitude from the user (`dataset.terrain.latitude_deg`) there is no warning: such
-    ground has no place on the Moon. Raises UserError if the elevation model cannot be read.
+    Procedural ground at the default latitude stands for any place on the Moon, so it causes no warning. Raises
+    UserError if the elevation model cannot be read.
     """
     latitude = _stated_latitude_deg(config)
     if latitude is None or elevation_deg <= highest_sun_deg(latitude):
@@ -34,7 +34,7 @@ def warn_of_sun(config: DatasetConfig, where: str, elevation_deg: float) -> None
 
 
 def warn_of_suns(config: DatasetConfig, kinds: tuple[Kind, ...]) -> None:
-    """Warn if datasets of these kinds may draw a higher Sun than the site ever has."""
+    """Warn if a dataset of one of these kinds may draw a higher Sun than the site ever has."""
     for kind in kinds:
         warn_of_sun(config, f"dataset.{kind}.sun.elevation_deg", config.kind(kind).sun.elevation_deg.high)
 
@@ -44,7 +44,7 @@ def _stated_latitude_deg(config: DatasetConfig) -> float | None:
     if terrain.dem is None:
         usual = TerrainConfig.model_fields["latitude_deg"].default
         return None if terrain.latitude_deg == usual else terrain.latitude_deg
-    # Imports rasterio.
+    # This import needs rasterio, which is used only for elevation models.
     from perilune_render.terrain.elevation.model import read_site
 
     return read_site(Path(terrain.dem), terrain.elevation).latitude_deg

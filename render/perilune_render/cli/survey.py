@@ -39,7 +39,7 @@ def survey(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render each scene of a dataset twice from orbit, under another Sun, to map its craters before the landing.
+    """Render each scene of a dataset twice from orbit under another Sun, to map its craters.
 
     The new dataset has two frames per scene, one from the east and one from the west, with labels. Run the same command
     again to resume.

@@ -1,4 +1,4 @@
-"""Settings of cameras: intrinsics, and the mounting of several on one body."""
+"""Settings of cameras: intrinsics, and the mounting of several cameras on one body."""
 
 from typing import Annotated
 
@@ -44,7 +44,7 @@ class CameraConfig(Section):
     focal_length_px: Pixels | None = None
     """Focal length, pixels; null computes it from horizontal_fov_deg."""
     focal_length_y_px: Pixels | None = None
-    """Focal length divided by the pixel height, for pixels that are not square; null takes the focal length along x."""
+    """Focal length in pixel heights, for pixels that are not square; null takes focal_length_px."""
     principal_x_px: _Point | None = None
     """Principal point, from the left edge, pixels; null takes the image centre."""
     principal_y_px: _Point | None = None
@@ -54,7 +54,7 @@ class CameraConfig(Section):
 
 
 class MountingConfig(Section):
-    """Position and attitude of a camera on the body; the default is the pose of the lander's camera, dataset.camera."""
+    """Position and attitude of a camera on the body; the defaults are the values for `dataset.camera`."""
 
     position_in_body_m: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
     """Centre of projection in O_B (the axes of the body), metres."""

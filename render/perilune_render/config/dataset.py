@@ -27,12 +27,13 @@ from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.labels.thresholds import default_label_bound_px
 
 MAX_TRAJECTORIES, MAX_FRAMES = 200_000, 10_000_000
-"""Largest numbers of trajectories and frames of a dataset; all trajectories are planned before the first frame."""
+"""Largest numbers of trajectories and frames of a dataset. They are limited because all trajectories are planned before
+the first frame is rendered."""
 MAX_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
 _MIN_LIMIT_SIGMAS = 3.0
-"""Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis; about half of all draws
-stay below it."""
+"""Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis. About half of all drawn
+perturbations stay below this limit; the others are drawn again."""
 
 
 class FlightConfig(Section):
@@ -51,13 +52,13 @@ class FlightConfig(Section):
     position_sigma_m: Deviation = 8.0
     """Standard deviation of the position from the nominal parabola, per axis, metres."""
     attitude_sigma_deg: Annotated[float, Field(ge=0, le=90)] = 0.3
-    """Standard deviation of the attitude from level, per axis, degrees."""
+    """Standard deviation of the attitude from a level attitude, per axis, degrees."""
     correlation_time_s: Seconds = 3.0
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
     attitude_correlation_time_s: Seconds | None = None
     """Correlation time of the perturbation of the attitude, seconds; null takes correlation_time_s."""
     max_perturbation_mps2: Annotated[float, Field(gt=0, le=1000)] | None = None
-    """Largest acceleration due to the perturbation of the position, metres per second squared; null for no limit."""
+    """Largest acceleration by the perturbation of the position, metres per second squared; null for no limit."""
 
     @model_validator(mode="after")
     def _end_below_start(self) -> "FlightConfig":
@@ -82,18 +83,19 @@ class FlightConfig(Section):
 
 
 class InstrumentsConfig(Section):
-    """Simulated measurements along each trajectory, for navigation filters: tables `inertial` and `ranges`."""
+    """Simulated measurements along each trajectory, in the tables `inertial` and `ranges`."""
 
     inertial_grades: tuple[InertialGrade, ...] = ()
     """Grades of inertial measurement units (gyroscopes and accelerometers) to simulate."""
     inertial_rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
     """Inertial measurements per second."""
     range_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Measurements of the laser altimeter per second; 0 for none. With given poses: one at each frame's time."""
+    """Measurements of the laser altimeter per second; 0 for no altimeter. With given poses, any other value gives one
+    measurement at the time of each frame."""
     range_sigma_m: Deviation = 0.2
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0005
-    """Additional standard deviation of a range, share of the range."""
+    """Standard deviation that is added in proportion to the range, share of the range."""
 
 
 class SunConfig(Section):
@@ -117,7 +119,7 @@ class KindConfig(Section):
     n_scenes: Count
     """Number of scenes, each with its own terrain."""
     trajectories_per_scene: Count
-    """Number of trajectories over each scene."""
+    """Number of trajectories over each scene's terrain."""
     n_frames: Annotated[int, Field(ge=2, le=1_000_000)]
     """Number of frames of each trajectory."""
     split_by: SplitUnit
@@ -125,13 +127,13 @@ class KindConfig(Section):
     val_share: Share = 0.1
     """Share of scenes, trajectories or frames (`split_by`) in the validation split."""
     test_share: Share = 0.1
-    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 assigns all to it."""
+    """Share of scenes, trajectories or frames (`split_by`) in the test split; 1 puts all of them into it."""
     flight: FlightConfig = FlightConfig()
-    """Trajectories."""
+    """Shape and perturbations of the trajectories."""
     sun: SunConfig = SunConfig()
     """Direction of the Sun."""
     instruments: InstrumentsConfig = InstrumentsConfig()
-    """Measurements other than frames."""
+    """Simulated inertial and range measurements."""
 
     @model_validator(mode="after")
     def _fits(self) -> "KindConfig":
@@ -167,13 +169,14 @@ class LightConfig(Section):
     photometry: Literal["hapke_highland", "hapke_mare", "hapke_mean", "lommel_seeliger", "lunar_lambert", "lambert"] = (
         "hapke_highland"
     )
-    """Reflectance law and parameter set."""
+    """Reflectance law of the ground, with its parameters."""
     sun_angular_diameter_deg: Annotated[float, Field(ge=0, le=5)] = 0.533
     """Angular diameter of the Sun, degrees."""
     albedo_variation: Annotated[float, Field(ge=0, le=10)] = 1.0
     """Strength of bright ejecta, rays and albedo patches; 0 for uniform albedo."""
     bounce: bool = False
-    """Whether to add light that other ground scattered once; without it and earthshine, shadows are black."""
+    """Whether ground also receives light that other ground has scattered once. Without bounce and earthshine, shadows
+    are black."""
     earthshine: bool = False
     """Whether the Earth, if it is above the horizon, also lights the ground."""
 
@@ -186,7 +189,7 @@ class SensorConfig(Section):
     exposure_percentile: Annotated[float, Field(gt=0, le=100)] = 99.0
     """Percentile of the frame's radiance factor that automatic exposure uses."""
     exposure_level: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Grey value of that percentile under automatic exposure, share of the largest grey value."""
+    """Grey value to which automatic exposure brings exposure_percentile, share of the largest grey value."""
     exposure_time_s: Exposure = 0.002
     """Exposure time if exposure is fixed, seconds."""
     longest_exposure_s: Exposure = 0.02
@@ -202,7 +205,7 @@ class SensorConfig(Section):
     black_level_share: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
     """Offset added before quantisation, share of the largest grey value."""
     read_noise_e: Electrons = 15.0
-    """Standard deviation of the dark signal, electrons."""
+    """Read noise: standard deviation of the dark signal without dark current, electrons."""
     dark_current_e_per_s: Electrons = 50.0
     """Mean dark current, electrons per second."""
     dark_nonuniformity_e: Electrons = 3.0
@@ -210,7 +213,7 @@ class SensorConfig(Section):
     gain_nonuniformity: Annotated[float, Field(ge=0, le=0.5)] = 0.005
     """Standard deviation of the pixels' fixed relative response (PRNU)."""
     hot_pixel_share: Share = 2e-5
-    """Share of hot pixels."""
+    """Share of hot pixels, which have an extra dark signal."""
     hot_pixel_e: Electrons = 6_000.0
     """Mean extra signal of the hot pixels in a 2 ms exposure (exponential distribution), electrons."""
     psf_sigma_px: Annotated[float, Field(ge=0, le=50)] = 0.45
@@ -218,8 +221,8 @@ class SensorConfig(Section):
     motion_blur: bool = True
     """Whether the camera's motion during the exposure blurs the frame."""
     blur_poses: Annotated[int, Field(ge=1, le=256)] = 1
-    """Number of poses during the exposure that are rendered and averaged; blur is exact, at that many times the
-    cost. With 1 a single rendering is blurred along the motion of each pixel."""
+    """Number of poses during the exposure that are rendered and averaged. With 1, a single rendering is blurred along
+    the motion of each pixel. More poses give a more accurate blur, but each pose needs a rendering."""
     row_time_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Time between the exposures of two neighbouring rows (rolling shutter), seconds; 0 exposes all rows at once."""
 
@@ -234,7 +237,8 @@ class RenderConfig(Section):
     """Settings of the renderer."""
 
     engine: Literal["cycles", "heightfield"] = "cycles"
-    """Blender's Cycles, or rays over the height field: faster, but without bounce and earthshine."""
+    """Rendering engine: `cycles` is Blender's. `heightfield` casts rays at the height field; it is faster, but renders
+    no bounce and no earthshine."""
     samples: Annotated[int, Field(ge=1, le=4096)] = 4
     """Camera rays per pixel."""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
@@ -246,7 +250,10 @@ class RenderConfig(Section):
 
 
 class LabelsConfig(Section):
-    """Which craters become labels, by the paper's rule."""
+    """Limits on the radius of labels.
+
+    A crater within these limits is labelled if its centre is in the frame.
+    """
 
     min_radius_px: Pixels = 2.0
     """Smallest radius of a label, sqrt(a b) of its ellipse, pixels."""
@@ -266,7 +273,7 @@ class LabelsConfig(Section):
 
 
 _GROUND_FIELDS = ("start_altitude_m", "end_altitude_m", "downrange_m")
-"""Flight settings that must agree if both kinds share terrain: they set the ground's extent and spacing."""
+"""Flight settings that must agree if both kinds share terrain, since they determine its extent and vertex spacing."""
 _SPREAD_FIELDS = ("position_sigma_m", "attitude_sigma_deg")
 """Flight settings for which shared terrain uses the larger of both kinds' values."""
 
@@ -279,21 +286,21 @@ class DatasetConfig(Section):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     """Random seed; with the name it determines every random stream."""
     shared_terrain: bool = False
-    """Whether both kinds use the same scenes, as in the paper; otherwise each kind has its own."""
+    """Whether the datasets `detect` and `nav` use the same scenes, as in the paper; if not, each has its own."""
     camera: CameraConfig = CameraConfig()
-    """Camera."""
+    """The lander's single camera."""
     cameras: dict[CameraName, MountedCameraConfig] = Field(default_factory=dict)
-    """Several cameras on the body, by name, in place of `camera`; each has its settings and a `mounting`."""
+    """Several cameras on the body, by name, in place of `camera`. Each has its own settings and a `mounting`."""
     terrain: TerrainConfig = TerrainConfig()
-    """Terrain."""
+    """Ground: craters, boulders, relief, elevation model."""
     light: LightConfig = LightConfig()
-    """Reflectance and light sources."""
+    """Reflectance of the ground, and light sources."""
     sensor: SensorConfig = SensorConfig()
-    """Sensor."""
+    """Sensor model of the camera."""
     labels: LabelsConfig = LabelsConfig()
-    """Labels."""
+    """Limits on the radius of crater labels."""
     render: RenderConfig = RenderConfig()
-    """Rendering."""
+    """Rendering engine and its settings."""
     detect: KindConfig
     """Dataset for crater detection."""
     nav: KindConfig
@@ -303,7 +310,7 @@ class DatasetConfig(Section):
     flash_lidar: FlashLidarConfig | None = None
     """Flash lidar beside the camera; null for none."""
     scene: SceneConfig | None = None
-    """One scene whose poses are given, in place of drawn scenes and descents; `perilune-render frames` reads it."""
+    """Scene of commands with given poses, such as `perilune-render frames`; it replaces drawn scenes and descents."""
     survey: SurveyConfig | None = None
     """Images from orbit in place of the descents, over the same ground; `perilune-render survey` sets it."""
     counterfactual: CounterfactualConfig | None = None
@@ -338,7 +345,10 @@ class DatasetConfig(Section):
         return self.counterfactual.removed.get(scene_seed, ()) if self.counterfactual is not None else ()
 
     def ground_flight(self, kind: str) -> FlightConfig:
-        """Flight settings that set the ground of `detect` or `nav`; with `shared_terrain`, both kinds' combined."""
+        """Flight settings that determine the ground of `detect` or `nav`.
+
+        With `shared_terrain`, each standard deviation is the larger of the two kinds' values.
+        """
         if not self.shared_terrain:
             return self.kind(kind).flight
         first, second = self.detect.flight, self.nav.flight

@@ -8,13 +8,13 @@ from perilune_render.config.values import Deviation, Length, Share
 from perilune_shared.config.resolve import Section
 
 _MIN_PX, _MAX_PX = 3, 100
-"""Smallest and largest footprint, pixels: fitting a plane needs 3, and run time grows with the square."""
+"""Smallest and largest footprint, pixels: fitting a plane needs 3, and run time grows with its square."""
 _MAX_SIDE_PX = 2048
 _ROUNDING = 1e-9
 
 
 class HazardConfig(Section):
-    """A hazard map of each scene for a lander of given size: slope, roughness, boulders, shadow, and safe places."""
+    """A hazard map of each scene: slope, roughness, boulders, shadow and safe places for a lander."""
 
     footprint_m: Length = 10.0
     """Diameter of the lander's footprint, metres."""
@@ -25,7 +25,7 @@ class HazardConfig(Section):
     max_slope_deg: Annotated[float, Field(gt=0, lt=90)] = 10.0
     """Largest slope of a safe place, degrees."""
     max_roughness_m: Deviation = 0.5
-    """Largest roughness of a safe place, metres."""
+    """Largest roughness of a safe place (deviation of the surface from a plane fitted to the footprint), metres."""
     max_boulder_m: Deviation = 0.5
     """Largest boulder height at a safe place, metres."""
     max_shadow_share: Share = 1.0
@@ -46,12 +46,12 @@ class HazardConfig(Section):
         return int(self.extent_m / self.pixel_m * (1 + _ROUNDING))
 
     def margin_px(self) -> int:
-        """Width of the border around the map that footprints at its edge cover, pixels."""
+        """Width of the border around the map into which footprints at its edge extend, pixels."""
         return int(self.footprint_m / self.pixel_m / 2 * (1 + _ROUNDING))
 
 
 class FlashLidarConfig(Section):
-    """A flash lidar along the camera's axis, which measures all its pixels at once, at the time of each frame."""
+    """A flash lidar along the camera's axis, which measures all pixels at the time of each frame."""
 
     width_px: Annotated[int, Field(ge=1, le=1024)] = 128
     """Image width, pixels."""
@@ -62,13 +62,13 @@ class FlashLidarConfig(Section):
     range_sigma_m: Deviation = 0.05
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0
-    """Standard deviation of a range that is proportional to the range, as a share of it; adds to range_sigma_m."""
+    """Standard deviation that is added in proportion to the range, share of the range."""
     quantisation_m: Deviation = 0.01
-    """Step of the ranges, metres; 0 for none."""
+    """Step to which ranges are rounded, metres; 0 for no rounding."""
     max_range_m: Length = 2000.0
     """Largest range that the lidar measures, metres."""
     threshold_range_m: Length = 1500.0
-    """Distance at which ground of mean albedo, seen along its normal, returns just enough energy to be detected,
+    """Largest distance at which ground of mean albedo, seen along its normal, returns enough energy to be detected,
     metres."""
     energy_sigma_share: Annotated[float, Field(ge=0, le=1)] = 0.1
     """Standard deviation of the returned energy, share of the energy."""

@@ -1,4 +1,4 @@
-"""Settings of one scene whose poses are given by a file (`perilune-render frames`)."""
+"""Settings of one scene whose poses come from a file or from a client."""
 
 from typing import Annotated
 
@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from perilune_shared.config.resolve import Section
 
 HIGHEST_M = 20_000.0
-"""Largest height of a camera in a scene with horizon, metres; it limits the ground, which extends to the horizon."""
+"""Largest height of a camera in a scene with horizon, metres. It limits the extent of the ground."""
 
 
 class ViewConfig(Section):
@@ -16,25 +16,25 @@ class ViewConfig(Section):
     height_m: Annotated[float, Field(gt=0, le=2e6)]
     """Height of a camera above the ground, metres."""
     reach_m: Annotated[float, Field(gt=0, le=2e6)]
-    """Largest |x| or |y| of the ground that cameras at this height or below show, metres; with `horizon`, largest |x|
-    or |y| of the cameras themselves."""
+    """Largest |x| or |y| of the ground that cameras up to this height show, metres. With `horizon`, it is the largest
+    |x| or |y| of the cameras."""
 
 
 class SceneConfig(Section):
     """One scene with given poses, in place of drawn scenes and descents."""
 
     sun_azimuth_deg: Annotated[float, Field(ge=-720, le=720)] = 90.0
-    """Azimuth of the Sun, clockwise from north, degrees; a column of the poses overrides it."""
+    """Azimuth of the Sun, clockwise from north, degrees; a column of the file of poses overrides it."""
     sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
-    """Elevation of the Sun above the ground plane, degrees; a column of the poses overrides it."""
+    """Elevation of the Sun above the ground plane, degrees; a column of the file of poses overrides it."""
     views: tuple[ViewConfig, ...] = ()
-    """Views for which the ground is made, from the lowest to the highest. They set its extent and the vertex spacing at
-    each distance from the site. By default they follow from the poses."""
+    """Views for which the ground is made, from the lowest to the highest. They determine the extent of the ground and
+    its vertex spacing at each distance from the site. By default, they are derived from the poses."""
     horizon: bool = False
-    """Whether views may show the sky. The ground is then curved and extends to the horizon of a camera at the last
-    view's height; `reach_m` of a view limits where its cameras are."""
+    """Whether frames may show the sky. The ground is then curved and extends to the horizon of a camera at the height
+    of the last view."""
     poses_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    """SHA-256 of the poses; `perilune-render frames` sets it, so that a dataset is not resumed with other poses."""
+    """SHA-256 of the poses; `perilune-render frames` sets it to prevent resuming a dataset with other poses."""
 
     @model_validator(mode="after")
     def _views_ascend(self) -> "SceneConfig":

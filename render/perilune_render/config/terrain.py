@@ -22,7 +22,7 @@ class CratersConfig(Section):
     equilibrium_share: Annotated[Span, Within(0, 100)] = Span(low=0.9, high=1.7)
     """Density of small craters, as a multiple of the equilibrium density, drawn for each scene."""
     min_diameter_spacings: Annotated[float, Field(ge=1.5, le=1000)] = 2.2
-    """Diameter of the smallest crater, local vertex spacings."""
+    """Diameter of the smallest crater, in local vertex spacings."""
     max_diameter_m: Annotated[float, Field(gt=0, le=100_000)] = 800.0
     """Diameter of the largest crater, metres."""
     profile: Literal["fassett_thomson", "pangu"] = "fassett_thomson"
@@ -30,10 +30,10 @@ class CratersConfig(Section):
     depth: Literal["stopar", "pike"] = "stopar"
     """Depth law of fresh craters."""
     irregularity: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """Irregularity of outline and rim height; 0 gives a circle, and at 1 the outline deviates by about 1 % of the
-    radius."""
+    """Irregularity of outline and rim height. At 0 the outline is a circle; at 1 it deviates from one by about 1 % of
+    the radius."""
     flat_floor_share: Share = 0.15
-    """Share of craters that form with a flat floor, as craters in thin regolith over rock do."""
+    """Share of craters that form with a flat floor, as in thin regolith over rock."""
     secondary_share: Share = 0.08
     """Share of craters below 30 m that belong to clusters of secondaries."""
     n_rayed: Annotated[int, Field(ge=0, le=100)] = 4
@@ -48,7 +48,7 @@ class BouldersConfig(Section):
     field_density: Annotated[float, Field(ge=0, le=100_000)] = 100.0
     """Boulder density at the rim of a newly formed crater, as a multiple of the density on the plain."""
     min_diameter_spacings: Annotated[float, Field(ge=0.3, le=1000)] = 0.7
-    """Diameter of the smallest boulder, local vertex spacings."""
+    """Diameter of the smallest boulder, in local vertex spacings."""
     max_diameter_m: Annotated[float, Field(gt=0, le=1000)] = 5.0
     """Diameter of the largest boulder, metres."""
     n_shapes: Annotated[int, Field(ge=1, le=100)] = 12
@@ -56,14 +56,14 @@ class BouldersConfig(Section):
 
 
 class ReliefConfig(Section):
-    """The self-affine relief."""
+    """The self-affine relief of the ground, without craters."""
 
     hurst_exponent: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """Hurst exponent H: slopes fall with wavelength L as L^(H-1)."""
     rms_slope_deg: Annotated[Span, Within(0, 30)] = Span(low=2.0, high=4.5)
     """RMS slope over wavelengths down to 1 m, without craters, drawn for each scene, degrees."""
     longest_wavelength_m: Length = 1600.0
-    """Longest wavelength, metres."""
+    """Longest wavelength of the relief, metres."""
 
     @model_validator(mode="after")
     def _slope_in_range(self) -> "ReliefConfig":
@@ -74,10 +74,10 @@ class ReliefConfig(Section):
 
 Outside = Literal["procedural", "refuse", "mirror"]
 METRES_PER_UNIT = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937, "cm": 0.01, "mm": 0.001}
-"""Units of heights."""
+"""Length of each unit of heights, metres."""
 HeightUnit = Literal["m", "km", "ft", "us-ft", "cm", "mm"]
 SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
-"""Settings that place the site in an elevation model; one pair or none may be set."""
+"""Settings that place the site in an elevation model: set the first two, the last two, or none."""
 FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "vrt_files", "allow_unseen")
 """Settings that supply what the file of an elevation model does not state."""
 
@@ -119,9 +119,10 @@ class ElevationConfig(Section):
     """How an elevation model is used."""
 
     outside: Outside = "procedural"
-    """Ground outside the model: procedural with the model's statistics, an error (refuse), or the model mirrored."""
+    """Ground outside the model: procedural ground with the model's statistics, an error (`refuse`), or the mirrored
+    model."""
     site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    """Latitude of the landing site, degrees; null, like the other site settings, takes the middle of the model."""
+    """Latitude of the landing site, degrees. If all four site settings are null, it is the middle of the model."""
     site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
     """Longitude of the landing site, east positive, degrees."""
     site_column_px: _Place | None = None
@@ -133,20 +134,20 @@ class ElevationConfig(Section):
     band: Annotated[int, Field(ge=1, le=65535)] | None = None
     """Band of the heights, from 1; null takes the only band, or the band that the file describes as heights."""
     nodata: Annotated[float, Field(ge=-1e39, le=1e39)] | None = None
-    """Value of pixels without a height, before scale and offset, in addition to the nodata value in the file."""
+    """Stored value of pixels without a height, in addition to the nodata value in the file."""
     crs: (
         Annotated[str, Field(max_length=5000, pattern=r"^(?i:(EPSG|ESRI|IAU|IAU_\d{4}):\d+$|\+proj=|[A-Z_]+\[)")] | None
     ) = None
     """Coordinate reference system of the model, in place of the one in its file: IAU_2015:30135, +proj=..., or WKT."""
     vrt_files: Annotated[list[str], Field(min_length=1, max_length=10_000)] | None = None
-    """Files that a model in VRT (GDAL's text that joins rasters) may refer to, as paths from its folder."""
+    """Files that a VRT model (a GDAL text file that joins rasters) may refer to, as paths relative to its folder."""
     allow_unseen: bool = False
     """Whether to accept a model that has no heights within the ground in view."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
-    """Columns of the catalogue."""
+    """Columns of the crater catalogue."""
     rims: RimSource = "measured"
-    """Position and size of a catalogue's craters: measured in the model where a rim is found, or taken from the
-    catalogue."""
+    """Source of position and size of a catalogue's craters: measured in the model where a rim is found there, or
+    always taken from the catalogue."""
 
     @model_validator(mode="after")
     def _one_pair(self) -> "ElevationConfig":
@@ -172,27 +173,27 @@ def _pair(first: float | None, second: float | None) -> tuple[float, float] | No
 
 
 class TerrainConfig(Section):
-    """The terrain."""
+    """The terrain: procedural ground, or an elevation model with finer details added."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = -45.5
     """Latitude of the site, degrees; an elevation model overrides it."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing, as a multiple of the smallest ground size of a pixel at that point."""
+    """Vertex spacing at a point of the ground, as a multiple of the smallest pixel size on the ground there."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
-    """Largest number of ground vertices of one mesh (about 450 bytes of memory each). If the ground needs more, each
-    trajectory is rendered with several meshes, each for a band of altitudes. Such ground may have ten times as many
-    vertices in total (70 bytes each while it is generated)."""
+    """Largest number of ground vertices of one mesh (about 450 bytes of memory per vertex). If the ground needs more,
+    each trajectory is rendered with several meshes, each for a range of altitudes; the ground may then have up to ten
+    times this number of vertices (70 bytes per vertex while it is generated)."""
     craters: CratersConfig = CratersConfig()
-    """Craters."""
+    """The crater population."""
     boulders: BouldersConfig = BouldersConfig()
-    """Boulders."""
+    """The boulder population."""
     relief: ReliefConfig = ReliefConfig()
-    """Relief."""
+    """Relief of the ground, without craters."""
     dem: str | None = None
-    """GeoTIFF elevation model that the terrain starts from, or null."""
+    """Path of the elevation model that the terrain is based on; null for procedural ground."""
     elevation: ElevationConfig = ElevationConfig()
     """How the elevation model is used."""
     catalogue: str | None = None
-    """CSV or Parquet catalogue of the model's craters, which become labels, or null."""
+    """Path of a CSV or Parquet catalogue of the model's craters, which become labels; null for none."""

@@ -1,1 +1,1 @@
-"""Files of a dataset: trajectories, parts, resume, regenerate, develop, preview."""
+"""Write datasets: render trajectories, resume, finish, develop EXRs, regenerate frames."""

@@ -1,4 +1,4 @@
-"""Begin or resume a dataset that is rendered or developed, and exclude other writers."""
+"""Begin or resume a dataset, and prevent other runs from writing it at the same time."""
 
 import contextlib
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
 
 
 def camera_records(mounted: MountedCamera) -> tuple[CameraRecord, CameraRecord]:
-    """The records of a camera in dataset.json: for the frames and for the EXRs, with the mounting."""
+    """The records of a camera in dataset.json: one for its frames and one for its EXRs, both with the mounting."""
     x, y, z = mounted.position_in_body_m.tolist()
     mounting = mounted.rotation_camera_from_body, (x, y, z)
     return CameraRecord.of(mounted.camera, *mounting), CameraRecord.of(mounted.exr_camera, *mounting)
@@ -56,9 +56,10 @@ def camera_records(mounted: MountedCamera) -> tuple[CameraRecord, CameraRecord]:
 
 @contextlib.contextmanager
 def writing(store: Store) -> Iterator[None]:
-    """Prevent other runs from writing a dataset, by a lock in a folder or a claim in an object store.
+    """Prevent other runs from writing a dataset until the block ends.
 
-    A finished dataset is not locked, since it may be on a read-only disk. Raises UserError if another run is writing.
+    A folder gets a lock file, an object store a claim. A finished dataset is not locked, since it may be on a read-only
+    disk. Raises UserError if another run is writing.
     """
     if is_complete(store):
         yield
@@ -76,12 +77,12 @@ def is_complete(store: Store) -> bool:
 
 
 def is_begun(store: Store) -> bool:
-    """Whether an address holds a dataset. Raises UserError if it holds something else."""
+    """Whether an address holds a dataset, finished or not. Raises UserError if it holds other files."""
     if store.folder is not None:
-        others = [p.name for p in (store.folder.iterdir() if store.folder.exists() else ()) if not _is_own(p.name)]
+        others = [p.name for p in (store.folder.iterdir() if store.folder.exists() else ()) if not _is_work(p.name)]
     else:
         begun = store.exists(INFO_NAME)
-        others = [] if begun else [item.path for item in store.list() if not _is_own(item.path.partition("/")[0])]
+        others = [] if begun else [item.path for item in store.list() if not _is_work(item.path.partition("/")[0])]
     # Check this last: another process may be starting the same dataset, and it writes dataset.json first.
     begun = store.exists(INFO_NAME)
     if others and not begun:
@@ -90,7 +91,7 @@ def is_begun(store: Store) -> bool:
     return begun
 
 
-def _is_own(name: str) -> bool:
+def _is_work(name: str) -> bool:
     """Whether a file of this name may exist before dataset.json."""
     return name == FOLDER or name.startswith(LOCK_NAME) or TEMPORARY_FILE.fullmatch(name) is not None
 
@@ -98,10 +99,10 @@ def _is_own(name: str) -> bool:
 def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
     """Write the dataset.json of a new dataset, or read the dataset.json of an existing one with the same settings.
 
-    Raises UserError if the address holds anything else.
+    Raises UserError if the address holds other files, or a dataset with other settings or code.
     """
     if not is_begun(store):
-        # Another process may start the same dataset at the same time.
+        # The file exists if another process has started the same dataset in the meantime.
         with contextlib.suppress(FileExistsError):
             store.write(INFO_NAME, info_bytes(info, store.at(INFO_NAME)))
     existing = open_dataset(store).info
@@ -128,7 +129,7 @@ def open_finished(store: Store) -> Dataset:
 
 
 def check_code(recipe: Recipe, *, with_dem: bool) -> None:
-    """Raise UserError if code or libraries of this process differ from a recipe."""
+    """Raise UserError if this process has other code or libraries than a recipe records."""
     current = all_versions(
         with_dem=with_dem,
         engine=recipe.config.get("render", {}).get("engine", "cycles"),
@@ -141,17 +142,17 @@ def check_code(recipe: Recipe, *, with_dem: bool) -> None:
 
 
 def _compared(recipe: Recipe, name: str) -> object:
-    """One field of a recipe, in the form that is compared on resuming."""
+    """A field of a recipe, without release numbers if it is `versions`."""
     return _without_releases(recipe.versions) if name == "versions" else getattr(recipe, name)
 
 
 def _without_releases(versions: dict[str, str]) -> dict[str, str]:
-    """Versions without perilune's release numbers: hashes identify the code."""
+    """Versions without perilune's release numbers, since hashes identify its code."""
     return {name: version for name, version in versions.items() if not name.startswith("perilune")}
 
 
 def first_difference(recorded: object, requested: object, path: str = "") -> str:
-    """The first setting, by name, that differs between two trees of plain data, with both values."""
+    """Text with the name and both values of the first setting that differs between two nested dicts."""
     if isinstance(recorded, dict) and isinstance(requested, dict):
         for key in sorted({*recorded, *requested}):
             if recorded.get(key) != requested.get(key):

@@ -1,7 +1,7 @@
 """Develop a dataset's frames again from their EXRs, with another sensor, or another camera at the same position.
 
-Nothing is rendered, so Blender is not needed. An interrupted run resumes as in rendering: a trajectory is finished once
-its commit is written, as the last step.
+Nothing is rendered, so Blender is not needed. A run that was interrupted resumes with the first trajectory without a
+commit (`dataset/work.py`).
 """
 
 from dataclasses import asdict, dataclass
@@ -42,7 +42,7 @@ from perilune_shared.storage.store import Address, Store, open_store
 
 @dataclass(frozen=True, slots=True)
 class Renderings:
-    """The engine of a developed trajectory: it reads the EXRs of the source instead of rendering."""
+    """Engine that reads the EXRs of one trajectory instead of rendering."""
 
     camera: Camera
     """Camera of the EXRs."""
@@ -61,12 +61,15 @@ class Renderings:
         return cls(camera, np.array(rows[0]["sun_direction"]), source.store, paths)
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int = 0) -> Radiance:
-        """Read the rendering of a random seed. Raises UserError if the file is damaged or of another size."""
+        """Read the EXR that was rendered with a random seed.
+
+        Raises UserError if the file is damaged or has another image size.
+        """
         with local_exr(self.store, self.paths[seed]) as path:
             return read_radiance(path, (self.camera.width_px, self.camera.height_px))
 
     def render_rows(self, poses: RowPoses, seed: int, approach_deg: int = 0) -> Radiance:
-        """Read the rendering of a random seed; the EXR already has a pose for each row."""
+        """Read the EXR that was rendered with a random seed, with a pose for each row."""
         return self.render(*poses.pose_at(0.0), seed, approach_deg)
 
 
@@ -75,9 +78,9 @@ def develop_dataset(
 ) -> Dataset:
     """Make a dataset at `out` from the EXRs of `source`, with changed settings.
 
-    `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only, or the intrinsics in
+    `config_file` and `settings` may change only `dataset.sensor`, `dataset.camera` and the intrinsics in
     `dataset.cameras`. Scenes, craters, boulders and trajectories are copied. With the same camera the labels are copied
-    and only their contrast is measured again; with another camera all labels are computed again. Raises UserError if
+    and only their contrast is measured again. With another camera all labels are computed again. Raises UserError if
     another setting is changed, if the source is incomplete or lacks EXRs, or if the EXRs do not cover the camera's
     view.
     """
@@ -200,7 +203,7 @@ def _rig(source: Dataset, config: DatasetConfig) -> Rig:
 
 
 def _records(source: Dataset, rig: Rig) -> dict[str, Any]:
-    """The fields `camera` and `cameras` of dataset.json with the intrinsics of a rig."""
+    """The fields `camera` and `cameras` of dataset.json, with the intrinsics of a rig's cameras."""
     info = source.info
     if info.cameras is None:
         (name,) = source.table("frames", ["camera"])["camera"].unique().to_pylist()

@@ -1,7 +1,7 @@
 """Finish a dataset: merge the rows of its trajectories, write overview, index and dataset.json, remove work/.
 
-If it is killed at any moment, the same command completes the dataset with the same bytes: dataset.json with `complete`
-is written after all files that it names, and work/ is removed last.
+If the process is killed, the same command completes the dataset with the same bytes. To ensure this, `complete` is set
+in dataset.json after all files that it names are written, and work/ is removed last.
 """
 
 from collections import deque
@@ -27,9 +27,9 @@ from perilune_shared.storage.store import Store
 
 _OVERVIEW = "overview.png"
 _SHEET_FRAMES, _FRAMES_PER_CAMERA, _COLUMNS = 12, 3, 6
-"""Numbers in the overview: frames of a single camera, frames of each camera if there are several, pictures per row."""
+"""Layout of the overview: frames of a single camera, frames per camera if there are several, pictures per row."""
 _AHEAD = 32
-"""Number of reads in flight, since each request to an object store takes tens of milliseconds."""
+"""Number of parallel reads; each request to an object store takes tens of milliseconds."""
 _Name = TypeVar("_Name")
 _Rows = TypeVar("_Rows")
 
@@ -65,7 +65,7 @@ def remove_work(store: Store) -> None:
 
 
 def _read_ahead(read: Callable[[_Name], _Rows], names: Iterable[_Name]) -> Iterator[tuple[_Name, _Rows]]:
-    """Yield each of `names` with the result of `read`, in order; several calls run at the same time."""
+    """Yield each name with the result of `read(name)`, in order; several calls run in parallel."""
     waiting: deque[tuple[_Name, Future[_Rows]]] = deque()
     with ThreadPoolExecutor(_AHEAD) as readers:
         for each in names:
@@ -78,9 +78,9 @@ def _read_ahead(read: Callable[[_Name], _Rows], names: Iterable[_Name]) -> Itera
 
 
 def overview_png(dataset: Dataset) -> bytes:
-    """One picture of frames from the whole dataset, each also with its labels; visible craters are green.
+    """A PNG of frames from the whole dataset, each frame without and with its labels.
 
-    With several cameras, each has a row.
+    Craters that the selection `visible` accepts are green. With several cameras, each camera has a row.
     """
     frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path", "camera"]).to_pandas()
     if dataset.info.cameras is None:
@@ -102,5 +102,5 @@ def overview_png(dataset: Dataset) -> bytes:
 
 
 def _spread(n: int, n_chosen: int) -> np.ndarray:
-    """At most `n_chosen` indices, evenly spread over n."""
+    """At most `n_chosen` indices, evenly spread from 0 to n - 1."""
     return np.unique(np.linspace(0, n - 1, n_chosen).astype(int)) if n else np.empty(0, int)

@@ -1,4 +1,4 @@
-"""Write the files of a frame: the PNG, and on request the EXR and the image of the flash lidar."""
+"""Write the files of a frame: the PNG, and optionally the EXR and the flash lidar image."""
 
 import hashlib
 
@@ -17,7 +17,7 @@ NO_OUTPUTS = FrameOutputs()
 def write_frame(
     out: Address, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool, outputs: FrameOutputs = NO_OUTPUTS
 ) -> dict[str, str | int]:
-    """Write a frame's PNG, with `exr` also the EXR, and the flash lidar image if there is one.
+    """Write a frame's PNG, the EXR if `exr` is true, and the flash lidar image if there is one.
 
     Returns the columns png_*, exr_* and lidar_* of the manifest. Does not wait until the files are on disk.
     """
@@ -32,7 +32,7 @@ def write_frame(
 def frame_contents(
     source: FrameSource, frame: Frame, *, exr: bool, outputs: FrameOutputs = NO_OUTPUTS
 ) -> dict[ImageKind, bytes]:
-    """The contents of a frame's files: the PNG, with `exr` the EXR, and the flash lidar image if there is one."""
+    """The contents of the files that `write_frame` writes."""
     contents: dict[ImageKind, bytes] = {"png": png_bytes(frame.image, source.sensor.bits)}
     if exr:
         contents["exr"] = exr_bytes(frame.radiance, source.crater_index(frame), outputs.channels)
@@ -42,13 +42,16 @@ def frame_contents(
 
 
 def png_bytes(image: np.ndarray, bits: int) -> bytes:
-    """An image (h, w), DN, as PNG. Above 8 bits the PNG has 16: grey values use the upper bits, the rest are 0."""
+    """Encode an image (h, w), DN, as PNG.
+
+    With more than 8 bits, the PNG has 16 bits: the grey values use the upper bits, and the lower bits are 0.
+    """
     stored = image if bits == 8 else image << (16 - bits)
     return cv2.imencode(".png", stored)[1].tobytes()
 
 
 def file_columns(kind: ImageKind | SceneFileKind, path: str, content: bytes) -> dict[str, str | int]:
-    """The columns of a file in the manifest: its path, size and hash, with column names that begin with `kind`."""
+    """The manifest columns of a file: <kind>_path, <kind>_bytes and <kind>_sha256."""
     return {
         f"{kind}_path": path,
         f"{kind}_bytes": len(content),

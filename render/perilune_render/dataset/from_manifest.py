@@ -1,4 +1,4 @@
-"""The plan of a manifest, so that a published dataset can be rendered again with its labels."""
+"""Make a plan from a manifest, to render a published dataset again."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import sha256_of
 
 _SAME_M = 1e-6
-"""Largest difference of a recorded position from its redrawn value, metres, due to rounding on another processor."""
+"""Largest difference between a recorded and a redrawn position, metres; rounding differs between processors."""
 _TURN = "angular_velocity_radps"
 _OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "camera")
 
@@ -36,7 +36,7 @@ _OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "r
 def plan_from_manifest(
     manifest: Dataset, dem: Path | None = None, catalogue: Path | None = None
 ) -> tuple[Plan, DatasetConfig, DatasetInfo]:
-    """The plan of a manifest's scenes, trajectories and frames, the settings, and the initial dataset.json.
+    """The plan, the settings and the initial dataset.json to render a manifest's frames again.
 
     Names, seeds, poses and splits come from the manifest; `dem` and `catalogue` are the user's copies of the files that
     its recipe names. Raises UserError if the manifest has several recipes (merged from different datasets), if its
@@ -91,10 +91,10 @@ def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
     dem = Path(config.terrain.dem) if config.terrain.dem is not None else None
     if dem is None or not dem.is_file():  # a missing file is reported when it is opened
         return
-    found = f"sha256:{sha256_of(dem)}"
+    sha256 = f"sha256:{sha256_of(dem)}"
     for expected in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
-        if not same_source(found, expected):
-            raise UserError("--dem", "", found, expected)
+        if not same_source(sha256, expected):
+            raise UserError("--dem", "", sha256, expected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +106,11 @@ class Recorded(Sequence[TrajectoryPlan]):
     first: np.ndarray
     """Index of the first frame of each trajectory, then the total number of frames (n_trajectories + 1,)."""
     columns: dict[str, np.ndarray]
-    """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
+    """Columns of the table `frames`, ordered by trajectory, then by `frame_index`; arrays (n_frames, ...)."""
     settings: FlightConfig | None
-    """Settings of the flights, which give the motion between frames; None if it is not needed."""
+    """Settings of the flights, from which the motion between frames is drawn; None if this motion is not needed."""
     rig: Rig
-    """Cameras; needed only with `settings`."""
+    """Cameras by name; needed only with `settings`."""
 
     @classmethod
     def of(
@@ -171,7 +171,7 @@ def _flight(
     """The flight of a row of the table `trajectories` and the columns of its frames.
 
     The motion between frames is drawn again from the recorded seed. If it does not pass through the recorded positions,
-    the flight has no motion: the recorded motion was not drawn, or was drawn with other settings.
+    the flight has no motion: the recorded poses were given, or were drawn with other settings.
     """
     position, velocity, acceleration = (
         tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
@@ -185,7 +185,7 @@ def _flight(
 
 
 def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamera | None) -> bool:
-    """Whether a motion of the body passes through the recorded positions of all frames of a camera on the body."""
+    """Whether a motion of the lander's body passes through the recorded positions of one camera's frames."""
     position = columns["position_m"]
     if camera is not None and camera.position_in_body_m.any():
         position = camera.body_position(position, columns["rotation_wxyz"])
@@ -193,7 +193,7 @@ def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamer
 
 
 def compare_hashes(manifest: Dataset, rendered: Dataset) -> tuple[int, int, int]:
-    """Numbers of frames with equal hashes, frames with a hash in the manifest, and scenes with different ground."""
+    """Numbers of frames with equal PNG hashes, frames with a hash in the manifest, and scenes with different ground."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))
         for d in (manifest, rendered)

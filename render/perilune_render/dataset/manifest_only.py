@@ -1,4 +1,4 @@
-"""Write the manifest of a planned dataset for later rendering: scenes, trajectories and poses, without frames."""
+"""Write the manifest of a planned dataset for later rendering: scenes, trajectories and poses, without images."""
 
 import pyarrow as pa
 
@@ -21,7 +21,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 
 _EMPTY = {name: TABLES[name].empty_table() for name in ("craters", "boulders", "labels")}
-"""Tables that a plan leaves out, since they follow from scenes and poses."""
+"""Tables that stay empty, since rendering computes them from scenes and poses."""
 
 
 def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Address, progress: Progress) -> None:
@@ -58,11 +58,11 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
 
 
 def write_left_out_frames(manifest: Dataset, out: Address, progress: Progress) -> None:
-    """Restore the table `frames` of a manifest without it, and write the whole manifest into the new folder `out`.
+    """Restore a manifest's missing table `frames`, and write the whole manifest into the new folder `out`.
 
-    Scenes, trajectories and metadata are copied from the manifest; poses, splits and times are drawn again by its
-    recipe, without generating ground. Raises UserError if the manifest has several recipes or already has its frames,
-    or if its trajectories differ from the recipe's trajectories.
+    Scenes, trajectories and metadata are copied from the manifest. Poses, splits and times are drawn again with its
+    recipe; no ground is generated. Raises UserError if the manifest has several recipes or already has its frames, or
+    if its trajectories differ from the trajectories that the recipe gives.
     """
     info, where = manifest.info, manifest.store.at("dataset.json")
     if len(info.recipes) != 1:
@@ -85,7 +85,7 @@ def write_left_out_frames(manifest: Dataset, out: Address, progress: Progress) -
 
 
 def frames_left_out(manifest: Dataset) -> bool:
-    """Whether a manifest counts frames, but has no row of the table `frames`."""
+    """Whether dataset.json counts frames, but the table `frames` has no rows."""
     return bool(manifest.info.counts.frames) and not manifest.table("frames", ["frame_id"]).num_rows
 
 
@@ -95,7 +95,7 @@ def _frames_of(config: DatasetConfig, plan: Plan, scene: ScenePlan) -> pa.Table:
     kinds = [kind for kind in IMAGE_KINDS if wanted[kind]]
     frames = []
     for trajectory in plan.of_scene(scene.scene_id):
-        ids = [trajectory.frame_id(place) for place in range(len(trajectory.splits))]
+        ids = [trajectory.frame_id(index) for index in range(len(trajectory.splits))]
         paths = [{f"{kind}_path": frame_path(frame_id, kind) for kind in kinds} for frame_id in ids]
         frames.append(tables.frame_table(trajectory, plan.rig[trajectory.camera].camera, scene.sun, paths))
     return pa.concat_tables(frames)

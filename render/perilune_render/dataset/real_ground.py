@@ -1,4 +1,4 @@
-"""Share of a frame that shows real ground, and the outline of the elevation model in it."""
+"""Measure the share of a frame that shows real ground, and draw the outline of the elevation model."""
 
 import cv2
 import numpy as np
@@ -17,9 +17,9 @@ _OUTLINE = (230, 190, 60)
 def real_ground_share(
     scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth_m: np.ndarray
 ) -> float:
-    """Share of a frame's ground pixels that show known ground of the elevation model.
+    """Share of a frame's ground pixels that show ground from the elevation model; 0 if no pixel shows ground.
 
-    Returns 0 without ground pixels. depth_m (h, w) is along the camera's axis, infinite where no ground is hit.
+    `depth_m` (h, w) is the depth along the camera's axis, infinite where a pixel shows no ground.
     """
     hit = np.isfinite(depth_m)
     if not hit.any() or not scene.real.any():
@@ -30,7 +30,10 @@ def real_ground_share(
 
 
 def outline_m(model: ElevationModel) -> Array:
-    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres, without points off the map."""
+    """Points (N, 2) on the edge of an elevation model's raster: x and y in O_L, metres.
+
+    Points without a finite position are left out.
+    """
     rows, columns = model.height_m.shape
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns
@@ -49,7 +52,10 @@ def draw_outline(
     position_m: Array,
     rotation_camera_from_site: Array,
 ) -> None:
-    """Draw the model's outline (N, 2) on a colour picture of a frame, enlarged by any integer factor, in place."""
+    """Draw an elevation model's outline (N, 2) on a colour picture of a frame, in place.
+
+    The picture may be enlarged by an integer factor.
+    """
     scale = picture.shape[1] / camera.width_px
     height = value_at(scene.height_m.astype(np.float64), scene.grid, outline[:, 0], outline[:, 1])
     pixels = camera.project(camera_from_site(np.column_stack([outline, height]), position_m, rotation_camera_from_site))

@@ -48,9 +48,9 @@ from perilune_shared.storage.store import Address, Store, open_store
 GREY_TOLERANCE = 2
 """Largest difference of a pixel within tolerance, grey levels on a scale of 255."""
 RELATIVE_TOLERANCE = 1e-3
-"""Largest difference of an EXR value within tolerance: relative, or absolute for values near 0."""
+"""Tolerance of EXR values, relative and absolute: `rtol` and `atol` of numpy.isclose."""
 OUTLIERS = 0.001
-"""Share of pixels that may differ by more, because a ray hits another facet."""
+"""Largest share of pixels that may exceed the tolerance, because their rays hit another facet."""
 State = Literal["identical", "within tolerance", "different", "new"]
 _ORDER: tuple[State, ...] = ("identical", "new", "within tolerance", "different")
 
@@ -62,7 +62,7 @@ class Outcome:
     frame_id: str
     """Id in the manifest."""
     png: State
-    """Result for the PNG, from the manifest's hash or, if this differs, the dataset's pixels; new without a hash."""
+    """Result for the PNG; new if the manifest has no hash."""
     exr: State | None
     """Result for the EXR; None if the frame has no EXR."""
     lidar: State | None
@@ -89,8 +89,8 @@ def regenerate(
     """Regenerate frames as `out`/frames/<frame_id>.png, .exr and .lidar.exr, and compare them with the manifest.
 
     `dem` and `catalogue` are the user's copies of the files that the recipes name; a path in a recipe is never opened.
-    Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and if `out`
-    holds a dataset.
+    Raises UserError if a frame is not in the manifest, if this version does not support a recipe, or if `out` holds a
+    dataset.
     """
     store = open_store(out)
     if store.exists("dataset.json"):
@@ -114,7 +114,7 @@ def regenerate(
 
 
 def spread(dataset: Dataset, n_frames: int) -> list[str]:
-    """Ids of frames evenly spread over a dataset."""
+    """Ids of up to `n_frames` frames, evenly spread over a dataset."""
     ids = sorted(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
     return [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(n_frames, len(ids))).round().astype(int))]
 
@@ -180,10 +180,7 @@ def _of_scene(
 
 
 def _trajectories(dataset: Dataset, scene_id: str, rows: list[dict]) -> dict[str, dict]:
-    """Rows of the trajectories of a scene by their ids.
-
-    Raises UserError if a frame of `rows` has no trajectory.
-    """
+    """Rows of a scene's trajectories by their ids. Raises UserError if a frame of `rows` has no trajectory."""
     columns = ["trajectory_id", "seed", "nominal_position_m"]
     recorded = dataset.table("trajectories", columns, scene_id=scene_id).to_pylist()
     trajectories = {row["trajectory_id"]: row for row in recorded}
@@ -206,7 +203,7 @@ def _check_cameras(dataset: Dataset, rows: list[dict], rig: Rig) -> None:
 
 
 def _wanted(config: DatasetConfig, rows: list[dict]) -> DatasetConfig:
-    """The settings without outputs that no frame of `rows` has."""
+    """The settings, without hazard map and flash lidar if no frame of `rows` has their outputs."""
     has_exrs, has_lidar = (any(row[f"{kind}_path"] is not None for row in rows) for kind in ("exr", "lidar"))
     channels = config.hazard is not None and config.hazard.frame_channels and has_exrs
     hazard, lidar = config.hazard if channels else None, config.flash_lidar if has_lidar else None
@@ -214,7 +211,7 @@ def _wanted(config: DatasetConfig, rows: list[dict]) -> DatasetConfig:
 
 
 def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> DatasetConfig:
-    """The settings of ground and EXRs; for a developed dataset, these include the camera of its source."""
+    """The settings of ground and EXRs. Those of a developed dataset have the camera of its source."""
     origin = recipe.developed_from
     if origin is None:
         return config
@@ -228,7 +225,7 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> Data
 
 
 def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Store, new: dict[str, Any]) -> State:
-    """Compare a new file with the recorded hash and, if it differs, with the pixels of the old file, if present."""
+    """Compare a new file with the recorded hash, then, if the hash differs, with the pixels of an existing old file."""
     if row[f"{kind}_sha256"] is None:
         return "new"
     if new[f"{kind}_sha256"] == row[f"{kind}_sha256"]:

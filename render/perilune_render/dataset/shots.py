@@ -1,4 +1,4 @@
-"""Shots of a dataset's frames: from a plan, or from rows of a manifest."""
+"""Build the shot (pose, motion and random seed) of a frame from a plan or from a row of a manifest."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from perilune_shared.geometry.frames import matrix_from_quaternion
 
 
 def planned_shot(trajectory: TrajectoryPlan, index: int) -> Shot:
-    """The shot of a frame of a planned trajectory, by the frame's index in the trajectory."""
+    """The shot of the frame at `index` in a planned trajectory."""
     flight = trajectory.flight
     turn = flight.angular_velocity_radps
     return Shot(
@@ -27,7 +27,10 @@ def planned_shot(trajectory: TrajectoryPlan, index: int) -> Shot:
 
 
 def recorded_shot(row: dict[str, Any], trajectory_seed: int, approach_deg: int = 0) -> Shot:
-    """The shot of a row of the manifest's table `frames`; `approach_deg` is needed only for rendering."""
+    """The shot of a row of the manifest's table `frames`.
+
+    `approach_deg` is needed only for rendering.
+    """
     return Shot(
         np.array(row["position_m"]),
         matrix_from_quaternion(row["rotation_wxyz"]),

@@ -1,4 +1,4 @@
-"""Rows of the manifest's tables, from scenes, plans and labels."""
+"""Build the rows of the manifest's tables from scenes, plans and labels."""
 
 import numpy as np
 import pyarrow as pa
@@ -36,7 +36,7 @@ def _vectors(values: ArrayLike) -> pa.Array:
 
 
 def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
-    """Parts of the tables `craters` and `boulders` for one scene."""
+    """Rows of the tables `craters` and `boulders` of one scene."""
     craters, rims, boulders = scene.craters, scene.rims, scene.boulders
     latitude, longitude = selenographic_from_site(craters.x_m, craters.y_m, scene.latitude_deg, scene.longitude_deg)
     return {
@@ -82,9 +82,10 @@ def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
 def scene_tables(
     plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str, files: dict | None = None
 ) -> dict[str, pa.Table]:
-    """Parts of the tables `scenes`, `craters` and `boulders` for one scene.
+    """Rows of the tables `scenes`, `craters` and `boulders` of one scene.
 
-    `recipe` is the key of the scene's recipe; `files` holds the columns of the scene's files, such as hazard_*.
+    `recipe` is the key of the scene's recipe. `files` holds the columns that describe the scene's files, such as
+    `hazard_path`.
     """
     ground = ground_tables(plan.scene_id, scene)
     return {
@@ -110,7 +111,7 @@ def scene_tables(
 
 
 def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
-    """Part of the table `trajectories` for one scene."""
+    """Rows of the table `trajectories`."""
     nominal = [trajectory.flight.nominal for trajectory in trajectories]
     return _table(
         "trajectories",
@@ -129,9 +130,10 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory.
+    """Rows of the table `frames` of one trajectory.
 
-    `files` holds each frame's file and measurement columns.
+    `files` holds, for each frame, the columns that describe its files, and `real_ground_share` and
+    `n_craters_above_max_radius` if they are known.
     """
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
@@ -157,10 +159,10 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
 def measurement_tables(
     trajectory: TrajectoryPlan, scene: Scene, config: InstrumentsConfig, *, at_frames: bool
 ) -> dict[str, pa.Table]:
-    """Parts of the tables `inertial` and `ranges` for one trajectory, without empty parts.
+    """Rows of the tables `inertial` and `ranges` of one trajectory; a table without rows is left out.
 
-    If the motion between frames is unknown, there are no measurements, except that `at_frames` gives a range for each
-    frame.
+    Inertial measurements need the motion between frames. If this motion is unknown, ranges are measured only with
+    `at_frames`, and only at the time of each frame.
     """
     motion = trajectory.flight.motion
 
@@ -188,7 +190,10 @@ def measurement_tables(
 
 
 def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:
-    """The part `table` of the table `frames` with a different camera and different files (see `frame_table`)."""
+    """Rows of the table `frames` with a different camera and different files.
+
+    `files` holds columns as in `frame_table`.
+    """
     columns = {name: table[name] for name in table.column_names}
     columns |= {name: [getattr(camera, name)] * len(table) for name in _CAMERA}
     renewed = (*_FILES, *(name for name in _OF_LABELS if name in files[0]))
@@ -196,7 +201,7 @@ def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) ->
 
 
 def label_table(frame_id: str, labels: Labels) -> pa.Table:
-    """Rows of the table `labels` for one frame, without the columns that repeat columns of the frame."""
+    """Rows of the table `labels` of one frame, without the columns that are copied from the table `frames`."""
     e, boxes = labels.ellipses, labels.ellipses.bounding_boxes()
     return _columns(
         "labels",

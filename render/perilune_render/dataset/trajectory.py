@@ -1,4 +1,4 @@
-"""Render one trajectory: its images, labels and rows of `frames`."""
+"""Render one trajectory: write its images, its labels and its rows of the table `frames`."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -32,7 +32,7 @@ class SceneSetting:
     instruments: InstrumentsConfig
     """Instruments on the lander."""
     outputs: SceneOutputs = field(default_factory=SceneOutputs)
-    """Additional outputs beside the frames."""
+    """Additional outputs, such as flash lidar images; none by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,7 @@ def render_trajectory(
     """Render and write one trajectory into the dataset at `out`; returns the ids of its dark frames.
 
     `source` renders the scene. A second thread develops, labels and writes each frame while the next one is rendered.
-    `advance` is called after each frame, in order. The same arguments give the same bytes; a trajectory whose rendering
-    was interrupted is rendered from its start.
+    `advance` is called after each frame, in order. The same arguments give the same bytes.
     """
     frames: list[_Written] = []
     for frame in _frames(out, source, trajectory, of_scene):
@@ -73,7 +72,7 @@ def render_trajectory(
 
 
 def _frames(out: Store, source: FrameSource, trajectory: TrajectoryPlan, of_scene: SceneSetting) -> Iterator[_Written]:
-    """Render and write the frames of a trajectory, in order; rendering is one frame ahead of writing."""
+    """Render and write the frames of a trajectory in order. The next frame is rendered while one is written."""
 
     def written(index: int, shot: Shot, radiance: Radiance) -> _Written:
         frame = source.develop(shot, radiance)
@@ -95,7 +94,7 @@ def _frames(out: Store, source: FrameSource, trajectory: TrajectoryPlan, of_scen
 
 
 def _labelled(frame_id: str, files: dict[str, str | int], source: FrameSource, frame: Frame, scene: Scene) -> _Written:
-    """Label a frame whose files are written; `files` holds their columns."""
+    """Label a frame. `files` holds the columns that describe its written files."""
     share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
     labels = source.labels(frame)
     row = {**files, "real_ground_share": share, "n_craters_above_max_radius": labels.n_above}

@@ -4,8 +4,9 @@
     work/<table>/<scene>.<trajectory>.parquet  frames, labels, inertial, ranges: the rows of a trajectory
     work/index/<scene>.<trajectory>.parquet    commit of a trajectory: its files and rows, with sizes and hashes
 
-The commit is written last: a trajectory is finished once its commit exists. Before that, everything is written again,
-since a killed attempt may have left any part of it. `finish` merges these files into the tables of the dataset.
+The commit is written last: a trajectory is finished once its commit exists. A trajectory without a commit is written
+again from its start, since a killed run may have left any part of it. `finish` merges these files into the tables of
+the dataset.
 """
 
 import hashlib
@@ -26,20 +27,20 @@ FOLDER = "work"
 OF_SCENE = ("scenes", "craters", "boulders", "trajectories")
 """Tables with a file for each scene."""
 OF_TRAJECTORY = ("frames", "labels", *OPTIONAL_TABLES)
-"""Tables with a file for each trajectory; optional ones only if they have rows."""
+"""Tables with a file for each trajectory; optional tables have a file only if they have rows."""
 
 
 def committed(store: Store) -> set[str]:
-    """Names of all finished trajectories, such as scene-0000.trajectory-0000, by one listing."""
+    """Names of all finished trajectories, such as scene-0000.trajectory-0000."""
     listed = (item.path for item in store.list(f"{FOLDER}/index"))
     return {stem_of(path) for path in listed if path.endswith(".parquet") and not stem_of(path).startswith(".")}
 
 
 def commit(store: Store, labels: list[pa.Table], frames: pa.Table, measurements: Mapping[str, pa.Table]) -> None:
-    """Write the rows of a trajectory whose files are written, then its commit.
+    """Write the table rows of a trajectory, then its commit. The files of its frames must exist already.
 
-    `labels` holds the labels of each frame, `frames` the rows of all frames, `measurements` the rows of optional
-    tables.
+    `labels` holds one table of labels for each frame, `frames` the rows of all frames, `measurements` the rows of the
+    optional tables `inertial` and `ranges`.
     """
     name = ".".join(frames[key][0].as_py() for key in ("scene_id", "trajectory_id"))
     tables = {"frames": frames, "labels": with_frame_columns(pa.concat_tables(labels), frames), **measurements}
@@ -52,7 +53,7 @@ def commit(store: Store, labels: list[pa.Table], frames: pa.Table, measurements:
 def write_scene(store: Store, scene_id: str, tables: Mapping[str, pa.Table]) -> None:
     """Write the rows of a scene unless they exist; the table `scenes` is written last.
 
-    Raises UserError if the dataset has other craters or boulders in this scene.
+    Raises UserError if the existing rows of this scene have different craters or boulders.
     """
     path = _path("scenes", scene_id)
     if store.exists(path):
@@ -75,13 +76,13 @@ def scene_rows(store: Store, scene_id: str) -> dict[str, pa.Table]:
 
 
 def trajectory_rows(store: Store, name: str) -> tuple[dict[str, pa.Table], pa.Table]:
-    """The rows of a finished trajectory by table, and the rows of its frames' files in the index.
+    """The rows of a finished trajectory by table, and the index rows of its frames' files.
 
-    Raises UserError if its rows differ from its commit.
+    Raises UserError if a hash differs from the commit.
     """
-    committed = Part(store, _path("index", name), "index", INDEX).read()
-    n_tables = sum(path.startswith(f"{FOLDER}/") for path in committed["path"].to_pylist())
-    listed = {row["path"]: row for row in committed.slice(0, n_tables).to_pylist()}
+    commit_rows = Part(store, _path("index", name), "index", INDEX).read()
+    n_tables = sum(path.startswith(f"{FOLDER}/") for path in commit_rows["path"].to_pylist())
+    listed = {row["path"]: row for row in commit_rows.slice(0, n_tables).to_pylist()}
     tables = {}
     for table in OF_TRAJECTORY:
         path = _path(table, name)
@@ -94,7 +95,7 @@ def trajectory_rows(store: Store, name: str) -> tuple[dict[str, pa.Table], pa.Ta
             expected = f"SHA-256 {recorded['sha256']}; delete {_path('index', name)} to render the trajectory again"
             raise UserError(store.at(path), "SHA-256", "a different SHA-256", expected)
         tables[table] = pq.read_table(pa.BufferReader(content))
-    return tables, committed.slice(n_tables)
+    return tables, commit_rows.slice(n_tables)
 
 
 def _path(table: str, name: str) -> str:

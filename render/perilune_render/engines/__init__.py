@@ -1,1 +1,1 @@
-"""Engines that render a frame: Blender (Cycles), and rays over the height field without Blender."""
+"""Engines that render a frame: Blender's Cycles, and ray casting at the height field."""

@@ -1,4 +1,4 @@
-"""The frame source: makes a frame from a pose and a random seed, with any rendering engine.
+"""The frame source makes a frame from a pose and a random seed, with any rendering engine.
 
     with Renderer(scene, config, exr_camera, sun) as engine:
         source = FrameSource.of(engine, config, camera, RimCircles.of_scene(scene))
@@ -43,8 +43,8 @@ class Shot:
     index: int = 0
     """Index of the frame in the sequence. Frames that differ in seed or index have independent noise."""
     approach_deg: int = 0
-    """Direction from which the trajectory comes (`NominalTrajectory.approach_deg`); used only if the ground has several
-    levels (`perilune_render.terrain.levels`)."""
+    """Direction from which the trajectory comes (`NominalTrajectory.approach_deg`). It matters only if the ground is
+    too large for one mesh (`perilune_render.terrain.levels`)."""
     angular_velocity_radps: Array = field(default_factory=lambda: np.zeros(3))
     """Angular velocity of the camera, O_C, radians per second (3,)."""
 
@@ -75,7 +75,7 @@ class Engine(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """Camera of the renderings, without distortion; its image covers the view of the frames' camera."""
+        """Camera of the renderings, without distortion. It covers the view of the camera of the frames."""
 
     @property
     def sun(self) -> Array:
@@ -104,7 +104,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class FrameSource:
-    """Takes frames of one lit scene with one sensor, and labels them. Create it with `FrameSource.of`."""
+    """Renders and labels frames of one lit scene with one sensor. Create it with `FrameSource.of`."""
 
     engine: Engine
     """Renders the radiance."""
@@ -117,16 +117,17 @@ class FrameSource:
     pattern: FixedPattern
     """Fixed pattern of the sensor."""
     bounds: LabelsConfig
-    """Limits on the radius of labels."""
+    """Smallest and largest radius of labels."""
 
     @classmethod
     def of(
         cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles, name: str | None = None
     ) -> "FrameSource":
-        """The source for a configuration, whose seed determines the fixed pattern of the sensor.
+        """The frame source of a configuration.
 
-        `name` is the name of the camera if there are several: each has its own fixed pattern. Raises ValueError
-        if the engine's camera does not cover the view of `camera`.
+        The random seed of the configuration determines the fixed pattern of the sensor. If there are several cameras,
+        `name` is the name of `camera`, since each camera has its own pattern. Raises ValueError if the engine's camera
+        does not cover the view of `camera`.
         """
         if not engine.camera.covers(camera):
             raise ValueError(f"camera of the engine: got {engine.camera}, expected a camera that covers {camera}")
@@ -134,13 +135,17 @@ class FrameSource:
         return cls(engine, camera, circles, config.sensor, pattern, config.labels)
 
     def take(self, shot: Shot) -> Frame:
-        """Render and develop one frame. Raises the engine's errors, such as OSError if Blender wrote no frame."""
+        """Render and develop one frame.
+
+        Raises the engine's errors, for example OSError if Blender wrote no frame.
+        """
         return self.develop(shot, self.render(shot))
 
     def render(self, shot: Shot) -> Radiance:
-        """The engine's rendering of a shot, in the pixels of its camera. Raises the engine's errors.
+        """The engine's rendering of a shot, in the pixels of the engine's camera. Raises the engine's errors.
 
-        If `sensor.blur_poses` is above 1 and the camera moves, `blurred` is the mean of renderings at these poses.
+        With motion blur, a moving camera and `sensor.blur_poses` above 1, `Radiance.blurred` is the mean of this number
+        of renderings during the exposure.
         """
         middle = self._render_at(shot, 0.0, shot.render_seed)
         n = self.sensor.blur_poses
@@ -154,7 +159,7 @@ class FrameSource:
         return replace(middle, blurred=(total / n).astype(np.float32))
 
     def _render_at(self, shot: Shot, time_s: float, seed: int) -> Radiance:
-        """The rendering `time_s` seconds from the middle of the exposure, with a pose per row for a rolling shutter."""
+        """The rendering `time_s` seconds after the middle of the exposure."""
         if not self._rolls(shot):
             return self.engine.render(*shot.pose_at(time_s), seed, shot.approach_deg)
         return self.engine.render_rows(self._row_poses(shot, time_s), seed, shot.approach_deg)
@@ -164,14 +169,14 @@ class FrameSource:
         return bool(self.sensor.row_time_s) and shot.moves
 
     def _row_poses(self, shot: Shot, time_s: float = 0.0) -> RowPoses:
-        """Poses of the rows of a shot `time_s` seconds from the middle of the exposure."""
+        """Poses of the rows of a shot, `time_s` seconds after the middle of the exposure."""
         times_s = row_times_s(self.camera.height_px, self.sensor.row_time_s)
         return RowPoses(sensor_rows(self.camera, self.engine.camera), times_s, lambda t: shot.pose_at(time_s + t))
 
     def places_m(self, frame: Frame) -> Array:
-        """Points (h, w, 3), O_L, metres, that the engine's camera sees, each from the pose of its row.
+        """Points (h, w, 3), O_L, metres, that the pixels of the engine's camera show; NaN for sky.
 
-        Returns NaN for sky.
+        With a rolling shutter, each row of pixels has its own pose.
         """
         shot, camera, depth_m = frame.shot, self.engine.camera, frame.radiance.depth_m.astype(np.float64)
         depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan)[..., None]
@@ -184,7 +189,10 @@ class FrameSource:
         return depth_m * np.stack(turned, axis=-1) + position[rows.row]
 
     def develop(self, shot: Shot, radiance: Radiance) -> Frame:
-        """Develop the rendering of a shot. Another thread may do this while the engine renders the next shot."""
+        """Apply the sensor model to the rendering of a shot.
+
+        Another thread may do this while the engine renders the next shot.
+        """
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
         turn = shot.angular_velocity_radps
         exposure = expose(radiance, self.sensor, self.camera, self.engine.camera, velocity, turn)
@@ -204,7 +212,7 @@ class FrameSource:
         return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, grey)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
-        """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32, -1 for none."""
+        """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32; -1 without a crater."""
         circles = self._seen_circles(frame.shot)
         return crater_index(circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
 

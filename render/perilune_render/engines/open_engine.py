@@ -1,4 +1,4 @@
-"""Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays cast at the height field)."""
+"""Open the engine of a configuration: `cycles` (Blender) or `heightfield` (ray casting)."""
 
 import contextlib
 from contextlib import AbstractContextManager
@@ -22,8 +22,8 @@ def open_engine(
 ) -> AbstractContextManager[Engine]:
     """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L.
 
-    Use it as a context manager. The engine `heightfield` builds the surface of the scene unless `surface` is given.
-    Raises UserError if the engine cannot be loaded or does not render what the configuration asks for.
+    Use the engine as a context manager. The engine `heightfield` builds the surface of the scene unless `surface` is
+    given. Raises UserError if the engine cannot be loaded or cannot render the light of the configuration.
     """
     if config.render.engine == "heightfield":
         from perilune_render.engines.heightfield.engine import HeightfieldEngine
@@ -31,7 +31,7 @@ def open_engine(
         return HeightfieldEngine(scene, config, camera, sun, config.render.threads or usable_cores(), surface)
     check_installed(config.render.engine)
     try:
-        # Importing Blender takes a second, and only this engine needs it.
+        # Import Blender only for this engine, since the import takes a second.
         from perilune_render.engines.blender.renderer import Renderer
     except ImportError as error:
         # The module is installed, so a system library is missing.

@@ -14,10 +14,7 @@ def is_dark(radiance: Radiance) -> bool:
 
 
 def warn_of_dark_frames(scene_id: str, dark: Sequence[str], n_frames: int, sun_elevation_deg: float) -> None:
-    """Print a warning if some of a scene's `n_frames` new frames are dark.
-
-    `dark` holds the ids of the dark frames.
-    """
+    """Print a warning if some of a scene's `n_frames` new frames are dark; `dark` holds their ids."""
     if dark:
         line = (
             f"warning: {scene_id}: {len(dark)} of {n_frames} frames are dark (less than {_MIN_SUNLIT:.0%} of the "

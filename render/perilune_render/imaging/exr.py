@@ -1,4 +1,4 @@
-"""Read the EXR files that Blender writes; make and read the EXR files of datasets."""
+"""Read the EXR files that Blender writes; create and read the EXR files of datasets."""
 
 import contextlib
 import io
@@ -21,13 +21,16 @@ CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
 def exr_bytes(radiance: Radiance, crater: np.ndarray, more: Mapping[str, np.ndarray] | None = None) -> bytes:
-    """An EXR file of a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), then `more`."""
+    """The content of a frame's EXR file: CHANNELS and the channels in `more`, (h, w) float32.
+
+    The channel `sunlit` is 0 or 1; the channel `crater` is a crater id, or -1 without a crater.
+    """
     values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
     return channel_bytes(dict(zip(CHANNELS, values, strict=True)) | dict(more or {}))
 
 
 def channel_bytes(channels: Mapping[str, np.ndarray]) -> bytes:
-    """An EXR file of named channels (h, w), stored as float32 without loss."""
+    """The content of an EXR file with named channels (h, w), stored as float32 with lossless compression."""
     stored = {name: np.ascontiguousarray(value, np.float32) for name, value in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     stream = io.BytesIO()
@@ -37,7 +40,10 @@ def channel_bytes(channels: Mapping[str, np.ndarray]) -> bytes:
 
 @contextlib.contextmanager
 def local_exr(store: Store, path: str) -> Iterator[Path]:
-    """Yield the path of an EXR of a dataset: OpenEXR reads only files, so an object is first copied to disk."""
+    """Yield a local path of a dataset's EXR.
+
+    OpenEXR reads only local files, so an EXR in a remote store is first copied into a temporary file.
+    """
     if store.folder is not None:
         yield files.inside(store.folder, path)
         return
@@ -48,7 +54,7 @@ def local_exr(store: Store, path: str) -> Iterator[Path]:
 
 
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
-    """Channels (h, w) by name.
+    """Read the channels (h, w) of an EXR file, by name.
 
     Raises UserError if the file is missing, damaged or not of `size_px` (width, height). A small file may decompress to
     any size, so the header is checked before the pixels are read.
@@ -65,7 +71,7 @@ def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np
 
 
 def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | None) -> None:
-    """Raise UserError if an EXR file is too large to read, or has several parts or subsampled channels."""
+    """Raise UserError for a wrong size, too many pixels or channels, or an unusual structure."""
     if len(image.parts) != 1:
         raise UserError(path, "parts", len(image.parts), "one")
     header = image.parts[0].header

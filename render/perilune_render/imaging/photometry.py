@@ -1,12 +1,13 @@
 """Reflectance laws of the lunar surface, written once for NumPy arrays and for Blender's shader.
 
-Theory: a law gives the reflectance factor as a function of mu0 = cos incidence, mu = cos emission and the cosine of the
-phase angle. The reflectance factor is the radiance divided by the radiance of a perfectly diffusing plate under the
-same light. Multiplied by mu0, it is the radiance factor I/F: the radiance divided by the radiance of the plate lit from
-the zenith. The phase angle equals i + e in the principal plane only.
+Theory: a law gives the reflectance factor as a function of mu0 = cos i, mu = cos e and the cosine of the phase angle g,
+where i is the angle of incidence and e the angle of emission. The reflectance factor is the radiance divided by the
+radiance of a perfectly diffusing plate under the same light. Multiplied by mu0, it is the radiance factor I/F: the
+radiance divided by the radiance of the plate lit from the zenith. The phase angle equals i + e only in the principal
+plane and if Sun and observer are on opposite sides of the normal.
 
-`perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law; a test checks that the results are equal
-to the bit.
+`perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law. A test checks that the results of both
+are equal to the bit.
 
 Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
 that `perilune_render.engines.blender.nodes` can call them with symbols and build shader nodes from the same code.
@@ -39,7 +40,7 @@ class HapkeParameters:
     b_s0: float
     """Amplitude of the shadow-hiding opposition surge."""
     h_s: float
-    """Width of the surge, the value of tan(g/2) at which it has half its amplitude."""
+    """Width of the surge: the value of tan(g/2) at which the surge falls to half of b_s0."""
     theta_bar_deg: float = 23.657
     """Mean slope of macroscopic roughness, > 0, degrees (Sato et al. 2014)."""
 
@@ -52,9 +53,8 @@ MEAN = HapkeParameters(0.2242, 0.24575, 0.2425, 1.8395, 0.06345)
 """Parameters for the mean Moon: b, c, B_S0 and h_S are midway between mare and highland; we fitted w.
 
 With this w, the ratio of the law to a published fit to NAC images has a mean of 1 for incidences of 5 to 80 degrees in
-nadir view.
-The published fit is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to 1.19 up to 70 degrees and
-falls to 0.63 at 80 degrees, where the law is darker than the fit.
+nadir view. The published fit is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to 1.19 up to 70
+degrees and falls to 0.63 at 80 degrees, where the law is darker than the fit.
 """
 
 
@@ -83,12 +83,13 @@ def hapke(parameters: HapkeParameters, mu0: Any, mu: Any, cos_phase: Any) -> Any
 
 
 def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[Any, Any, Any]:
-    """Hapke's correction for a surface of mean slope theta_bar (Hapke 1984, doi 10.1016/0019-1035(84)90054-X).
+    """Hapke's correction for a surface of mean slope theta_bar.
 
-    Returns the effective cosines of the larger and the smaller of incidence and emission, and S / (mu0 mue). Hapke
-    gives two cases, i <= e and e <= i, which differ only by exchanging the two angles. If the angles are ordered by
-    size, only one case remains, with the same S / (mu0 mue). The formulas follow chapter 12 of Hapke's book of 2012. In
-    this form, S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
+    Source: Hapke 1984, doi 10.1016/0019-1035(84)90054-X.
+    Returns the effective cosines of the larger and of the smaller angle of i and e, and S / (mu0 mue). Hapke gives two
+    cases, i <= e and e <= i, which differ only by exchanging the two angles. Ordering the angles by size leaves one
+    case, with the same S / (mu0 mue). The formulas follow chapter 12 of Hapke's book of 2012. In this form, S exceeds 1
+    at grazing angles, by at most 7 percent up to 85 degrees.
     """
     slope, chi = slope_of(theta_bar_deg), chi_of(theta_bar_deg)
     # Cosines of the larger and the smaller angle.
@@ -136,16 +137,17 @@ def lommel_seeliger(mu0: Any, mu: Any, cos_phase: Any) -> Any:
 
 
 LUNAR_LAMBERT_SCALE = 0.0503
-"""Fitted by us, as `MEAN`; the ratio to the published fit is 0.63 at 5 degrees, rises to 1.28, and is 0.89 at 80."""
+"""Scale of `lunar_lambert`, which we fitted as for `MEAN`. The ratio of the law to the published fit is 0.63 at an
+incidence of 5 degrees, rises to 1.28, and is 0.89 at 80 degrees."""
 
 
 def lunar_lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
     """McEwen's lunar-Lambert law, I/F = scale [2 L mu0/(mu0+mu) + (1-L) mu0].
 
     L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees (McEwen 1991, doi 10.1016/0019-1035(91)90053-V). The
-    polynomial is valid up to g = 104 degrees, where it falls below 0; beyond, L is 0. The law describes how brightness
-    varies over a surface at one phase angle. Deviation: McEwen fits a factor that falls with the phase angle to each
-    image; here this factor is constant.
+    polynomial is valid up to g = 104 degrees, where it falls below 0; at larger angles, L is 0. The law describes how
+    brightness varies over a surface at one phase angle. Deviation: McEwen fits the scale to each image, and it falls
+    with the phase angle; here the scale is constant.
     """
     g = np.arccos(np.minimum(np.maximum(cos_phase, -1), 1)) * (180 / np.pi)
     share = np.maximum(1 + g * (-0.019 + g * (2.42e-4 + g * -1.46e-6)), 0)
@@ -168,7 +170,7 @@ LAWS: dict[str, Law] = {
 
 
 def reflectance_factor(law: str, mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """Return I/F of a named law, divided by mu0, for mu0, mu > 0.
+    """I/F of a named law, divided by mu0, for mu0, mu > 0; arrays broadcast.
 
     A diffuse shader with this value as its colour has the radiance I/F.
     """

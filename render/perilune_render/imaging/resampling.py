@@ -1,4 +1,4 @@
-"""Resample the image of one camera to another camera at the same pose: lens distortion, other intrinsics."""
+"""Resample the image of one camera to another camera at the same pose."""
 
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -13,8 +13,9 @@ from perilune_shared.geometry.camera import Camera
 def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
     """Resample an image (h, w) of the camera `source` to `camera` (Lanczos, 8 x 8 px).
 
-    It is unchanged if both cameras are equal. `source` must cover the view of `camera`. OpenCV rounds sample positions
-    to 1/32 px. If the pixels of `source` are finer, several samples per pixel are averaged, to avoid aliasing.
+    If both cameras are equal, the image is returned unchanged. `source` must cover the view of `camera`. OpenCV rounds
+    sample positions to 1/32 px. If the pixels of `source` are finer, several samples per pixel are averaged to avoid
+    aliasing.
     """
     if camera == source:
         return image
@@ -45,7 +46,7 @@ def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
 
 
 def refined(camera: Camera, n: int) -> Camera:
-    """The same view with each pixel divided into n x n."""
+    """A camera with the same view and each pixel divided into n x n pixels."""
     return replace(
         camera,
         width_px=n * camera.width_px,
@@ -59,6 +60,9 @@ def refined(camera: Camera, n: int) -> Camera:
 
 @lru_cache(maxsize=4)
 def _places(camera: Camera, source: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row (h, w) float32 in `source` of each pixel centre, 0 at the first pixel's centre as in OpenCV."""
+    """Column and row (h, w) float32 in `source` of each pixel centre of `camera`.
+
+    As in OpenCV, the centre of the first pixel is at 0.
+    """
     pixel = source.project(camera.rays(camera.pixel_centres())) - 0.5
     return pixel[..., 0].astype(np.float32), pixel[..., 1].astype(np.float32)

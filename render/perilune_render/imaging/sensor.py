@@ -7,8 +7,8 @@ gain, grey values (DN) per electron. mu_y and sigma_y^2 are the temporal mean an
     mu_y = K (eta mu_p + mu_d) + black level,    mu_d = dark current x t
     sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark),    sigma_d^2 = read noise^2 + mu_d
 
-Between pixels, eta varies by the PRNU, and mu_d by the DSNU and the hot pixels. All frames of a dataset share this
-pattern.
+From pixel to pixel, eta varies by the PRNU, and mu_d varies by the DSNU and the hot pixels. All frames of one camera in
+a dataset share this pattern.
 """
 
 from dataclasses import dataclass
@@ -26,11 +26,11 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 _STRETCH = 1.5
-"""Approximate bound on how much distortion stretches motion at the image edges."""
+"""Approximate upper bound on the factor by which distortion stretches motion at the image edges."""
 _MIN_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
 _FAINT_E = 100.0
-"""Signal above which a rounded Gaussian approximates Poisson noise, ten times faster, electrons."""
+"""Signal above which a rounded Gaussian approximates Poisson noise, electrons. It takes a tenth of the time."""
 HOT_PIXEL_S = 0.002
 """Exposure time to which `hot_pixel_e` refers, seconds; the signal is proportional to the exposure time."""
 
@@ -48,7 +48,7 @@ class FixedPattern:
 
     @classmethod
     def draw(cls, config: SensorConfig, camera: Camera, seed: int) -> "FixedPattern":
-        """Draw the sensor of a dataset from the random seed of the dataset."""
+        """Draw the fixed pattern of a sensor from a random seed."""
         rng = stream(seed, "sensor")
         shape = camera.height_px, camera.width_px
         response = 1 + config.gain_nonuniformity * rng.standard_normal(shape, np.float32)
@@ -76,11 +76,11 @@ def expose(
     velocity_camera_mps: Array,
     angular_velocity_radps: Array | None = None,
 ) -> Exposure:
-    """The light on the sensor of `camera`: resampling, point spread, exposure time, motion blur, in this order.
+    """The light on the sensor of `camera`.
 
-    `radiance` is the rendering by `exr_camera` at the middle of the exposure. `velocity_camera_mps` (3,) is the
-    velocity of the camera in its own axes O_C, `angular_velocity_radps` (3,) its angular velocity in the same axes,
-    None without rotation.
+    The steps, in this order, are resampling, point spread, exposure time and motion blur. `radiance` is the rendering
+    by `exr_camera` at the middle of the exposure. `velocity_camera_mps` (3,) and `angular_velocity_radps` (3,) are the
+    velocity and the angular velocity of the camera in its axes O_C; None means no rotation.
     """
     light = _on_sensor(radiance.radiance_factor, config, camera, exr_camera)
     exposure_s = exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
@@ -112,11 +112,11 @@ def _on_sensor(factor: np.ndarray, config: SensorConfig, camera: Camera, exr_cam
 
 @lru_cache(maxsize=4)
 def psf_kernel(sigma_px: float) -> np.ndarray:
-    """Weights (2 n + 1,) of the point spread along one axis: the discrete Gaussian of variance sigma_px^2.
+    """Weights (2 n + 1,) of the point spread along one axis: a discrete Gaussian of variance sigma_px^2.
 
     The weight at k pixels is exp(-t) I_k(t) with t = sigma_px^2 (Lindeberg 1990, doi 10.1109/34.49051). Its variance is
-    t for every t, while a Gaussian sampled at the pixel centres loses variance below about 0.7 px (sigma 0.45 becomes
-    0.38). sigma_px does not include the average over the pixel's area, which the renderer takes.
+    t for every t, while a Gaussian sampled at the pixel centres loses variance if sigma is below about 0.7 px (0.45
+    becomes 0.38). sigma_px does not include the average over the pixel's area, which the renderer computes.
     """
     half = int(np.ceil(6 * sigma_px + 4))
     weights = ive(np.abs(np.arange(-half, half + 1)), sigma_px**2)
@@ -145,11 +145,12 @@ def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rn
 
 
 def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (h, w) float32 of each grey value, DN, over temporal noise and fixed patterns.
+    """Mean and standard deviation (h, w) float32 of each grey value, DN.
 
-    The variance is sigma_y^2 as above plus the variances of PRNU and DSNU, which act as noise in a single frame. Hot
-    pixels are omitted. Clipping is ignored: where the sensor clips (in the brightest pixels, and in shadows with a
-    black level of 0) the standard deviation is too large.
+    They are taken over temporal noise and fixed patterns. The variance is sigma_y^2 (module docstring) plus the
+    variances of PRNU and DSNU, which act as noise in a single frame. Hot pixels are omitted. Clipping is ignored: where
+    the sensor clips (in the brightest pixels, and in shadows with a black level of 0), the standard deviation is too
+    large.
     """
     largest = 2**config.bits - 1
     per_e = config.gain * largest / config.full_well_e
@@ -171,10 +172,10 @@ def _on_ground(light: np.ndarray, depth_m: np.ndarray, camera: Camera, exr_camer
 
 
 def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
-    """Exposure time, seconds, for the radiance factor of pixels (...).
+    """Exposure time, seconds, for the radiance factors (...) of pixels.
 
-    Automatic exposure brings the percentile `exposure_percentile` to the grey value `exposure_level`, but to no more
-    than that share of the full well, and is limited to `longest_exposure_s`.
+    Automatic exposure brings the percentile `exposure_percentile` to the grey value `exposure_level`. It fills at most
+    the share `exposure_level` of the full well and takes at most `longest_exposure_s`.
     """
     if config.exposure == "fixed":
         return config.exposure_time_s
@@ -187,11 +188,11 @@ def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
 def motion_px(
     depth_m: np.ndarray, camera: Camera, move_camera_m: Array, turn_rad: Array | tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """Motion in the image, pixels (h, w, 2) float32, of the ground at a depth (h, w) along the axis, metres.
+    """Motion of the ground in the image, pixels (h, w, 2) float32.
 
-    The camera moves by `move_camera_m` (3,) in its own axes O_C and rotates by the rotation vector `turn_rad` (3,) in
-    these axes. The result is of first order in the rotation and in the ratio of motion to depth; where nothing is hit,
-    only the rotation counts.
+    `depth_m` (h, w) is the depth of the ground along the camera's axis, metres. The camera moves by `move_camera_m`
+    (3,) in its axes O_C and rotates by the rotation vector `turn_rad` (3,) in these axes. The result is of first order
+    in the rotation and in the ratio of motion to depth. Pixels of the sky (infinite depth) move only by the rotation.
     """
     rays = _rays(camera)
     step = np.asarray(move_camera_m, np.float32)
@@ -207,7 +208,7 @@ def motion_px(
 
 
 def _turned(rays: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
-    """Motion (h, w, 2) of rays (h, w, 2), both divided by z, if the camera rotates by `turn_rad` (3,): -turn x ray."""
+    """Motion (h, w, 2) of rays (h, w, 2), both divided by z, if the camera rotates by `turn_rad` (3,)."""
     x, y = rays[..., 0], rays[..., 1]
     a, b, c = turn_rad
     along = a * y - b * x
@@ -230,7 +231,7 @@ def _rays(camera: Camera) -> np.ndarray:
 
 
 def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """The mean of an image over the exposure, in which its content moves by `motion` (h, w, 2), pixels."""
+    """The mean of an image over an exposure during which its content moves by `motion` (h, w, 2), pixels."""
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
     if longest < _MIN_MOTION_PX:
         return light

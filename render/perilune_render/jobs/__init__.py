@@ -1,1 +1,1 @@
-"""Jobs: render a planned dataset in three steps, in this process, in worker processes or on many machines."""
+"""Render a planned dataset in this process, in worker processes or on many machines."""

@@ -1,4 +1,4 @@
-"""Estimate run time and size of a job from a few frames, rendered into a temporary folder."""
+"""Estimate the run time and size of a job from a few frames rendered into a temporary folder."""
 
 import tempfile
 import time
@@ -39,7 +39,7 @@ class Estimate:
 
 
 class _Times(Report):
-    """Records when trajectories begin and end and when their frames are rendered, seconds."""
+    """Records when each trajectory begins and ends and when its frames are rendered, by `time.perf_counter`."""
 
     def __init__(self, job: Job, indices: list[int], progress: Progress):
         super().__init__(job, indices, progress)
@@ -60,11 +60,11 @@ class _Times(Report):
 
 
 def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecutor, n_workers: int) -> Estimate:
-    """Estimate the rest of a job at an address, with an executor of `n_workers` processes.
+    """Estimate the remaining work of a job at an address, with an executor of `n_workers` processes.
 
-    Renders ten frames for each process at the same time, each process from a different scene if there are enough.
-    Writes nothing to the address. Raises UserError like `check`, and if a pose does not fit the ground, RenderingFailed
-    if frames cannot be rendered.
+    Each process renders up to ten frames of one trajectory; the trajectories come from different scenes if there are
+    enough scenes. Nothing is written to the address. Raises UserError like `check` and if a pose does not fit the
+    ground, and RenderingFailed if frames cannot be rendered.
     """
     out = open_store(address)
     check(job)
@@ -97,7 +97,10 @@ def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecu
 
 
 def _sample(job: Job, left: list[int], n_trajectories: int) -> Job:
-    """A job of `n_trajectories` unfinished trajectories with few frames, from different scenes if possible."""
+    """A job of up to `n_trajectories` unfinished trajectories, each with up to _N_FRAMES frames.
+
+    The trajectories come from different scenes if possible.
+    """
     first_of: dict[str, int] = {}
     for number in left:
         first_of.setdefault(job.plan.trajectories[number].scene_id, number)
@@ -113,7 +116,7 @@ def _sample(job: Job, left: list[int], n_trajectories: int) -> Job:
 
 
 def _thinned(trajectory: TrajectoryPlan) -> TrajectoryPlan:
-    """A trajectory with few frames, evenly spread from the first to the last."""
+    """A trajectory with up to _N_FRAMES of its frames, evenly spread from the first to the last."""
     n, flight = len(trajectory.splits), trajectory.flight
     indices = np.unique(np.linspace(0, n - 1, min(_N_FRAMES, n)).round().astype(int))
     arrays = (flight.time_s, flight.position_m, flight.velocity_mps, flight.rotation_wxyz)
@@ -122,24 +125,24 @@ def _thinned(trajectory: TrajectoryPlan) -> TrajectoryPlan:
         trajectory,
         frame_index=tuple(trajectory.frame_index[i] for i in indices),
         splits=tuple(trajectory.splits[i] for i in indices),
-        draw_flight=partial(_same, thinned),
+        draw_flight=partial(_identity, thinned),
     )
 
 
-def _same(flight: Flight) -> Flight:
+def _identity(flight: Flight) -> Flight:
     return flight
 
 
 @dataclass(frozen=True, slots=True)
 class _Bytes:
-    """Mean sizes in a sample, bytes."""
+    """Mean sizes in a rendered sample, bytes."""
 
     frame: float
     """Size of a frame's files and rows."""
     scene: float
     """Size of a scene's rows."""
     fixed: float
-    """Size of the tables `frames` and `labels` and of the index if they had no rows."""
+    """Size of the tables `frames` and `labels` and of the index without any rows."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> "_Bytes":

@@ -13,7 +13,7 @@ from perilune_shared.storage.store import Store
 
 
 class InProcess:
-    """The executor that renders in this process, one trajectory after another."""
+    """Executor that renders in this process, one trajectory after another."""
 
     def __init__(self, job: Job, out: Store):
         self._renderer = SceneRenderer(job, out)
@@ -27,14 +27,14 @@ class InProcess:
         self._renderer.__exit__(kind, error, trace)
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene and check that its poses fit it. Raises UserError."""
+        """Generate a scene and check its poses. Raises UserError if a pose does not fit the ground."""
         for line in self._renderer.check(scene_id):
             say(line)
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises the first error that would stop all other trajectories too.
+        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
         """
         while (index := work.take(self._renderer.scene_id)) is not None:
             report.started(index)

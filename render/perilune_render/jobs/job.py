@@ -1,4 +1,4 @@
-"""A job: a dataset to render, as plain data that every process of a run receives."""
+"""The description of a dataset to render, which every process of a run receives."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +13,7 @@ from perilune_shared.threads import usable_cores
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A dataset to render. Trajectories are identified by their index in `plan.trajectories`."""
+    """Description of a dataset to render. Trajectories are identified by their index in `plan.trajectories`."""
 
     plan: Plan
     """Scenes, trajectories and frames."""
@@ -22,13 +22,13 @@ class Job:
     info: DatasetInfo
     """The initial dataset.json."""
     where: str
-    """Origin of the plan (configuration or manifest), named in errors about poses."""
+    """Source of the plan (configuration or manifest), for error messages about poses."""
 
     @classmethod
     def planned(cls, config: DatasetConfig, kind: Kind, preset: str) -> "Job":
-        """The job of the dataset `detect` or `nav` of a configuration.
+        """The job to render the dataset `detect` or `nav` of a configuration.
 
-        Raises UserError on impossible settings.
+        `preset` is the preset on which the settings are based, for the recipe. Raises UserError on impossible settings.
         """
         plan = make_plan(config, kind)
         return cls(
@@ -36,9 +36,9 @@ class Job:
         )
 
     def with_threads(self, n_threads: int | None, n_workers: int) -> "Job":
-        """The job with this number of threads in each process.
+        """The job with `n_threads` threads in each process.
 
-        None keeps the configured number; if that is 0 (all cores), several workers share the cores.
+        None keeps the configured number. If the configured number is 0 (all cores), several workers share the cores.
         """
         if n_threads is None and (self.config.render.threads or n_workers <= 1):
             return self

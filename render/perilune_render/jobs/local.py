@@ -1,7 +1,7 @@
 """Render a job in worker processes on this machine.
 
-This is a small loop over processes instead of a library's pool: a killed worker breaks a pool of `concurrent.futures`
-or loky with all its tasks, and neither pool hands a task to the worker that already holds the scene.
+The pools of `concurrent.futures` and loky are not used for two reasons: a killed worker breaks the pool with all its
+tasks, and the pools cannot give a task to the worker that already holds its scene.
 """
 
 import tempfile
@@ -24,18 +24,20 @@ from perilune_shared.threads import usable_cores
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
 LOST_STARTS = 3
-"""Number of consecutive workers that may end before they are ready."""
+"""Number of consecutive workers, per requested worker, that may end before they are ready."""
 _BASE_BYTES, _VERTEX_BYTES = 0.75 * 2**30, 500
-"""Peak memory of a worker, in total and per vertex; measured: 1.1 GiB for 1.2 million vertices, 3.1 GiB for 5.7
-million."""
+"""Peak memory of a worker: a constant part and a part per vertex, bytes.
+
+Measured: 1.1 GiB for 1.2 million vertices, 3.1 GiB for 5.7 million.
+"""
 _GROUND_BYTES, _GROWING_BYTES = 16, 70
-"""Memory per vertex for ground that is rendered in levels, and per vertex while ground is generated, bytes."""
+"""Memory per vertex outside the rendered mesh, and per vertex while ground is generated, bytes."""
 
 
 class LocalWorkers:
-    """The executor that renders in `n_workers` processes.
+    """Executor that renders in `n_workers` processes.
 
-    Its workers end with the block, or with this process. `early` is a worker that is already running; it is used unless
+    The workers end with the block, or with this process. `early` is a worker that was started before; it is ignored if
     it has ended.
     """
 
@@ -56,7 +58,7 @@ class LocalWorkers:
         self._scratch.cleanup()
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene in a worker and check that its poses fit it. Raises UserError."""
+        """Generate a scene in a worker and check its poses. Raises UserError if a pose does not fit the ground."""
         asked: list[Worker] = []
         while True:
             self._start(min(self._n_workers, len(self._job.plan.trajectories)) or 1)
@@ -67,7 +69,7 @@ class LocalWorkers:
                     raise UserError(self._job.where, scene_id, asked[-1].how_ended, expected)
                 asked.append(ready[0])
                 ready[0].send("grow", scene_id)
-            for worker in self._heard():
+            for worker in self._wait_for_messages():
                 message = self._receive(worker)
                 if message is not None and message[0] == "grown":
                     worker.scene_id = scene_id
@@ -78,7 +80,7 @@ class LocalWorkers:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises the first error that would stop all other trajectories too.
+        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
         """
         while True:
             n_busy = sum(worker.trajectory is not None for worker in self._workers.values())
@@ -88,7 +90,7 @@ class LocalWorkers:
             for worker in list(self._workers.values()):
                 if worker.ready and worker.trajectory is None:
                     self._hand_out(worker, work, report)
-            for worker in self._heard():
+            for worker in self._wait_for_messages():
                 self._handle(worker, self._receive(worker), work, report)
 
     def _hand_out(self, worker: Worker, work: WorkList, report: Report) -> None:
@@ -116,15 +118,15 @@ class LocalWorkers:
                 report.failed(index, error, work.failed(index, error))
                 self._end(worker)
 
-    def _heard(self) -> list[Worker]:
+    def _wait_for_messages(self) -> list[Worker]:
         """Workers that have sent a message or ended; waits for at least one."""
         ready = wait(self._workers)
         return [worker for connection, worker in self._workers.items() if connection in ready]
 
     def _receive(self, worker: Worker) -> tuple[Any, ...] | None:
-        """The next message of a worker; None if the worker has ended, which removes it.
+        """The next message of a worker; None if the worker has ended and was removed.
 
-        Raises its final error.
+        Raises the error with which a worker stops the run.
         """
         try:
             message = worker.connection.recv()
@@ -155,9 +157,9 @@ class LocalWorkers:
 
 
 def for_other_processes(out: Store) -> Store:
-    """A store that processes with other working directories can open too.
+    """The store `out` with an address that processes in other working directories can open.
 
-    Raises UserError if they cannot open it.
+    Raises UserError if it is in the memory of this process.
     """
     if out.address.startswith("memory://"):
         raise UserError(out, "--out", "memory of this process", "--workers 0, or an address that workers can open")
@@ -165,11 +167,11 @@ def for_other_processes(out: Store) -> Store:
 
 
 def default_workers(job: Job, n_threads: int | None) -> int:
-    """The number of workers that render a job here by default: one for each core, or for each `n_threads` cores.
+    """The default number of workers on this machine: one for each core, or one for each `n_threads` cores.
 
-    The number of trajectories and free memory limit it. On two cores, two processes with one thread each rendered 1.28
-    times as many frames per second as one process with two threads (docs/notebook/2026-11-22-cores.md). More cores were
-    not measured.
+    There are no more workers than trajectories, and no more than fit in free memory. On two cores, two processes with
+    one thread each rendered 1.28 times as many frames per second as one process with two threads
+    (docs/notebook/2026-11-22-cores.md). More cores were not measured.
     """
     n_cores = usable_cores() // (n_threads or job.config.render.threads or 1)
     n_ground = graded_grid(job.config.terrain, job.plan.view).n_vertices
@@ -180,6 +182,6 @@ def default_workers(job: Job, n_threads: int | None) -> int:
 
 
 def _free_bytes() -> float:
-    """Memory that new processes may use, bytes: free on the machine, within limits of the container or batch job."""
+    """Memory that new processes may use, bytes: free memory, limited by the container or batch job."""
     free, left = float(psutil.virtual_memory().available), memory_left_bytes()
     return free if left is None else min(free, left)

@@ -1,7 +1,7 @@
-"""Render a job with Ray, on this machine or on a cluster: one actor per process, each with its own renderer.
+"""Render a job with Ray, on this machine or on a cluster. Each process of Ray is an actor with one renderer.
 
-Ray places the actors on machines, and starts new ones when a process or a machine is lost. Work is handed out as for
-local workers (`WorkList`), so that an actor keeps its scene.
+Ray places the actors on machines. When a process or a machine is lost, this module starts a new actor. A `WorkList`
+hands out trajectories as for local workers, so that an actor rarely changes its scene.
 """
 
 import logging
@@ -26,14 +26,14 @@ from perilune_shared.storage.store import Store
 
 
 class _Renderer:
-    """The actor: a scene renderer in a process of Ray."""
+    """The actor class: it holds a scene renderer in a process of Ray."""
 
     def start(self, job: Job, out: Store) -> None:
-        """Receive the job. Raises UserError if the code of this process differs from the job's."""
+        """Receive the job. Raises UserError if this process has other code or libraries than the job's recipe."""
         self._renderer = SceneRenderer(job, out)
 
     def grow(self, scene_id: str) -> list[str]:
-        """Generate a scene and check that its poses fit it; returns warnings."""
+        """Generate a scene and check its poses; returns warnings."""
         return self._renderer.check(scene_id)
 
     def render(self, index: int) -> list[str]:
@@ -58,11 +58,11 @@ class _Actor:
 
 
 class RayActors:
-    """The executor that renders with Ray in `n_workers` actors, by default as many as the cluster's cores allow.
+    """Executor that renders with Ray in `n_workers` actors, by default as many as the cluster's cores allow.
 
-    Each actor has the configured number of threads, or one if this is 0; Ray reserves a core for each thread. `address`
-    is the address of a running cluster; None starts Ray on this machine for the duration of the block. A local folder
-    `out` must be at the same path on all machines.
+    Each actor has the configured number of threads, or one thread if the configured number is 0. Ray reserves a core
+    for each thread. `address` is the address of a running cluster; None starts Ray on this machine for the duration of
+    the block. If `out` is a folder, all machines must have it at the same path.
     """
 
     def __init__(self, job: Job, out: Store, n_workers: int | None, address: str | None):
@@ -105,7 +105,7 @@ class RayActors:
             ray.shutdown()
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene in an actor and check that its poses fit it. Raises UserError."""
+        """Generate a scene in an actor and check its poses. Raises UserError if a pose does not fit the ground."""
         while True:
             self._start(1)
             actor = self._actors[0]
@@ -125,7 +125,7 @@ class RayActors:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises the first error that would stop all other trajectories too.
+        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
         """
         while True:
             busy = [actor for actor in self._actors if actor.trajectory is not None]
@@ -177,9 +177,9 @@ class RayActors:
                 ray.kill(actor.handle)
 
     def _lose_start(self, actor: _Actor, error: RayActorError) -> None:
-        """Remove an actor lost before it rendered anything.
+        """Remove an actor that was lost before it rendered a trajectory.
 
-        Raises UserError if too many were lost in succession.
+        Raises UserError if too many actors were lost in succession.
         """
         self._actors.remove(actor)
         self._lost_starts += 1

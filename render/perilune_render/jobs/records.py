@@ -1,11 +1,11 @@
 """Records of a rendering in progress, below work/ in the dataset, for `perilune-render status`.
 
     work/plan.json                 number of trajectories and frames, identity of the plan
-    work/running/<process>.json    one process: what it renders, and how many frames it has rendered
+    work/running/<process>.json    one process: the trajectory that it renders, and its number of rendered frames
     work/failed/<trajectory>.json  the error of a trajectory that failed repeatedly
 
-No record affects what is rendered, except that a dataset resumes only with its own plan. The records are removed with
-the rest of work/ when the dataset is finished.
+The records do not affect what is rendered; plan.json decides whether a run may resume the dataset. They are removed
+with the rest of work/ when the dataset is finished.
 """
 
 import contextlib
@@ -28,17 +28,20 @@ _FAILURE = frozenset({"trajectory", "error"})
 
 
 def write_plan(store: Store, plan: dict[str, Any]) -> None:
-    """Record a job's numbers of `trajectories` and `frames` and the hash of its `plan`."""
+    """Write a job's record: its numbers of `trajectories` and `frames`, and the hash of its `plan`."""
     store.replace(f"{FOLDER}/plan.json", json.dumps(plan).encode())
 
 
 def read_plan(store: Store) -> dict[str, Any] | None:
-    """The record of a job (`write_plan`); None without a record."""
+    """The record that `write_plan` wrote; None if there is no record."""
     return _read(store, f"{FOLDER}/plan.json") if store.exists(f"{FOLDER}/plan.json") else None
 
 
 class RunningRecord:
-    """The record of this process, written when a trajectory begins and at most every ten seconds after a frame."""
+    """The record of this process.
+
+    It is written when a trajectory begins, and after a frame if the last write is more than ten seconds ago.
+    """
 
     def __init__(self, store: Store):
         self._store = store
@@ -47,7 +50,7 @@ class RunningRecord:
         self._trajectory, self._n_frames, self._updated = "", 0, 0.0
 
     def begin(self, trajectory: str) -> None:
-        """Record that this process begins a trajectory."""
+        """Record that this process begins the trajectory of this name."""
         self._trajectory = trajectory
         self._write()
 
@@ -71,12 +74,12 @@ class RunningRecord:
 
 
 def write_failure(store: Store, trajectory: str, error: str) -> None:
-    """Record a trajectory (scene-0000/trajectory-0000) that failed repeatedly."""
+    """Record the error of a trajectory that failed repeatedly, by its name, such as scene-0000/trajectory-0000."""
     _write(store, f"failed/{trajectory.replace('/', '.')}", {"trajectory": trajectory, "error": error[:2000]})
 
 
 def remove_failures(store: Store, trajectories: Iterable[str]) -> None:
-    """Remove the failure records of trajectories that are tried again."""
+    """Remove the failure records of these trajectories, since they are rendered again."""
     recorded = {content["trajectory"]: path for path, content in _listed(store, "failed", _FAILURE)}
     for trajectory in trajectories:
         if trajectory in recorded:
@@ -95,7 +98,7 @@ def remove_running(store: Store) -> None:
 
 
 def failures(store: Store) -> dict[str, str]:
-    """The error of each trajectory that failed repeatedly."""
+    """The last error of each trajectory that failed repeatedly, by its name."""
     return {content["trajectory"]: content["error"] for _, content in _listed(store, "failed", _FAILURE)}
 
 
@@ -114,7 +117,7 @@ def _listed(store: Store, folder: str, fields: frozenset[str]) -> Iterator[tuple
 
 
 def _read(store: Store, path: str) -> dict[str, Any] | None:
-    """The record in a file; None if it has just been removed, or is damaged."""
+    """The record in a file; None if the file was just removed or is damaged."""
     try:
         content = json.loads(store.read(path))
     except (OSError, UserError, ValueError, RecursionError):

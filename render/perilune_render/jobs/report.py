@@ -1,4 +1,4 @@
-"""Report on a running job: progress bar, warnings of dark frames, failed attempts."""
+"""Report the progress of a job: a progress bar, failed attempts and warnings of dark frames."""
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from perilune_shared.errors import one_line, shortened
 
 
 class Report:
-    """Reports on the rendering of trajectories of a job, which are identified by their indices in the plan."""
+    """Reports on the rendering of trajectories, which are identified by their indices in the plan."""
 
     def __init__(self, job: Job, indices: Sequence[int], progress: Progress):
         self._job, self._progress = job, progress
@@ -33,18 +33,21 @@ class Report:
         self._progress.advance(self._task)
 
     def note(self, text: str) -> None:
-        """Show a text about the current step."""
+        """Show a text about the current step beside the progress bar."""
         self._progress.update(self._task, note=text)
 
     def done(self, index: int, dark: Sequence[str]) -> None:
-        """Count a finished trajectory with the ids of its dark frames; warn of them after the last one of a scene."""
+        """Count a finished trajectory with the ids of its dark frames.
+
+        After the last trajectory of a scene, warn of the scene's dark frames.
+        """
         scene_id = self._job.plan.trajectories[index].scene_id
         self._dark[scene_id] += dark
         self._rendered[scene_id] += self._job.n_frames(index)
         self._close(scene_id)
 
     def failed(self, index: int, error: str, attempts_left: int) -> None:
-        """Report a failed attempt."""
+        """Report a failed attempt, and take its frames off the progress bar."""
         self._progress.advance(self._task, -self._frames.pop(index, 0))
         again = f"; trying again ({attempts_left} left)" if attempts_left else ""
         say(f"warning: {self._job.name(index)}: {shortened(one_line(error), 500)}{again}")

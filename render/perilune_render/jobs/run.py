@@ -1,9 +1,9 @@
-"""Run a job in three steps, with any executor: prepare, render each trajectory, finish.
+"""Run a job in three steps: prepare the dataset, render each trajectory, finish the dataset.
 
-`SceneRenderer` renders a trajectory, which is finished once its commit is written (`dataset/work.py`).
+A trajectory is finished once its commit is written (`dataset/work.py`).
 
-A dataset resumes only with the plan with which it was begun. A hash identifies the plan, since two manifests with equal
-settings may differ in scenes, trajectories, frames and splits.
+A dataset can be resumed only with the plan with which it was begun. The plan is identified by a hash, since two
+manifests with equal settings may differ in scenes, trajectories, frames and splits.
 """
 
 import hashlib
@@ -41,18 +41,18 @@ class Executor(Protocol):
     """Renders trajectories of a job in this process, in other processes or on other machines."""
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene and check that its poses fit it. Raises UserError."""
+        """Generate a scene and check its poses. Raises UserError if a pose does not fit the ground."""
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises the first error that would stop all other trajectories too.
+        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """One of several equal shares of a job's trajectories."""
+    """One of several parts of a job, with about equal numbers of trajectories."""
 
     number: int
     """Number of the shard, from 1."""
@@ -60,7 +60,10 @@ class Shard:
     """Number of shards."""
 
     def indices(self, n_trajectories: int) -> range:
-        """Indices of the shard's trajectories in the plan, consecutive so that few scenes are in several shards."""
+        """Indices of the shard's trajectories in the plan.
+
+        They are consecutive, so that few scenes belong to several shards.
+        """
         first, after = ((k * n_trajectories) // self.count for k in (self.number - 1, self.number))
         return range(first, after)
 
@@ -70,7 +73,7 @@ MakeExecutor = Callable[[Job, Store], AbstractContextManager[Executor]]
 
 
 class RenderingFailed(Exception):
-    """Raised if some trajectories failed N_ATTEMPTS times each; all others are rendered."""
+    """Some trajectories failed N_ATTEMPTS times each; all other trajectories are rendered."""
 
     def __init__(self, out: Store, errors: dict[str, str]):
         self.out, self.errors = out, errors
@@ -80,9 +83,9 @@ class RenderingFailed(Exception):
 def render_job(job: Job, address: Address, progress: Progress, executor: MakeExecutor) -> Dataset:
     """Render a job into the dataset at an address, or resume it.
 
-    Raises UserError if the address holds something else, if another run is writing it, or if a pose does not fit the
-    ground. The first scene is checked before anything is written; each other scene before its first frame is rendered.
-    Raises RenderingFailed at the end if trajectories failed repeatedly.
+    The poses of the first scene are checked before anything is written, the poses of every other scene before its first
+    frame is rendered. Raises UserError if a pose does not fit the ground, if the address holds something else, or if
+    another run is writing there. Raises RenderingFailed at the end if trajectories failed repeatedly.
     """
     out = open_store(address)
     check(job)
@@ -99,10 +102,10 @@ def render_job(job: Job, address: Address, progress: Progress, executor: MakeExe
 
 
 def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, executor: MakeExecutor) -> int:
-    """Render the unfinished trajectories of one shard of a job into the dataset at an address.
+    """Render the unfinished trajectories of one shard of a job into the dataset at an address; return their number.
 
-    Returns their number. Processes on many machines may render different shards into one dataset at the same time, so
-    it is not locked. Raises the errors of `render_job`.
+    The dataset is not locked, since processes on many machines may render its other shards at the same time. Raises the
+    errors of `render_job`.
     """
     out = open_store(address)
     check(job)
@@ -117,7 +120,7 @@ def render_shard(job: Job, address: Address, shard: Shard, progress: Progress, e
 def finish_job(job: Job, address: Address) -> Dataset:
     """Finish a dataset whose shards are all rendered.
 
-    Raises UserError if trajectories are still to be rendered.
+    Raises UserError if a trajectory is not rendered yet.
     """
     out = open_store(address)
     if not is_begun(out):
@@ -128,7 +131,7 @@ def finish_job(job: Job, address: Address) -> Dataset:
 
 
 def _render(job: Job, out: Store, indices: list[int], executor: Executor, progress: Progress) -> None:
-    """Render some trajectories, given by their indices. Raises RenderingFailed at the end if some failed."""
+    """Render trajectories by their indices. Raises RenderingFailed at the end if trajectories failed repeatedly."""
     work = WorkList(job.plan, indices)
     records.remove_failures(out, map(job.name, indices))
     executor.render(work, Report(job, indices, progress))
@@ -140,7 +143,7 @@ def _render(job: Job, out: Store, indices: list[int], executor: Executor, progre
 
 
 def check(job: Job) -> None:
-    """Check what needs no terrain heights in a job, without writing anything. Raises UserError."""
+    """Check settings, poses and files of a job before any terrain is generated. Raises UserError."""
     grid = check_ground(job.config, job.plan.view)
     check_plan(job.plan, grid, job.where)
     if job.config.hazard is not None:
@@ -148,10 +151,10 @@ def check(job: Job) -> None:
 
 
 def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> DatasetInfo:
-    """Begin the dataset at `out`, or check that it belongs to the job; return its dataset.json.
+    """Begin the dataset at `out`, or check that an existing dataset belongs to the job; return its dataset.json.
 
-    Before a dataset is begun, `check_scene` generates its first scene and checks all poses over it. Raises UserError if
-    a pose does not fit the ground, or if `out` holds something else or a dataset with different settings, code or plan.
+    Before a dataset is begun, `check_scene` is called for its first scene. Raises UserError if a pose does not fit the
+    ground, or if `out` holds other files, or a dataset with different settings, code or plan.
     """
     if not is_begun(out) and job.plan.scenes:
         check_scene(job.plan.scenes[0].scene_id)
@@ -176,11 +179,11 @@ def unfinished(job: Job, out: Store) -> list[int]:
 
 
 def finish(job: Job, out: Store, info: DatasetInfo) -> Dataset:
-    """Merge the trajectories into a complete dataset. Raises UserError if some are still to be rendered."""
+    """Merge the trajectories into a complete dataset. Raises UserError if a trajectory is not rendered yet."""
     left = unfinished(job, out)
     if left:
-        found = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"
-        raise UserError(out, "trajectories", found, "all rendered; run their shards again")
+        actual = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"
+        raise UserError(out, "trajectories", actual, "all rendered; run their shards again")
     scenes = (
         (scene.scene_id, [trajectory.trajectory_id for trajectory in job.plan.of_scene(scene.scene_id)])
         for scene in job.plan.scenes
@@ -190,7 +193,7 @@ def finish(job: Job, out: Store, info: DatasetInfo) -> Dataset:
 
 
 def _begin_plan(store: Store, job: Job) -> None:
-    """Record size and hash of a job's plan in a new dataset, or compare them with the existing record.
+    """Record the size and hash of a job's plan in a new dataset, or compare them with an existing record.
 
     Raises UserError if the dataset was begun with another plan.
     """
@@ -223,9 +226,9 @@ def _ordered(plan: Plan) -> Iterator[TrajectoryPlan]:
 
 
 def _hash(trajectories: Iterable[TrajectoryPlan], *, positions: bool) -> str:
-    """SHA-256 of trajectories, hexadecimal; with `positions`, also of the position of each frame.
+    """SHA-256 of trajectories, hexadecimal; with `positions`, the hash includes the position of each frame.
 
-    The positions of a drawn flight follow from seed, settings and code, which the recipe contains.
+    Positions of drawn flights need no hash: they follow from seed, settings and code, which the recipe contains.
     """
     digest = hashlib.sha256()
     for each in trajectories:

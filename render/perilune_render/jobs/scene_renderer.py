@@ -1,4 +1,4 @@
-"""Render one trajectory of a job: the unit of work, for any process that has the job and the store."""
+"""Render single trajectories of a job, in any process that has the job and the store."""
 
 import contextlib
 from collections.abc import Callable
@@ -28,8 +28,8 @@ from perilune_shared.storage.store import Store
 class SceneRenderer:
     """Renders trajectories of a job, one at a time, and keeps the current scene for the next trajectory.
 
-    Use it as a context manager, and only one at a time in a process, since Blender holds only one scene. Raises
-    UserError if the code of this process differs from the job's.
+    Use it as a context manager. A process may have only one at a time, since Blender holds only one scene. Raises
+    UserError if this process has other code or libraries than the job's recipe.
     """
 
     def __init__(self, job: Job, out: Store):
@@ -44,13 +44,13 @@ class SceneRenderer:
 
     @property
     def scene_id(self) -> str | None:
-        """Id of the scene that is kept, if any."""
+        """Id of the scene in memory, if any."""
         if self._opened is not None:
             return self._opened[0][0]
         return self._grown[0] if self._grown is not None else None
 
     def grow(self, scene_id: str) -> Scene:
-        """Generate the ground of a scene and check that all its poses fit it. Raises UserError otherwise."""
+        """Generate the ground of a scene and check its poses. Raises UserError if a pose does not fit the ground."""
         if self._grown is None or self._grown[0] != scene_id:
             self.close()  # frees the ground of the previous scene first
             job = self._job
@@ -62,12 +62,15 @@ class SceneRenderer:
         return self._grown[1]
 
     def check(self, scene_id: str) -> list[str]:
-        """`grow` a scene; return warnings about Suns that leave the site in shadow, if the poses are given."""
+        """Generate a scene and check its poses (`grow`).
+
+        Returns warnings about directions of the Sun that leave the site in shadow, if the job has `dataset.scene`.
+        """
         scene, job = self.grow(scene_id), self._job
         return [] if job.config.scene is None else shadow_warnings(scene, job.plan.scenes)
 
     def render(self, index: int, advance: Callable[[], object], note: Callable[[str], object]) -> list[str]:
-        """Render a trajectory and write its files, labels and frames; return the ids of its dark frames.
+        """Render a trajectory and write its files and rows; return the ids of its dark frames.
 
         `advance` is called after each frame, `note` with a text about the current step.
         """
@@ -93,7 +96,7 @@ class SceneRenderer:
         if self._opened is None or self._opened[0] != (scene_id, camera):
             note(f"{scene_id}: generating ground")
             self._opened = None
-            self._closing.close()  # the engine of another camera of the scene
+            self._closing.close()  # closes the engine of the previous camera
             scene, plan, config = self.grow(scene_id), self._job.scene(scene_id), self._job.config
             outputs = self._outputs_of(scene_id, scene, note)
             files = self._write_hazard(scene_id, scene, outputs)
@@ -110,7 +113,7 @@ class SceneRenderer:
         return self._opened[1:]
 
     def _outputs_of(self, scene_id: str, scene: Scene, note: Callable[[str], object]) -> SceneOutputs:
-        """Outputs of a scene beside the frames, shared by all its cameras."""
+        """Additional outputs of a scene, shared by all its cameras."""
         if self._outputs is None or self._outputs[0] != scene_id:
             if self._job.config.hazard is not None:
                 note(f"{scene_id}: making the hazard map")
@@ -118,7 +121,7 @@ class SceneRenderer:
         return self._outputs[1]
 
     def _write_hazard(self, scene_id: str, scene: Scene, outputs: SceneOutputs) -> dict[str, str | int]:
-        """Write the hazard map of a scene if there is one; return its columns of the table `scenes`."""
+        """Write the hazard map of a scene if there is one; return the columns hazard_* of the table `scenes`."""
         if outputs.hazard is None:
             return {}
         path = scene_file_path(scene_id, "hazard")

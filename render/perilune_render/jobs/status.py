@@ -1,4 +1,4 @@
-"""The state of a rendering, from the files of its dataset alone."""
+"""Read the state of a rendering from the files of its dataset."""
 
 import json
 import time
@@ -28,7 +28,7 @@ class Status:
     n_frames: int
     """Number of frames."""
     frames_done: int
-    """Number of frames in finished trajectories; estimated from the mean length if trajectories differ in length."""
+    """Number of frames in finished trajectories, estimated from the mean number of frames per trajectory."""
     running: tuple[str, ...]
     """Trajectories that are being rendered."""
     n_silent: int
@@ -40,14 +40,14 @@ class Status:
 
     @property
     def left_s(self) -> float | None:
-        """Remaining time at this rate, seconds; None if nothing is running."""
+        """Remaining time at the rate `frames_per_s`, seconds; None if the rate is 0."""
         return (self.n_frames - self.frames_done) / self.frames_per_s if self.frames_per_s > 0 else None
 
 
 def datasets_below(store: Store) -> list[Store]:
-    """The dataset at an address, or the datasets `detect` and `nav` below it.
+    """The dataset at an address and the datasets `detect` and `nav` below it, as far as they exist.
 
-    Raises UserError without a dataset.
+    Raises UserError if no dataset exists.
     """
     stores = [each for each in (store, *map(store.sub, KINDS)) if each.exists(INFO_NAME)]
     if not stores:
@@ -58,7 +58,7 @@ def datasets_below(store: Store) -> list[Store]:
 def status_of(store: Store) -> Status:
     """The state of one dataset.
 
-    Raises UserError if it is in progress and its record of the plan is missing.
+    Raises UserError if the dataset is unfinished and the record of its plan is missing.
     """
     complete, counts = _info(store)
     if complete:

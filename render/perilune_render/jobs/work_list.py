@@ -1,4 +1,4 @@
-"""The trajectories of a job that are still to be rendered: which is next, and which have failed."""
+"""Choose which trajectory of a job a process renders next, and count failed attempts."""
 
 from collections import Counter, deque
 from collections.abc import Iterable
@@ -6,11 +6,14 @@ from collections.abc import Iterable
 from perilune_render.flight.plan import Plan
 
 N_ATTEMPTS = 4
-"""Number of attempts for each trajectory: a first and three more."""
+"""Number of attempts for each trajectory, including the first."""
 
 
 class WorkList:
-    """Hands out trajectories by their index in the plan, so that each process rarely changes scenes."""
+    """The trajectories that are still to be rendered, by their index in the plan.
+
+    They are handed out so that a process rarely changes its scene.
+    """
 
     def __init__(self, plan: Plan, indices: Iterable[int]):
         self._scene = [trajectory.scene_id for trajectory in plan.trajectories]
@@ -29,10 +32,10 @@ class WorkList:
         return sum(map(len, self._waiting.values()))
 
     def take(self, scene_id: str | None) -> int | None:
-        """The next trajectory for a process that keeps the scene `scene_id`; None if no trajectory is waiting.
+        """The next trajectory for a process that holds the scene `scene_id`; None if no trajectory is waiting.
 
-        The first choice is a trajectory of the same scene, the second a trajectory of a scene that no process has
-        begun, the third a trajectory of the scene that the fewest processes are rendering.
+        The first choice is a trajectory of this scene, the second a trajectory of a scene that no process has begun,
+        the third a trajectory of the scene that the fewest processes are rendering.
         """
         if scene_id not in self._waiting:
             while self._untouched and self._untouched[0] not in self._waiting:
@@ -58,7 +61,7 @@ class WorkList:
     def failed(self, index: int, error: str) -> int:
         """Record a failed attempt; return the number of attempts left.
 
-        If it is not 0, the trajectory waits again.
+        The trajectory waits again if attempts are left.
         """
         self._running[self._scene[index]] -= 1
         left = N_ATTEMPTS - self._attempts[index]

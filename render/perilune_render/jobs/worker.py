@@ -1,9 +1,13 @@
-"""A worker process: renders the trajectories that its parent sends, one at a time (`local.py`).
+"""A worker process, which renders the trajectories that its parent sends, one at a time (`local.py`).
 
-`start_worker` starts `python -m perilune_render.jobs.worker DESCRIPTOR PARENT SCRATCH ENGINE`: the descriptor of its
-end of the connection, the parent's process id, a folder for temporary files, which the parent removes, and the engine
-to load before the job arrives. The parent's part of this module imports quickly: a command can
-start a worker before it loads other libraries.
+`start_worker` starts `python -m perilune_render.jobs.worker DESCRIPTOR PARENT SCRATCH ENGINE`:
+
+    DESCRIPTOR  file descriptor of the worker's end of the connection
+    PARENT      process id of the parent
+    SCRATCH     folder for temporary files, which the parent removes
+    ENGINE      engine to load before the job arrives
+
+This module imports no large library at the top, so that a command can start a worker before it loads other libraries.
 """
 
 import contextlib
@@ -22,41 +26,44 @@ from perilune_shared.errors import ends_run
 WORKER = ("-m", "perilune_render.jobs.worker")
 """Arguments of Python that start a worker process."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Variables set to 1 in a worker: the number of threads of linear algebra changes the last digits of results."""
+"""Environment variables set to 1 in a worker.
+
+The number of threads in linear algebra changes the last digits of its results.
+"""
 _END_S = 5.0
-"""Longest time for a worker to end by itself, seconds."""
+"""Time to wait for a worker to end before it is killed, seconds."""
 _PR_SET_PDEATHSIG = 1
 """PR_SET_PDEATHSIG from linux/prctl.h."""
 
 
 @dataclass(slots=True)
 class Worker:
-    """A worker process, as its parent sees it."""
+    """The parent's handle of a worker process."""
 
     process: subprocess.Popen
     connection: Connection
     ready: bool = False
-    """Whether it has received the job."""
+    """Whether the worker has received the job."""
     trajectory: int | None = None
-    """The trajectory that it renders."""
+    """Index of the trajectory that the worker is rendering, if any."""
     scene_id: str | None = None
-    """The scene that it keeps."""
+    """Id of the scene that the worker holds in memory, if any."""
     n_done: int = 0
-    """Number of trajectories that it has rendered."""
+    """Number of trajectories that the worker has rendered."""
 
     def send(self, command: str, target: object) -> None:
-        """Send a command. Raises nothing if the worker has ended: receiving its messages shows that."""
+        """Send a command. An ended worker causes no error here, but when its next message is received."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.connection.send((command, target))
 
     @property
     def how_ended(self) -> str:
-        """How the process ended."""
+        """A text that says how the process ended; waits for its end."""
         code = self.process.wait()
         return f"worker killed by {signal.Signals(-code).name}" if code < 0 else f"worker ended with code {code}"
 
     def end(self, *, at_once: bool = False) -> None:
-        """End the process; all that it reported as done is on the disk. Has no effect if it has already ended."""
+        """End the process, if it is still running. Everything that it reported as done is on the disk."""
         self.connection.close()
         if at_once:
             self.process.kill()
@@ -68,7 +75,7 @@ class Worker:
 
 
 def start_worker(scratch: str, engine: str) -> Worker:
-    """Start a worker, which writes its temporary files into the folder `scratch`."""
+    """Start a worker that loads `engine` and writes its temporary files into the folder `scratch`."""
     ours, theirs = Pipe()
     arguments = [str(theirs.fileno()), str(os.getpid()), scratch, engine]
     with theirs:
@@ -96,7 +103,10 @@ def early_worker(engine: str) -> Iterator[Worker]:
 
 
 def main() -> None:
-    """Serve the parent until it closes the connection or a trajectory fails; a failure needs a new worker."""
+    """Serve the parent until it closes the connection or a trajectory fails.
+
+    After a failure the parent starts a new worker.
+    """
     _end_with(int(sys.argv[2]))
     tempfile.tempdir = sys.argv[3]
     connection = Connection(int(sys.argv[1]))
@@ -136,7 +146,7 @@ def _serve(connection: Connection, engine: str) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends for any reason, even within native code."""
+    """Let the kernel kill this process when its parent ends for any reason, even while native code is running."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:

@@ -14,7 +14,10 @@ _DARK = 40
 
 
 def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: int = 2) -> np.ndarray:
-    """A colour picture (scale h, scale w, 3) with the ellipses, green where `chosen` (N,) is true, else orange."""
+    """The image in colour, enlarged (scale h, scale w, 3), with the ellipses of N labels.
+
+    The ellipses of labels with a true value in `chosen` (N,) are green, all others are orange.
+    """
     picture = cv2.cvtColor(enlarge(image, scale), cv2.COLOR_GRAY2BGR)
     e = labels.ellipses
     for k in range(len(labels.crater_id)):
@@ -33,9 +36,9 @@ def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
 
 
 def padded(pictures: list[np.ndarray], group_sizes: list[int], columns: int) -> list[np.ndarray]:
-    """Pictures padded for a sheet with `columns` columns; each group of `group_sizes[k]` pictures starts a row.
+    """Pictures padded to one size for a sheet; each group of `group_sizes[k]` pictures starts a new row.
 
-    Smaller pictures and missing ones are filled with dark grey.
+    `columns` is the number of pictures in a row. Added pixels and added pictures are dark grey.
     """
     height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
     sheet, rest = [], iter(pictures)

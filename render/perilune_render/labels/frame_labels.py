@@ -1,4 +1,4 @@
-"""Crater labels of a frame: ellipse, visible share of the rim, sunlit share and contrast of each crater."""
+"""Crater labels of a frame: ellipse, visible share of the rim, sunlit share and contrast."""
 
 from dataclasses import dataclass, replace
 
@@ -37,12 +37,12 @@ class Labels:
     visible_fraction: Array
     """Share of the rim that is inside the image and not hidden (N,)."""
     sunlit_fraction: Array
-    """Share of the ellipse's pixels in the image that are sunlit; 0 without such pixels (N,)."""
+    """Sunlit share of the pixels that the ellipse covers in the image; 0 if it covers none (N,)."""
     contrast: Array
-    """Amplitude of the crater's shading, divided by its standard error from noise and clutter; NaN if not measured
-    (N,)."""
+    """Amplitude of the crater's shading, divided by its standard error (`perilune_render.labels.pixels.contrasts`); NaN
+    if not measured (N,)."""
     n_above: int | None = None
-    """Number of craters with their centre in the image that are too large for a label; None if not counted."""
+    """Number of craters that have their centre in the image but are too large for a label; None if not counted."""
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "Labels":
@@ -110,11 +110,11 @@ def label_frame(
     radiance: Radiance,
     radii_px: tuple[float, float],
 ) -> Labels:
-    """Labels by the paper's rule: centre in the frame, radius sqrt(a b) from radii_px[0] to radii_px[1].
+    """Labels of a frame: craters with their centre in the image and a radius sqrt(a b) within `radii_px`.
 
-    `position_m` (3,) is in O_L. Visibility is computed from the rendered depth. `radiance` has the pixels of `camera`
-    (`perilune_render.imaging.resampling.seen_by`). The contrast also depends on the sensor and is NaN here:
-    `with_contrast` adds it.
+    `radii_px` are the smallest and the largest radius, pixels. `position_m` (3,) is in O_L. Visibility is computed from
+    the depth in `radiance`, which has the pixels of `camera` (`perilune_render.imaging.resampling.seen_by`). The
+    contrast also depends on the sensor, so it is NaN until `with_contrast` adds it.
     """
     pose, (min_radius_px, max_radius_px) = (position_m, rotation_camera_from_site), radii_px
     if any(camera.distortion):
@@ -148,7 +148,10 @@ def label_frame(
 
 
 def _in_camera(points_m: Array, position_m: Array, rotation_camera_from_site: Array) -> Array:
-    """`camera_from_site` for many points (N, 3): NumPy subtracts long columns ten times as fast as rows of three."""
+    """`camera_from_site` for many points (N, 3), faster.
+
+    NumPy subtracts long columns ten times as fast as rows of three numbers.
+    """
     offset = np.empty_like(points_m)
     for k in range(3):
         np.subtract(points_m[:, k], position_m[k], out=offset[:, k])
@@ -163,7 +166,7 @@ def with_contrast(
     rotation_camera_from_site: Array,
     image: GreyAndSun,
 ) -> Labels:
-    """The labels with their contrast in the image of `camera` (`perilune_render.labels.pixels.contrasts`)."""
+    """The labels with their contrast in the image of `camera` (`labels.pixels.contrasts`)."""
     rows = np.searchsorted(circles.crater_id, labels.crater_id)
     centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
     matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, image.sun, rows)
@@ -173,7 +176,10 @@ def with_contrast(
 def _image_from_rim(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
 ) -> Array:
-    """Matrices (N, 2, 2) from the rim's plane, in radii along and across the direction of the Sun, to pixels."""
+    """Matrices (N, 2, 2) that map offsets in each rim's plane to pixels.
+
+    The offsets are in radii, along and across the direction of the Sun.
+    """
     centre, normal = circles.centre_m[rows], circles.normal[rows]
     along = sun - (normal @ sun)[:, None] * normal
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -191,7 +197,7 @@ def _visible_fraction(
 
     The label circle is flat and the real rim is rough, so a point of the circle may be below the ground. The point
     counts as hidden only if the ground in front of it is nearer by more than SLACK_RADII radii and by more than
-    SLACK_PX pixel widths. A point beyond the horizon, on a pixel of the sky, is hidden.
+    SLACK_PX pixel widths. A point on a pixel of the sky is beyond the horizon and also counts as hidden.
     """
     if not len(rows):
         return np.empty(0)
@@ -217,12 +223,13 @@ def crater_index(
     rotation_camera_from_site: Array,
     depth_m: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Instance image (h, w) float32: id of the smallest crater whose visible interior holds the pixel's centre, or -1.
+    """Id of the smallest crater that each pixel's centre shows (h, w) float32; -1 without a crater.
 
-    The interior is the disc within the rim. It is visible where the ground, at `depth_m` (h, w) metres along the axis,
-    is not nearer than the disc's plane by more than SLACK_RADII radii and SLACK_PX pixel widths; without `depth_m` the
-    whole interior is visible. Pixels of the sky, whose depth is infinite, are -1. All craters at least a pixel wide are
-    included, even without a label. `camera` has no distortion.
+    A pixel shows a crater if it shows the interior, the disc within the rim. The interior is hidden where the ground is
+    nearer than the disc by more than SLACK_RADII radii and by more than SLACK_PX pixel widths. `depth_m` (h, w) is the
+    depth of the ground along the camera's axis, metres; without it, no interior is hidden. Pixels of the sky (infinite
+    depth) are -1. All craters at least a pixel wide are included, even if they have no label. `camera` has no
+    distortion.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     candidate = _reaching_in(camera, in_camera, circles.radius_m)
@@ -237,7 +244,10 @@ def crater_index(
 
 
 def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray:
-    """Indices of circles (N, 3), (N,) in O_C that may reach into the image and are at least a pixel wide."""
+    """Indices of the circles in O_C that may extend into the image and are at least a pixel wide.
+
+    `centre_m` is (N, 3), `radius_m` is (N,).
+    """
     x, y, z = centre_m.T
     rows = np.flatnonzero((z > 0) & (2 * camera.fx_px * radius_m > z))
     x, y, z, radius = x[rows], y[rows], z[rows], radius_m[rows]

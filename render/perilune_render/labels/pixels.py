@@ -1,4 +1,4 @@
-"""Loops over craters and their pixels, compiled by numba: selection, visible and sunlit share, contrast, index."""
+"""Compiled loops over craters and pixels: selection, visible share, sunlit share, contrast, index."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,10 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
 
 REACH = 1.5
-"""Radius of the disc in which contrast is measured, rim radii."""
+"""Radius of the disc in which contrast is measured, in radii of the rim."""
 _N_FITTED = 4
 _SLACK = 0.99
-"""Factor on the smallest radius to select: ellipses are computed later, with different rounding."""
+"""Factor on the smallest radius in `centred_in`, since rounding differs in the ellipses that are computed later."""
 
 
 class Circles(NamedTuple):
@@ -46,11 +46,14 @@ def _pinhole(camera: Camera) -> _Pinhole:
 def centred_in(
     camera: Camera, position_m: Array, rotation_camera_from_site: Array, circles: Circles, least_px: float
 ) -> tuple[np.ndarray, Array]:
-    """Circles in O_L whose centre is in an image without distortion and whose image has a radius of about `least_px`.
+    """Select the circles in O_L with their centre in the image and a large enough radius there.
 
-    The radius is sqrt(a b); some slightly smaller circles are selected too. Returns their indices (M,) and their
-    centres in O_C (M, 3), metres. The centres and pixels equal those of `camera_from_site`, `Camera.project` and
-    `Camera.inside` to the bit. A single loop computes them, since a scene has far more craters than an image shows.
+    `camera` has no distortion. The radius, sqrt(a b) of the ellipse, must be at least `least_px`, pixels; some circles
+    with a slightly smaller radius are also selected. Returns the indices of the selected circles (M,) and their centres
+    in O_C (M, 3), metres.
+
+    The centres and pixels equal the results of `camera_from_site`, `Camera.project` and `Camera.inside` to the bit. One
+    loop computes them, since a scene has far more craters than an image shows.
     """
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
     return _centred_in(circles, *pose, _pinhole(camera), least_px)
@@ -80,7 +83,10 @@ def _centred_in(circles, position, rotation, pinhole, least):
 
 
 class Rims(NamedTuple):
-    """N circles in O_L, as points c + r (cos t p + sin t q) at M angles t; an argument of compiled functions."""
+    """N circles in O_L, as an argument of compiled functions.
+
+    The points of a circle are c + r (cos t p + sin t q) at M angles t.
+    """
 
     centre_m: Array
     """Centres, metres (N, 3)."""
@@ -99,10 +105,10 @@ class Rims(NamedTuple):
 def rim_shares(
     rims: Rims, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth: np.ndarray
 ) -> Array:
-    """Share (N,) of each rim's points that an image without distortion shows, given the image's depth (h, w), metres.
+    """Share (N,) of each rim's points that are inside the image and not hidden by the ground.
 
-    A single loop computes the result of `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the
-    bit.
+    `camera` has no distortion; `depth` (h, w), metres, is the depth of its image along the axis. The result equals the
+    result of `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside` to the bit.
     """
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
     return _rim_shares(rims, *pose, _pinhole(camera), depth)
@@ -135,9 +141,9 @@ def _rim_shares(rims, position, rotation, pinhole, depth):
 
 
 def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
-    """Sunlit share (N,) of the pixels whose centres are in each of N ellipses; `sunlit` is (h, w) bool.
+    """Sunlit share (N,) of the pixels with their centre in each of N ellipses; `sunlit` is (h, w) bool.
 
-    0 if an ellipse contains no pixel centre.
+    The share is 0 if an ellipse contains no pixel centre.
     """
     shapes = ellipses.cx_px, ellipses.cy_px, ellipses.a_px, ellipses.b_px, ellipses.theta_rad
     return _lit(shapes, ellipses.bounding_boxes(), sunlit)
@@ -165,15 +171,15 @@ def _lit(shapes, boxes, sunlit):
 def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: np.ndarray) -> Array:
     """Contrast (N,) of N craters: fitted shading of a bowl lit from one side, over its standard error.
 
-    `centre_px` (N, 2) are the ellipses' centres. `image_from_rim` (N, 2, 2) maps offsets from the centre on the
+    `centre_px` (N, 2) are the centres of the ellipses. `image_from_rim` (N, 2, 2) maps offsets from the centre in the
     crater's plane, in radii along and across the Sun's direction, to offsets in pixels. `grey` and `noise` (h, w) are
     the mean and standard deviation of each pixel.
 
     Within REACH radii, grey is fitted by least squares as a plane plus c times the shading of a bowl, -s exp(-(r /
     0.8)^4), with r the distance from the centre and s the offset's component towards the Sun: the wall that faces the
     Sun is bright. The result is c over its standard error, where a pixel's variance is the sum of the variances of
-    noise and of the fit's residuals. It is negative for a bump, about 0 for flat ground, and 0 if too few pixels are in
-    the image.
+    the noise and of the fit's residuals. The contrast is negative for a bump, about 0 for flat ground, and 0 if too few
+    pixels are in the image.
     """
     matrices = np.ascontiguousarray(image_from_rim, np.float64)
     return _shading(centre_px, matrices, np.asarray(grey, np.float64), np.asarray(noise, np.float64))
@@ -222,7 +228,10 @@ def _shading(centre, matrices, grey, noise):
 
 @njit()
 def _last_over_its_error(normal, right, squares, variance, count):
-    """The last fitted value over its standard error, by Cholesky factors L L^T = normal (lower triangle given)."""
+    """The last fitted value over its standard error, from the Cholesky factors L L^T of `normal`.
+
+    Only the lower triangle of `normal` is read.
+    """
     for i in range(_N_FITTED):
         for j in range(i + 1):
             rest = normal[i, j]
@@ -245,11 +254,11 @@ def _last_over_its_error(normal, right, squares, variance, count):
 def smallest_crater(
     crater_id: np.ndarray, circles: Circles, boxes_px: Array, camera: Camera, depth_m: np.ndarray | None
 ) -> np.ndarray:
-    """Index image (h, w) float32: the smallest crater whose visible interior contains each pixel's centre.
+    """Id of the smallest crater that each pixel's centre shows (h, w) float32; -1 without a crater.
 
-    `circles` are the rims in O_C, largest first, `boxes_px` (N, 4) the bounding boxes of their images. `camera` has no
-    distortion. `depth_m` (h, w), metres along the optical axis, determines which interiors are hidden; None hides none.
-    Pixels without a crater are -1.
+    A pixel shows a crater if it shows the disc within the rim. `circles` are the rims in O_C, largest first; `boxes_px`
+    (N, 4) are the bounding boxes of their images. `camera` has no distortion. `depth_m` (h, w), metres along the
+    camera's axis, determines which interiors are hidden; with None, no interior is hidden.
     """
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)
     depth = np.full((1, 1), np.inf) if depth_m is None else depth_m

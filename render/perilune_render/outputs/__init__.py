@@ -1,1 +1,1 @@
-"""Outputs beside the frames: hazard maps of the scenes, images of a flash lidar."""
+"""Outputs in addition to the frames: hazard maps of the scenes, images of a flash lidar."""

@@ -22,22 +22,22 @@ from perilune_shared.geometry.frames import Array
 
 @dataclass(frozen=True, slots=True)
 class FlashImage:
-    """Ranges of one flash, metres, each (h, w)."""
+    """Ranges and intensity of one flash, each (h, w)."""
 
     range_m: Array
-    """Measured distances along the pixels' rays; NaN without a return."""
+    """Measured distances along the pixels' rays, metres; NaN without a return."""
     true_m: Array
-    """True distances to ground or boulders; NaN without a hit."""
+    """True distances to ground or boulders, metres; NaN without a hit."""
     intensity: Array
     """Energy of the returns, as a multiple of the smallest detectable energy; NaN without a return."""
 
     def exr(self) -> bytes:
-        """An EXR file with the channels range, range_true and intensity."""
+        """The content of an EXR file with the channels range, range_true and intensity."""
         return channel_bytes({"range": self.range_m, "range_true": self.true_m, "intensity": self.intensity})
 
 
 def lidar_camera(config: FlashLidarConfig) -> Camera:
-    """The pinhole camera with the pixels of the lidar."""
+    """The pinhole camera that has the pixels of the lidar."""
     return Camera.from_field_of_view(config.width_px, config.height_px, config.horizontal_fov_deg)
 
 
@@ -61,9 +61,12 @@ def flash(surface: Surface, shot: Shot, config: FlashLidarConfig) -> FlashImage:
 def _noisy(
     distance_m: Array, energy: Array, config: FlashLidarConfig, rng: np.random.Generator
 ) -> tuple[Array, Array, np.ndarray]:
-    """Measured ranges, metres, energies, and whether there is a return (N,), from true distances and mean energies."""
+    """Measured ranges, metres, energies, and whether there is a return (N,).
+
+    The arguments are true distances, metres, and mean energies (N,).
+    """
     n = len(distance_m)
-    # Always draw all of these in this order, so that no setting changes the noise of another.
+    # Always draw all numbers in this order, so that no setting changes the noise that another setting controls.
     of_range, of_energy, is_false, false_m = rng.normal(size=n), rng.normal(size=n), rng.random(n), rng.random(n)
     energy = energy * (1 + config.energy_sigma_share * of_energy)
     measured = np.where(np.isfinite(distance_m), distance_m, 0.0)

@@ -2,9 +2,9 @@
 
 The definitions come from hazard detection in the ALHAT project (Johnson et al. 2008, IEEE Aerospace Conference,
 "Analysis of on-board hazard detection and avoidance for safe lunar landing"): a plane is fitted to the heights in a
-footprint; the slope is the slope of this plane, and the roughness is the largest deviation from it. Deviations: the map
-shows the true ground, not measurements; the plane is fitted by least squares to the ground without boulders, but
-boulders count in the roughness.
+footprint. The slope is the slope of this plane; the roughness is the largest height of the surface above or below it.
+Deviations from the paper: the map shows the true ground, not measurements; the plane is fitted by least squares to the
+ground without boulders, but boulders count in the roughness.
 """
 
 from dataclasses import dataclass
@@ -33,9 +33,9 @@ LAYERS = {
 }
 """Layers of a map, in order, with their units."""
 FRAME_LAYERS = ("slope", "roughness", "boulder", "safe")
-"""Layers that become channels of the frames' EXRs on request."""
+"""Layers that become channels of the frames' EXRs with the setting `frame_channels`."""
 _LIFT_M = 1e-3
-"""Start of a shadow ray above its facet, metres."""
+"""Height above its facet at which a shadow ray starts, metres."""
 _ROWS_AT_ONCE = 128
 
 
@@ -46,11 +46,12 @@ class HazardMap:
     pixel_m: float
     """Size of a pixel, metres."""
     layers: dict[str, np.ndarray]
-    """Layers (n, n) float32 by the names in LAYERS: height of the surface with boulders; slope, roughness, largest
-    boulder height and share of shadow in the footprint around the pixel's centre; safe (1 or 0)."""
+    """Layers (n, n) float32 by the names in LAYERS. `height` is the height of the surface with boulders at the pixel's
+    centre. `slope`, `roughness`, `boulder` (largest boulder height) and `shadow` (share in shadow) describe the
+    footprint around the pixel's centre. `safe` is 1 or 0."""
 
     def at(self, x_m: Array, y_m: Array) -> dict[str, np.ndarray]:
-        """The FRAME_LAYERS (...) float32 of the pixels at positions (...) in O_L; NaN off the map and at NaN."""
+        """Values (...) float32 of the FRAME_LAYERS at positions (...) in O_L; NaN outside the map."""
         n = len(self.layers["safe"])
         with np.errstate(invalid="ignore"):
             column, row = (np.floor(offset_m / self.pixel_m + n / 2) for offset_m in (-x_m, y_m))
@@ -60,7 +61,7 @@ class HazardMap:
 
 
 def check_hazard(config: HazardConfig, grid: Grid) -> None:
-    """Raise UserError unless all footprints of a map lie on the ground of `grid`."""
+    """Raise UserError unless all footprints of a map are on the ground of `grid`."""
     needed = (config.side_px() + 2 * config.margin_px() + 1) * config.pixel_m
     if needed > grid.extent_m:
         most = grid.extent_m - config.footprint_m - config.pixel_m
@@ -69,10 +70,10 @@ def check_hazard(config: HazardConfig, grid: Grid) -> None:
 
 
 def hazard_map(surface: Surface, scene: Scene, sun: Array, config: HazardConfig) -> HazardMap:
-    """The hazard map of a scene lit from `sun` (3,), a unit vector in O_L; takes a second for 500 x 500 pixels.
+    """The hazard map of a scene lit from `sun` (3,), a unit vector in O_L.
 
-    Heights and shadows are evaluated at pixel centres. Every boulder, however small, counts with its highest point. The
-    Sun is treated as a point, so shadows have no penumbra.
+    Heights and shadows are evaluated at pixel centres. Boulders of every size count with their highest points. The Sun
+    is treated as a point, so shadows have no penumbra. Takes a second for 500 x 500 pixels.
     """
     n, margin = config.side_px(), config.margin_px()
     side = n + 2 * margin
@@ -101,7 +102,7 @@ def hazard_map(surface: Surface, scene: Scene, sun: Array, config: HazardConfig)
 
 
 def _top_and_shadow(surface: Surface, x_m: Array, y_m: Array, sun: Array) -> tuple[Array, Array]:
-    """Heights (N,) of the surface with boulders, metres, and shadow: 1 where the Sun does not reach it, else 0."""
+    """Heights (N,) of the surface with boulders, metres, and shadow: 1 in shadow, else 0."""
     above = surface.ground.highest_m + 1.0
     start = np.stack([x_m, y_m, np.full(len(x_m), above)], axis=1)
     distance, normal = first_hits(surface, start, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)))
@@ -111,7 +112,10 @@ def _top_and_shadow(surface: Surface, x_m: Array, y_m: Array, sun: Array) -> tup
 
 
 def _raise_to_boulders(above: Array, surface: Surface, scene: Scene, pixel_m: float) -> None:
-    """Raise the heights above the ground (side, side), metres, to the highest point of each boulder in its pixel."""
+    """Raise `above` (side, side) to the highest point of the boulders in each pixel.
+
+    `above` holds heights above the ground, metres.
+    """
     if not len(scene.boulders):
         return
     points = highest_points(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed)
@@ -139,10 +143,10 @@ class _Footprint(NamedTuple):
 
 @njit()
 def _footprints(ground, above, dark, footprint):
-    """For the footprint of each pixel: slope, degrees, roughness and largest boulder, metres, and share of shadow.
+    """Slope (degrees), roughness, largest boulder (metres) and share of shadow of each pixel's footprint.
 
-    The arrays (side, side) extend beyond these pixels by the margin of the footprint. A footprint is symmetric, so the
-    sums for the fit of the plane have no mixed terms.
+    The arrays (side, side) extend beyond the pixels of the map by the margin of the footprint. The footprint is
+    symmetric, so the sums for the fit of the plane have no mixed terms.
     """
     down, right, margin, pixel_m = footprint
     n, m = len(ground) - 2 * margin, len(down)
@@ -178,7 +182,10 @@ def _footprints(ground, above, dark, footprint):
 
 
 def hazard_tiff(hazard: HazardMap, latitude_deg: float, longitude_deg: float) -> bytes:
-    """A float32 GeoTIFF with a named band for each layer: north up, azimuthal equidistant around the site."""
+    """The content of a float32 GeoTIFF with a named band for each layer.
+
+    North is up; the projection is azimuthal equidistant around the site.
+    """
     from rasterio.io import MemoryFile
 
     n = len(hazard.layers["safe"])

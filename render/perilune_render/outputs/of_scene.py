@@ -1,4 +1,4 @@
-"""The outputs that a configuration requests beside the frames of one lit scene."""
+"""The outputs that a configuration requests in addition to the frames of one lit scene."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,17 +22,17 @@ class FrameOutputs:
     channels: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Additional EXR channels (h, w), in the pixels of the engine's camera."""
     lidar: bytes | None = None
-    """File of the flash lidar; None without a flash lidar."""
+    """Content of the flash lidar's EXR file; None without a flash lidar."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneOutputs:
-    """The outputs beside the frames of one lit scene. Create it with `SceneOutputs.of`."""
+    """The additional outputs of one lit scene. Create it with `SceneOutputs.of`."""
 
     surface: Surface | None = None
     """Surface of the scene; None if no output needs it."""
     hazard: HazardMap | None = None
-    """Hazard map of the scene; None without a map."""
+    """Hazard map of the scene; None if no map is requested."""
     has_channels: bool = False
     """Whether the EXRs have channels from the hazard map."""
     flash_lidar: FlashLidarConfig | None = None
@@ -50,7 +50,7 @@ class SceneOutputs:
         return cls(surface, hazard, config.hazard.frame_channels, config.flash_lidar)
 
     def of_frame(self, frame: Frame, places_m: Callable[[Frame], Array]) -> FrameOutputs:
-        """The outputs beside a frame; `places_m` is the method of the frame source."""
+        """The additional outputs of a frame; `places_m` is `FrameSource.places_m` of its frame source."""
         channels: Mapping[str, np.ndarray] = {}
         if self.hazard is not None and self.has_channels:
             points = places_m(frame)

@@ -33,11 +33,12 @@ _N_FRAMES = 4
 
 
 def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, map_path: Path) -> None:
-    """Write a contact sheet of the first scene and trajectory, frames evenly spaced in time, and a map of the scene.
+    """Write a contact sheet of the first trajectory in the first scene, and a map of this scene.
 
-    Below each camera's frames, the frames are repeated with labels and the outline of the elevation model, if any. The
-    map shows the trajectories over this ground. Prints a warning for each Sun that leaves the site in shadow. Raises
-    UserError if the engine is not installed, and with `where` if poses do not fit the ground.
+    The frames are evenly spaced in time. Each frame is shown twice: without labels, and with labels and the outline of
+    the elevation model, if there is one. The map shows all trajectories over the scene's ground. Prints a warning for
+    each Sun that leaves the site in shadow. Raises UserError if the engine is not installed or if poses do not fit the
+    ground; `where` names the source of the poses in the message.
     """
     check_installed(config.render.engine)
     scene_plan = plan.scenes[0]
@@ -77,7 +78,7 @@ def _rows(
     config: DatasetConfig,
     n_frames: int,
 ) -> tuple[list[np.ndarray], list[str]]:
-    """Frames of a trajectory, then these frames with labels, and the ids of the dark frames."""
+    """Pictures of a trajectory's frames, the same frames with labels, and the ids of the dark frames."""
     depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
     outline = None if model is None else outline_m(model)
     plain, drawn, dark = [], [], []

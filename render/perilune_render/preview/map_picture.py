@@ -29,9 +29,10 @@ def map_picture(
     tracks: Sequence[Array],
     horizon: SiteHorizon,
 ) -> np.ndarray:
-    """The picture (h, w, 3) uint8, BGR, north up.
+    """The picture of a site map (h, w, 3) uint8, BGR, north up.
 
-    `tracks` are positions (N, 2 or more) in O_L, first frame first.
+    `place_deg` are latitude and longitude of the site. Each element of `tracks` holds the positions (N, 2 or more) of a
+    trajectory in O_L, metres, in the order of its frames.
     """
     relief = cv2.resize(_shaded(site_map), (_MAP_PX, _MAP_PX), interpolation=cv2.INTER_AREA)
     _draw_square(relief, site_map)
@@ -77,7 +78,7 @@ def _draw_line(
 
 
 def _draw_square(picture: np.ndarray, site_map: SiteMap) -> None:
-    """Draw the extent of the scene's ground, if the map shows more."""
+    """Draw the extent of the scene's ground if the map extends beyond it."""
     half = site_map.ground_half_m
     if half < 0.99 * site_map.half_width_m:
         _draw_line(picture, site_map, half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), _GROUND, closed=True)
@@ -130,7 +131,7 @@ def _draw_legend(
     azimuth_deg: float,
     n_tracks: int,
 ) -> None:
-    """Write name and facts, and draw the compass with the Sun's azimuth and the keys of the map."""
+    """Write the name and the facts, and draw the compass and the key of the map's colours."""
     left, top = _MAP_PX + 2 * _EDGE_PX, _EDGE_PX + 18
     _write(picture, name[:26], (left, top), 0.6)
     for text, colour in facts:
@@ -160,7 +161,7 @@ def _draw_legend(
 
 
 def _draw_compass(picture: np.ndarray, at: tuple[int, int], azimuth_deg: float) -> None:
-    """Draw north up, and an arrow along the direction in which sunlight crosses the map."""
+    """Draw an arrow towards north, and an arrow along the direction in which sunlight crosses the map."""
     cv2.circle(picture, at, 50, _FAINT, 1, cv2.LINE_AA)
     cv2.arrowedLine(picture, (at[0], at[1] + 40), (at[0], at[1] - 40), _INK, 2, cv2.LINE_AA, tipLength=0.2)
     _write(picture, "N", (at[0] - 6, at[1] - 58))

@@ -1,4 +1,4 @@
-"""The horizon of the landing site in the direction of the Sun: whether the site lies in shadow."""
+"""The horizon seen from the landing site towards the Sun. It shows whether the site lies in shadow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _MAX_LINES = 5
 
 @dataclass(frozen=True, slots=True)
 class SiteHorizon:
-    """The ground with the largest elevation angle seen from the site in one direction."""
+    """The point of the ground with the largest elevation angle seen from the site in one direction."""
 
     elevation_deg: float
     """Elevation above the site's plane, degrees."""
@@ -29,8 +29,7 @@ class SiteHorizon:
 def site_horizon_of(scene: Scene, azimuth_deg: float) -> SiteHorizon:
     """The horizon seen from the ground at the site, at an azimuth clockwise from north.
 
-    Only the ground of the scene counts, without boulders. Ground beyond the scene's edge casts no shadow in frames
-    either.
+    Only the ground of the scene counts, without boulders: ground beyond its edge casts no shadow in frames either.
     """
     towards = sun_direction(azimuth_deg, 0.0)[:2]
     distance = _distances(scene.grid, towards)
@@ -53,7 +52,10 @@ def _distances(grid: Grid, towards: Array) -> Array:
 
 
 def shadow_warnings(scene: Scene, plans: Sequence[ScenePlan]) -> list[str]:
-    """One warning per plan over this ground whose Sun is below the site's horizon; at most _MAX_LINES lines."""
+    """A warning for each plan over this ground whose Sun is below the site's horizon.
+
+    After _MAX_LINES warnings, one more line counts the others.
+    """
     lines = []
     for plan in plans:
         horizon = site_horizon_of(scene, plan.sun_azimuth_deg)

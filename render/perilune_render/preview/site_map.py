@@ -1,4 +1,4 @@
-"""Shaded relief around the landing site, from the ground of a scene and the elevation model around it."""
+"""Shaded relief around the landing site, from the ground of a scene and its elevation model."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -18,8 +18,10 @@ from perilune_shared.geometry.frames import Array
 _N_HALF = 450
 """Vertex spacings from the middle of the map to its edge."""
 LARGEST_WIDTH = 8.0
-"""Largest width of the map, as a multiple of the ground's; a larger model is shown only around the site."""
+"""Largest width of the map, as a multiple of the ground's width. Of a larger elevation model, only the part around the
+site is shown."""
 _MARGIN = 1.03
+"""Width of the map as a multiple of the width of ground and model, if there is a model."""
 _LIFT = 0.02
 """Height above the ground at which rays to the Sun begin, in vertex spacings."""
 
@@ -28,7 +30,7 @@ _LIFT = 0.02
 class SiteMap:
     """A square map in O_L's plane.
 
-    Row 0 is the northern edge (smallest y), column 0 the western one (largest x).
+    Row 0 is the northern edge (smallest y), column 0 is the western edge (largest x).
     """
 
     height_m: Array
@@ -44,14 +46,14 @@ class SiteMap:
     ground_half_m: float
     """Half the side of the scene's ground around the site, metres."""
     outline_m: Array | None
-    """Points (N, 2) on the edge of the elevation model, metres; None without one."""
+    """Points (N, 2) on the edge of the elevation model, metres; None without an edge to draw."""
 
 
 def site_map(scene: Scene, model: ElevationModel | None, sun: Array) -> SiteMap:
     """The map of a scene's ground, and of the elevation model around it, lit from `sun` (3,), O_L.
 
-    The ground of the scene covers what frames show. Beyond it the map has the heights of the model, which cast no
-    shadows in frames.
+    The ground of the scene covers everything that frames show. Beyond this ground, the map has the heights of the
+    model, which cast no shadows in frames.
     """
     ground_half = scene.grid.extent_m / 2
     outline = outline_m(model) if model is not None else None
@@ -84,7 +86,7 @@ def site_map(scene: Scene, model: ElevationModel | None, sun: Array) -> SiteMap:
 
 
 def _grid(ground_half_m: float, outline: Array | None) -> Grid:
-    """The vertices of the map: the ground of the scene and the whole model, or the part of it that fits."""
+    """The vertices of the map, which covers the ground of the scene and the model up to LARGEST_WIDTH."""
     corners = np.array([[-ground_half_m, -ground_half_m], [ground_half_m, ground_half_m]])
     if outline is not None:
         corners = np.stack([np.minimum(corners[0], outline.min(axis=0)), np.maximum(corners[1], outline.max(axis=0))])
@@ -97,7 +99,7 @@ def _grid(ground_half_m: float, outline: Array | None) -> Grid:
 
 
 def _bare(scene: Scene, grid: Grid, height_m: Array) -> Scene:
-    """A scene with other ground and without boulders."""
+    """The scene with the heights `height_m` on `grid` as its ground, without boulders."""
     return dataclasses.replace(
         scene,
         grid=grid,

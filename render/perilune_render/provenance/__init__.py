@@ -1,1 +1,1 @@
-"""The code and versions that determine a result, and the caches keyed by them."""
+"""Records of the code and libraries that determine a result, and caches keyed by their versions."""

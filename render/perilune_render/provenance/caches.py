@@ -25,10 +25,10 @@ _LONGEST_WAIT_S = 120.0
 
 
 def cache_home() -> Path:
-    """perilune's cache folder, in the user's cache folder or, without a home folder, in the temporary folder.
+    """perilune's folder in the user's cache folder; without a home folder, in the temporary folder.
 
-    Other users may write to the temporary folder, and numba executes the files it reads. If the folder there is not
-    owned by the user or is accessible to others, a new folder with a random name is used.
+    Other users may write to the temporary folder, and numba executes the files that it reads. If perilune's folder in
+    the temporary folder is not owned by the user or is accessible to others, a new folder with a random name is used.
     """
     if Path(os.environ.get("XDG_CACHE_HOME", "")).is_absolute() or _has_home():
         return platformdirs.user_cache_path("perilune")
@@ -52,9 +52,10 @@ def _has_home() -> bool:
 
 @functools.cache
 def machine_code_folder() -> Path:
-    """The folder of machine code for the current compiled functions, in NUMBA_CACHE_DIR if set, else in `cache_home()`.
+    """The cache folder of the machine code for the current versions of the compiled functions.
 
-    Removes the least recently used folders. If the folder cannot be written, a temporary one is used.
+    The folder is in NUMBA_CACHE_DIR if this variable is set, else in `cache_home()`. Removes all but the _KEPT most
+    recently used folders. If the folder cannot be written, a temporary folder is used.
     """
     parent = _kernels()
     folder = parent / f"perilune-{_kept('compiled', lambda: fingerprint(*compiled_functions())).sha256[:16]}"
@@ -73,7 +74,11 @@ def machine_code_folder() -> Path:
 
 @contextlib.contextmanager
 def compiling(path: Path) -> Iterator[None]:
-    """Hold a compiled function's lock file, if the file system has locks and no other process holds it for too long."""
+    """Hold the lock file of a compiled function while the block runs.
+
+    The block runs without the lock if the file system has no locks, or after waiting _LONGEST_WAIT_S for another
+    process.
+    """
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError, NotImplementedError, Timeout):
             stack.enter_context(FileLock(path).acquire(timeout=_LONGEST_WAIT_S, poll_interval=0.02))
@@ -81,7 +86,10 @@ def compiling(path: Path) -> Iterator[None]:
 
 
 def kept_fingerprint(*roots: str) -> Fingerprint:
-    """`fingerprint` of functions of perilune, kept in a file: computing it parses most sources, which takes 0.1 s."""
+    """`fingerprint` of functions of perilune, stored in a file.
+
+    Computing a fingerprint parses most source files, which takes 0.1 s.
+    """
     return _kept(" ".join(roots), lambda: fingerprint(*roots))
 
 
@@ -90,9 +98,10 @@ def _kernels() -> Path:
 
 
 def _kept(name: str, compute: Callable[[], Fingerprint]) -> Fingerprint:
-    """A fingerprint from the file of this installation, or computed and stored there.
+    """A fingerprint from the file of this installation; if it is not in the file, compute and store it.
 
-    The file is valid for one state of the sources. If it is damaged or cannot be written, fingerprints are computed.
+    The file is valid for one state of the sources. If the file is damaged or cannot be written, the fingerprint is
+    computed.
     """
     folders_key = hashlib.sha256(repr(sorted(FOLDERS.items())).encode()).hexdigest()[:16]
     path, state = _kernels() / f"hashes-{folders_key}.json", _state_of_sources()
@@ -112,10 +121,10 @@ def _kept(name: str, compute: Callable[[], Fingerprint]) -> Fingerprint:
 
 
 def _state_of_sources() -> str:
-    """Hash of the version of Python and of path, size and times of every source file.
+    """Hash of the version of Python and of the path, size, times and inode of every source file.
 
-    The time of the inode's last change cannot be set, so a replacement with equal size and modification time is
-    noticed.
+    Users cannot set the time of an inode's last change. This time therefore reveals a file that was replaced by a file
+    of equal size and modification time.
     """
     states = [sys.version]
     for root in FOLDERS.values():

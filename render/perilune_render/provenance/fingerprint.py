@@ -1,8 +1,8 @@
 """Hash of the code that determines a result.
 
-Starting from some functions and classes, the hash covers every function, class and constant of perilune that they use,
-directly or indirectly. It omits comments, docstrings, error messages and unused code: a new docstring or command does
-not change the hash, but a new value of a constant five calls away does.
+The hash of some functions and classes covers them and every function, class and constant of perilune that they use,
+directly or indirectly. It omits comments, docstrings, error messages and unused code. A new docstring or command
+therefore does not change the hash, but a new value of a constant does, even if the constant is five calls away.
 """
 
 import ast
@@ -19,7 +19,8 @@ import perilune_shared
 FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
 """Folder of each package, by its name."""
 _SETTINGS = "perilune_render.config."
-"""Prefix of the modules of settings. Their values are in the recipe, so the hash omits defaults, bounds and checks."""
+"""Prefix of the modules of settings. A recipe records the values of all settings, so the hash omits their defaults,
+bounds and checks."""
 _NO_EFFECT = (
     "perilune_render.provenance.caches",
     "perilune_shared.config.",
@@ -27,7 +28,7 @@ _NO_EFFECT = (
     "perilune_shared.errors",
     "perilune_shared.storage.files",
 )
-"""Modules that read settings, store results, or report errors and progress, and so change no result."""
+"""Modules that do not change results: they read settings, store results, or report errors and progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,10 @@ class _Module:
     """Cached results of `content`."""
 
     def content(self, name: str) -> tuple[str, frozenset[tuple[str, ...]]]:
-        """The code that defines a name, and the dotted names in it; for "", the statements that define no name."""
+        """The code that defines a name, and the dotted names in this code.
+
+        For the name "", the code is the statements that define no name.
+        """
         if name not in self.contents:
             statements = self.definitions[name] if name else self.others
             names = frozenset(names for statement in statements for names in _names(statement))
@@ -101,7 +105,7 @@ def compiled_functions() -> tuple[str, ...]:
 
 
 class _Walk:
-    """Collects, across modules, the code to which names refer."""
+    """Collects the code to which names refer, across modules."""
 
     def __init__(self, folders: dict[str, Path]):
         self.folders = folders
@@ -112,7 +116,7 @@ class _Walk:
     def follow(self, module: str, names: tuple[str, ...]) -> None:
         """Collect the code to which a dotted name in a module refers.
 
-        Ignore names that the module does not define.
+        A name that the module does not define is ignored.
         """
         if module.startswith(_NO_EFFECT):
             return
@@ -157,7 +161,7 @@ class _Walk:
 def _parsed(text: str, settings: bool = False) -> _Module:
     """Parse a source file without docstrings and error messages; `settings` also omits fields and checks."""
     module, tree = _Module(), ast.parse(text)
-    # Includes imports inside functions.
+    # Walk the whole tree to include imports inside functions.
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -176,7 +180,7 @@ def _parsed(text: str, settings: bool = False) -> _Module:
 
 
 class _Stripped(ast.NodeTransformer):
-    """Removes imports, docstrings, other bare strings and raised errors; for settings also fields and their checks."""
+    """Removes imports, bare strings (docstrings) and raised errors; for settings, also fields and checks."""
 
     def __init__(self, settings: bool):
         self.settings = settings

@@ -1,8 +1,8 @@
 """numba.njit with a machine code cache that is keyed by the sources of all kernels.
 
 numba's own cache checks only the file of the function, although the machine code also contains functions and constants
-of other files. Here, a change to any of these files selects a new cache folder. Of several processes that need a kernel
-for the first time, one compiles it and the others wait.
+of other files. Here, a change to any kernel, or to the functions and constants that it uses, selects a new cache
+folder. If several processes need a kernel for the first time, one process compiles it and the others wait.
 """
 
 from collections.abc import Callable

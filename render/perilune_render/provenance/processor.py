@@ -1,9 +1,9 @@
-"""Settings of numerical libraries that make all x86-64 processors with AVX2 and FMA compute the same digits.
+"""Settings with which numerical libraries compute equal digits on all x86-64 CPUs with AVX2 and FMA.
 
-NumPy, OpenBLAS, OpenCV and numba select their code by the processor, and OpenBLAS also by the number of threads; both
+NumPy, OpenBLAS, OpenCV and numba select their code by the processor, and OpenBLAS also by the number of threads. Both
 choices change the last digits. The libraries read these environment variables when they are loaded, so
-`perilune_render` imports this module first. Processors without AVX2 and FMA still differ: the C library (sin, exp, log,
-power), OpenCV and Cycles have different code for them.
+`perilune_render` imports this module first. Results on processors without AVX2 and FMA still differ, since the C
+library (sin, exp, log, power), OpenCV and Cycles have different code for them.
 """
 
 import os
@@ -25,6 +25,7 @@ SETTINGS = {
 }
 """Environment variables and their values."""
 IN_FORCE = "numpy" not in sys.modules or all(os.environ.get(name) == value for name, value in SETTINGS.items())
-"""Whether the settings came before NumPy. Otherwise results depend on this processor, and recipes record that."""
+"""Whether the settings were set before NumPy was imported. If not, results depend on this processor, and recipes record
+this fact."""
 
 os.environ.update(SETTINGS)

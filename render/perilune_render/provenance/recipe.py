@@ -23,10 +23,7 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """The recipe of a dataset.
-
-    With `planned`, it is the recipe of a plan, with only the versions that affect the ground.
-    """
+    """The recipe of a dataset; with `planned`, of a plan, with only the versions that affect the ground."""
     with_dem = config.terrain.dem is not None
     versions = (
         ground_versions(with_dem=with_dem)
@@ -44,9 +41,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are omitted: settings
-    of speed, settings of the other kind unless the kinds share terrain, optional sections that are not set, the site in
-    an elevation model if there is no model, settings that repeat what the model's file states, and unused settings of a
-    catalogue.
+    of speed, settings of the other kind unless the kinds share terrain, and optional settings that are not set or not
+    used. Settings that the first versions of perilune did not have are omitted if they have their default, so that
+    recipes of these versions stay equal.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -83,7 +80,10 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
-    """The settings of a recipe with a section for each kind; if only one is recorded, it is used for both."""
+    """The settings of a recipe with a section for each kind.
+
+    If the recipe records only one kind, both sections are equal.
+    """
     other = _OTHER[recipe.kind]
     return {other: recipe.config[recipe.kind], **recipe.config} if recipe.kind in recipe.config else recipe.config
 
@@ -94,10 +94,11 @@ def same_source(first: str, second: str) -> bool:
 
 
 def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue: Path | None = None) -> DatasetConfig:
-    """The configuration of a recipe, with the user's copies of the files that it names.
+    """The configuration of a recipe, with the user's copies of the files that the recipe names.
 
-    Recipes are untrusted: the files that they name are never opened, only `dem` and `catalogue`. Raises UserError if a
-    needed file is not given, if a given file is not used by the recipe, or if this version rejects the settings.
+    Recipes are untrusted input: files that they name are never opened, only the user's copies `dem` and `catalogue`.
+    Raises UserError if a needed file is not given, if a given file is not used by the recipe, or if this version of
+    perilune rejects the settings.
     """
     copies = {"dem": dem, "catalogue": catalogue}
     terrain = recipe.config.get("terrain", {})

@@ -1,4 +1,4 @@
-"""Versions of the code for ground, rendering and images: hashes of perilune's code, version numbers of libraries."""
+"""Versions of the code that determines a dataset: hashes of perilune's code, versions of libraries."""
 
 import functools
 import importlib.util
@@ -46,21 +46,24 @@ OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune
 """Code that makes hazard maps and images of the flash lidar."""
 _NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING, "outputs": OUTPUTS}
 _RECORDED = {"rays": "renderer"}
-"""Recorded names of versions that have a different name in this module."""
+"""Names in a recipe of versions that have a different name in this module."""
 
 
 def ground_versions(*, with_dem: bool) -> dict[str, str]:
-    """Versions of code and libraries that generate the ground. rasterio is listed if there is an elevation model."""
+    """Versions of the code and libraries that generate the ground.
+
+    rasterio is included only with an elevation model (`with_dem`).
+    """
     return _versions(("generator",), with_dem)
 
 
 def imaging_versions() -> dict[str, str]:
-    """Versions of the code and libraries that make images and labels from EXRs. Works without Blender."""
+    """Versions of the code and libraries that make images and labels from EXRs; does not need Blender."""
     return _versions(("imaging",), False)
 
 
 def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = False) -> dict[str, str]:
-    """Versions of all code that determines a frame of an engine, its labels and additional `outputs`.
+    """Versions of all code that determines frames and labels, and with `outputs` the additional outputs.
 
     Raises UserError if the engine is not installed.
     """
@@ -70,10 +73,7 @@ def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = Fals
 
 
 def check_installed(engine: str) -> None:
-    """Raise UserError for the engine `cycles` if Blender's module is missing.
-
-    Other engines do not need it.
-    """
+    """Raise UserError for the engine `cycles` if Blender's module is missing."""
     if engine == "cycles" and importlib.util.find_spec("bpy") is None:
         found = "cycles, without Blender's module bpy"
         expected = "heightfield, or on Python 3.11 `pip install 'perilune-render[blender]'`"

@@ -1,1 +1,1 @@
-"""Servers that render frames on request: PANGU's wire protocol, and our own interface."""
+"""A server that renders frames on request, over PANGU's wire protocol and perilune's native interface."""

@@ -1,4 +1,4 @@
-"""One client of the server: its messages with time limits, and limits on its requests."""
+"""A client's connection, with time limits on its messages and size limits on its requests."""
 
 import asyncio
 import time
@@ -21,18 +21,18 @@ class Limits:
     clients: int = 16
     """Largest number of connected clients."""
     idle_s: float = 600.0
-    """Time after which a client that sends nothing between two messages is disconnected, seconds."""
+    """Longest silence between two messages before a client is disconnected, seconds."""
     message_s: float = 30.0
-    """Time within which the hello arrives, a started message is completed, and a reply is read, seconds."""
+    """Longest time until the hello arrives, a started message is complete, or a reply is read, seconds."""
     items: int = 100_000
-    """Largest number of items of an array in a message."""
+    """Largest number of items in an array of a message."""
     item_bytes: int = 4_000_000
-    """Largest size of an array in a message, bytes."""
+    """Largest size of an array of a message, bytes."""
 
 
 @dataclass(eq=False)
 class Connection:
-    """One client."""
+    """The connection of one client."""
 
     reader: asyncio.StreamReader
     writer: asyncio.StreamWriter
@@ -42,7 +42,7 @@ class Connection:
     name: str = ""
     """Address of the client, for messages."""
     is_extra: bool = False
-    """Whether this client exceeds the largest number of clients and gets an error."""
+    """Whether the client is beyond the limit of clients, so that it gets an error."""
     has_asked: bool = False
     """Whether the client has sent a complete request."""
     heard_s: float = field(default_factory=time.monotonic)
@@ -58,7 +58,8 @@ class Connection:
     async def first(self, n_bytes: int) -> bytes:
         """The first bytes of a message.
 
-        Raises TimeoutError after `limits.idle_s`, or if only part of them arrives.
+        Raises TimeoutError if no byte arrives in `limits.idle_s`, or if the other bytes do not follow the first byte in
+        `limits.message_s`.
         """
         async with asyncio.timeout(self.limits.idle_s):
             begun = await self.reader.readexactly(1)
@@ -66,7 +67,7 @@ class Connection:
         return begun + await self.rest(n_bytes - 1)
 
     async def rest(self, n_bytes: int) -> bytes:
-        """More bytes of a message. Raises TimeoutError `limits.message_s` after the message began."""
+        """The next bytes of a message. Raises TimeoutError if `limits.message_s` have passed since it began."""
         async with asyncio.timeout(self._due_s - time.monotonic()):
             data = await self.reader.readexactly(n_bytes)
         self.heard_s = time.monotonic()

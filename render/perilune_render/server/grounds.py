@@ -1,7 +1,7 @@
 """The scenes of a server: scene 0 of the configuration, and further scenes that clients request by number.
 
-A separate thread generates further scenes, one after another, while frames are rendered. A client has at most one scene
-in this queue. The most recently used scenes stay in memory.
+A separate thread generates the further scenes, one after another, while frames are rendered. Each client has at most
+one scene in the queue. The most recently used scenes stay in memory.
 """
 
 import queue
@@ -23,9 +23,9 @@ _STREAM = "served"
 
 
 def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
-    """Random seed and Sun of a further scene, from 1; the Sun is drawn from `dataset.nav.sun`.
+    """Random seed and Sun of the further scene `number`, from 1; the Sun is drawn from `dataset.nav.sun`.
 
-    The seed is derived as for the scenes of a dataset, but from another name, so that no dataset has this terrain.
+    The seed differs from the seeds of all scenes in datasets, so that no dataset has this terrain.
     """
     return drawn_scene(config, config.nav.sun, _STREAM, number)
 
@@ -35,15 +35,15 @@ class Grounds:
 
     def __init__(self, first: SimulatedScene, n_scenes: int = 1, note: Callable[[str], object] = lambda text: None):
         self.first, self.n_scenes, self._note = first, n_scenes, note
-        self._kept: dict[int, SimulatedScene] = {}
+        self._in_memory: dict[int, SimulatedScene] = {}
         self._waiting: dict[int, object] = {}
         self._failed: dict[int, Exception] = {}
-        self._asked: queue.SimpleQueue[int] = queue.SimpleQueue()
-        self._made: queue.SimpleQueue[tuple[int, SimulatedScene | Exception]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[tuple[int, SimulatedScene | Exception]] = queue.SimpleQueue()
         self._last = first
         if n_scenes > 1:
             # A daemon, so that the server can end while a scene is being generated.
-            threading.Thread(target=self._generate, name="grounds", daemon=True).start()
+            threading.Thread(target=self._serve_requests, name="grounds", daemon=True).start()
 
     def __enter__(self) -> "Grounds":
         return self
@@ -53,61 +53,61 @@ class Grounds:
 
     def close(self) -> None:
         """Release the engines of all scenes."""
-        for simulated in (self.first, *self._kept.values()):
+        for simulated in (self.first, *self._in_memory.values()):
             simulated.close()
-        self._kept.clear()
+        self._in_memory.clear()
 
     def simulated(self, number: int, client: object) -> SimulatedScene | None:
-        """The simulated scene of a number, or None if it is not in memory yet.
+        """The simulated scene `number`, or None if it is not in memory yet.
 
-        After None, call again: the scene is being generated or queued, unless another scene of the client or
-        MAX_WAITING scenes are queued. Raises UserError for a number that the server does not have, and the original
-        error if generation failed.
+        If the result is None, call again later. The call queues the scene, unless another scene of the client or
+        MAX_WAITING scenes are in the queue. Raises UserError if the server has no scene of this number, and the
+        original error if the scene could not be generated.
         """
         if number >= self.n_scenes:
             raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")
         self._collect()
         if number in self._failed:
             raise self._failed.pop(number)
-        if number == 0 or number in self._kept:
+        if number == 0 or number in self._in_memory:
             return self._used(number)
         is_full = client in self._waiting.values() or len(self._waiting) >= MAX_WAITING
         if number not in self._waiting and not is_full:
             self._waiting[number] = client
-            self._asked.put(number)
+            self._requests.put(number)
         return None
 
     def _used(self, number: int) -> SimulatedScene:
         if number > 0:
-            self._kept[number] = self._kept.pop(number)  # the most recently used scene comes last
-        simulated = self._kept.get(number, self.first)
+            self._in_memory[number] = self._in_memory.pop(number)  # the most recently used scene comes last
+        simulated = self._in_memory.get(number, self.first)
         if simulated is not self._last and simulated.config.render.engine == "cycles":
             self._last.close()  # Blender holds only one scene
         self._last = simulated
         return simulated
 
     def _collect(self) -> None:
-        """Take over generated scenes, and drop the least recently used scenes."""
-        while not self._made.empty():
-            number, result = self._made.get()
+        """Take generated scenes out of the thread's results, and drop the least recently used scenes."""
+        while not self._results.empty():
+            number, result = self._results.get()
             del self._waiting[number]
             if isinstance(result, Exception):
                 self._failed[number] = result
                 continue
-            while len(self._kept) >= MAX_KEPT:
-                self._kept.pop(next(iter(self._kept))).close()
-            self._kept[number] = result
+            while len(self._in_memory) >= MAX_KEPT:
+                self._in_memory.pop(next(iter(self._in_memory))).close()
+            self._in_memory[number] = result
 
-    def _generate(self) -> None:
-        """The thread that generates scenes."""
+    def _serve_requests(self) -> None:
+        """Generate requested scenes; the body of the thread."""
         while True:
-            number = self._asked.get()
+            number = self._requests.get()
             try:
-                self._made.put((number, self._grown(number)))
+                self._results.put((number, self._new_scene(number)))
             except Exception as error:
-                self._made.put((number, error))
+                self._results.put((number, error))
 
-    def _grown(self, number: int) -> SimulatedScene:
+    def _new_scene(self, number: int) -> SimulatedScene:
         config, view = self.first.config, self.first.scene.view
         if view is None:
             raise UserError("request", "scene", number, "0: the ground was made for no views")

@@ -1,10 +1,8 @@
-"""The server: many clients, one thread that renders.
+"""The server: it accepts many clients, and one thread answers their requests one after another.
 
-It answers the requests of all clients one after another.
-
-The first thread renders, since Blender must be in it. An event loop in a second thread holds the connections of all
-interfaces. It reads a connection again once its request is answered, so a client has at most one request in the queue,
-and the queue is fair. If the second thread ends for any reason except `stop`, `run` raises an error.
+The main thread renders, since Blender must run in it. An event loop in a second thread handles the connections of all
+interfaces. It reads the next request of a client only after the previous one is answered, so each client has at most
+one request in the queue. If the second thread ends for any reason except `stop`, `run` raises an error.
 """
 
 import asyncio
@@ -26,17 +24,17 @@ _STOP_S = 5.0
 _WATCH_S = 1.0
 """Interval between checks that the ports are still open, seconds."""
 _NOTES_S = 1.0
-"""Longest time to wait for the last log lines when the server ends, seconds."""
+"""Time to wait for the last log lines when the server ends, seconds."""
 _GRACE_S = 1.0
-"""Time for which a client without a request is kept, even if another client needs its connection, seconds."""
+"""Shortest silence after which a client without any request may be dropped for a new client, seconds."""
 _EXTRA_S = 2.0
-"""Time within which a client above the limit must send its hello and read its error, seconds."""
+"""Time within which a client beyond the limit must send its hello and read the error, seconds."""
 
 
 class LineQueue:
     """Passes lines to a function in a separate thread, without ever blocking the caller.
 
-    The function may block, for example on a full pipe. Further lines then wait; lines beyond `most` are dropped.
+    While the function blocks, for example on a full pipe, up to `most` lines wait, and further lines are dropped.
     """
 
     def __init__(self, note: Callable[[str], object], most: int = 1000):
@@ -51,7 +49,7 @@ class LineQueue:
             self._lines.put_nowait(text)
 
     def close(self, wait_s: float) -> None:
-        """Pass on the queued lines, for at most about `wait_s` seconds."""
+        """Pass on the queued lines; stop waiting after about `wait_s` seconds."""
         with contextlib.suppress(queue.Full):
             self._lines.put(None, timeout=wait_s)
             self._thread.join(wait_s)
@@ -65,18 +63,18 @@ class LineQueue:
 
 @dataclass(eq=False)
 class Interface:
-    """One port, and the function that serves its clients."""
+    """A port of the server, and the function that serves its clients."""
 
     name: str
     """Name of the protocol, for messages."""
     host: str
     """Address to listen on."""
     port: int
-    """Port; 0 takes a free port, which is then stored here."""
+    """Port; 0 takes a free port, whose number then replaces the 0."""
     handle: Callable[[Connection], Awaitable[None]]
     """Coroutine function that serves one connection until it ends. May raise `Dropped`."""
     greets: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[bool]]
-    """Whether the other end of a new connection sends the greeting of this interface."""
+    """Coroutine function that returns whether the other end of a new connection sends this interface's greeting."""
     limits: Limits
     """Limits on the clients."""
     clients: set[Connection] = field(default_factory=set)
@@ -84,9 +82,9 @@ class Interface:
     probes: set[int] = field(default_factory=set)
     """Ports from which the server itself connects to check that the interface answers."""
     n_extra: int = 0
-    """Number of connections above the limit of clients."""
+    """Number of connections beyond the limit of clients."""
     listening: asyncio.Server | None = None
-    """Socket server that accepts connections, once the server has begun."""
+    """Socket server that accepts connections; None before the server begins."""
 
 
 @dataclass
@@ -95,7 +93,7 @@ class Server:
 
     interfaces: list[Interface]
     note: Callable[[str], object]
-    """Called with one line per event, in a separate thread; it may block."""
+    """Function that is called with one line per event, in a separate thread; it may block."""
     _ready: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
     _work: "queue.Queue[tuple[Callable[[], Any], Future[Any]] | None]" = field(default_factory=queue.Queue)
@@ -117,29 +115,29 @@ class Server:
     def run(self) -> None:
         """Answer requests until `stop` is called.
 
-        Raises UserError if the thread of the connections ended before.
+        Raises UserError if the thread of the connections ended by itself.
         """
         try:
             while (item := self._work.get()) is not None:
                 _answer(*item)
         finally:
             if self._loop is not None:
-                with contextlib.suppress(RuntimeError):  # closed already
+                with contextlib.suppress(RuntimeError):  # the loop is already closed
                     self._loop.call_soon_threadsafe(self._ending.set)
             if self._thread is not None:
                 self._thread.join(_STOP_S)
             if self._notes is not None:
                 self._notes.close(_NOTES_S)
         if self._failure is not None:
-            found = f"ended by {type(self._failure).__name__}: {self._failure}"
-            raise UserError("serve", "connections", found, "a server that answers; start it again") from self._failure
+            actual = f"ended by {type(self._failure).__name__}: {self._failure}"
+            raise UserError("serve", "connections", actual, "a server that answers; start it again") from self._failure
 
     def stop(self) -> None:
         """End `run`; may be called from any thread."""
         self._work.put(None)
 
     def _accept(self) -> None:
-        """The thread of the connections. Whenever it ends, `run` ends too."""
+        """Accept and serve connections; the body of the second thread. When it fails, `run` ends too."""
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_error)
         try:
@@ -156,7 +154,7 @@ class Server:
                 self._loop.close()
 
     async def _watch(self) -> None:
-        """Wait for the end. Raises RuntimeError if a port is no longer open."""
+        """Wait until the server ends. Raises RuntimeError if a port is no longer open."""
         while not self._ending.is_set():
             for each in self.interfaces:
                 if each.listening is None or not each.listening.is_serving():
@@ -210,7 +208,7 @@ class Server:
         self._say(f"{connection.name}: {reason}")
 
     async def _serve(self, interface: Interface, connection: Connection) -> str:
-        """Serve a connection and close it. Returns the reason for its end."""
+        """Serve a connection and close it. Returns the reason why it ended."""
         task, reason = asyncio.current_task(), "left"
         self._tasks.add(task)
         try:
@@ -233,9 +231,9 @@ class Server:
         return reason
 
     def _drop_silent(self, interface: Interface) -> bool:
-        """Close the connection that has been silent longest without any request.
+        """Close the connection that has been silent longest, among those without any request so far.
 
-        Returns False without such a connection.
+        Returns whether a connection was closed.
         """
         now_s = time.monotonic()
         silent = [each for each in interface.clients if not each.has_asked and now_s - each.heard_s >= _GRACE_S]
@@ -248,7 +246,7 @@ class Server:
         return True
 
     async def _refuse(self, interface: Interface, connection: Connection) -> None:
-        """Tell a client that the limit is reached, or close the connection if there are too many such clients."""
+        """Tell a client that the limit is reached. With too many such clients, only close the connection."""
         self._say(f"{connection.name}: refused, {interface.limits.clients} clients are connected")
         if interface.n_extra >= interface.limits.clients:
             connection.writer.transport.abort()
@@ -267,9 +265,10 @@ class Server:
 
 
 async def answers(interface: Interface) -> bool:
-    """Whether an interface of this event loop greets a new connection, which does not count as a client.
+    """Connect to an interface of this event loop, and return whether it sends its greeting.
 
-    Raises OSError if the connection fails, and IncompleteReadError if the interface closes it.
+    The connection does not count as a client. Raises OSError if it fails, and IncompleteReadError if the interface
+    closes it.
     """
     if interface.listening is None or not interface.listening.sockets:
         return False
@@ -277,7 +276,7 @@ async def answers(interface: Interface) -> bool:
     address = (_own_address(listening), *listening.getsockname()[1:])
     with socket.socket(listening.family) as probe:
         probe.setblocking(False)
-        # The port must be known before the connection is accepted.
+        # `_connected` recognises the probe by this port, so it must be stored before the connection is accepted.
         probe.bind((address[0], 0))
         port = probe.getsockname()[1]
         interface.probes.add(port)
@@ -299,7 +298,7 @@ def _own_address(listening: Any) -> str:
 
 
 def _answer(work: Callable[[], Any], future: "Future[Any]") -> None:
-    """Call `work` and pass its result or error to the thread of the connections. Raises KeyboardInterrupt."""
+    """Call `work` and pass its result or error to the thread of the connections; KeyboardInterrupt is also raised."""
     if not future.set_running_or_notify_cancel():
         return
     try:
@@ -307,6 +306,6 @@ def _answer(work: Callable[[], Any], future: "Future[Any]") -> None:
     except Exception as error:
         future.set_exception(error)
     except BaseException:
-        # KeyboardInterrupt would end the event loop with a traceback.
+        # Passed on as the result, KeyboardInterrupt would end the event loop with a traceback.
         future.set_exception(ConnectionAbortedError("the server ends"))
         raise

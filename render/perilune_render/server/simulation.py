@@ -1,4 +1,4 @@
-"""A simulated scene, rendered and measured from any pose. Only one thread may use it."""
+"""A scene that can be rendered from any pose and measured with rays. Only one thread may use it."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -74,9 +74,9 @@ class SimulatedScene:
         self._sources.clear()
 
     def prepare(self) -> None:
-        """Render a frame of the site with the camera and the Sun of the configuration, and label it.
+        """Render and label a frame of the site, so that the first frame of a client does not wait.
 
-        In a new installation, the first frame waits half a minute (on one core) for the compilation of functions.
+        In a new installation, this compiles functions, which takes half a minute on one core.
         """
         stated = self.config.scene or SceneConfig()
         position = np.array([0.0, 0.0, float(self.heights_m(np.zeros(1), np.zeros(1))[0]) + _PREPARED_AT_M])
@@ -99,9 +99,9 @@ class SimulatedScene:
         velocity_mps: Array | None = None,
         angular_velocity_radps: Array | None = None,
     ) -> Frame:
-        """Render and develop a frame.
+        """Render and develop a frame, blurred by the velocities.
 
-        Raises UserError like `check_view`, and above LARGEST_MPS or LARGEST_RADPS.
+        Raises UserError like `check_view`, and if a velocity exceeds LARGEST_MPS or LARGEST_RADPS.
         """
         self.check_view(view)
         velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
@@ -114,29 +114,29 @@ class SimulatedScene:
         return self._source(view).labels(frame)
 
     def radiance(self, view: View) -> Radiance:
-        """Radiance, depth and normals of a view, with the samples of the configuration and without a sensor."""
+        """Radiance, depth and normals of a view, without a sensor."""
         self.check_view(view)
         return self._source(view).render(Shot(view.position_m, view.rotation_camera_from_site, np.zeros(3), 0))
 
     def check(self, position_m: Array) -> None:
-        """Raise UserError if a camera is off the ground or not above its surface, as `perilune-render frames` does."""
+        """Raise UserError if a camera is beyond the edge of the ground, or not above its surface."""
         check_places(_poses(position_m, _DOWN), self.scene, "request")
 
     def check_view(self, view: View) -> None:
-        """Raise UserError for a view that `perilune-render frames` rejects."""
+        """Raise UserError if `perilune-render frames` would reject the view."""
         pinhole = view.camera.covering_pinhole()
         check_poses(_poses(view.position_m, view.rotation_camera_from_site), pinhole, self.scene, "request")
 
     def hits(self, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
-        """Distances (N,) and normals (N, 3) of the first hits (`heightfield.query.first_hits`)."""
+        """Distances (N,) and normals (N, 3) of the first hits of rays, as from `heightfield.query.first_hits`."""
         return first_hits(self.surface, origins_m, directions, boulders=boulders)
 
     def heights_m(self, x_m: Array, y_m: Array, *, boulders: bool = True) -> Array:
-        """Heights (N,) of the surface, metres; NaN off the ground."""
+        """Heights (N,) of the surface, metres; NaN beyond the edge of the ground."""
         return heights_m(self.surface, x_m, y_m, boulders=boulders)
 
     def _source(self, view: View) -> FrameSource:
-        """The frame source of a camera and a Sun, opened if necessary."""
+        """The frame source for a view's camera and Sun, opened if necessary."""
         key = (view.camera, tuple(view.sun.tolist()))
         source = self._sources.pop(key, None) or self._opened(view)
         self._sources[key] = source  # the most recently used source comes last
@@ -158,7 +158,10 @@ class SimulatedScene:
 
 
 def open_simulation(config: DatasetConfig) -> SimulatedScene:
-    """The simulated scene of a configuration, with ground for `dataset.scene.views` or for the flights of `nav`."""
+    """The simulated scene of a configuration.
+
+    Its ground covers the views in `dataset.scene.views` or, without them, the flights of `dataset.nav`.
+    """
     pinhole = camera_of(config.camera).covering_pinhole()
     scene = config.scene or SceneConfig()
     if scene.views:
@@ -169,13 +172,13 @@ def open_simulation(config: DatasetConfig) -> SimulatedScene:
 
 
 def simulation_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> SimulatedScene:
-    """The simulated scene of a configuration over the ground of a seed, made for the given views.
+    """The simulated scene of a configuration, with ground of a random seed that covers the given views.
 
     Raises UserError if the engine is not installed or the ground is too large.
     """
     check_installed(config.render.engine)
     if config.render.engine == "cycles":
-        # Do not use levels, which hold only the ground of one descent: ground that is too large raises an error.
+        # Use one mesh, since levels fit only one descent. `check_ground` rejects ground that is too large for one mesh.
         view = replace(view, seen=None)
     check_ground(config, view)
     say("generating the ground")
@@ -183,12 +186,12 @@ def simulation_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Sim
 
 
 def _poses(position_m: Array, rotation_camera_from_site: Array) -> Poses:
-    """One pose, to be checked."""
+    """One pose, in the form that the pose checks take."""
     return Poses(["requested"], np.asarray(position_m)[None], quaternion_from_matrix(rotation_camera_from_site)[None])
 
 
 def _limited(values: Array | None, field: str, largest: float, unit: str) -> Array:
-    """A vector (3,), 0 if not given. Raises UserError if it is longer than `largest`."""
+    """The vector `values` (3,), or zeros for None. Raises UserError if it is longer than `largest`."""
     vector = np.zeros(3) if values is None else np.asarray(values, np.float64)
     # Test the components first, since the length of a very large vector overflows.
     if not np.abs(vector).max() <= largest or np.linalg.norm(vector) > largest:

@@ -22,7 +22,7 @@ DatasetArgument = Annotated[
 OutOption = Annotated[str, typer.Option(help="New folder or address for the result.")]
 ImagesOption = Annotated[
     ImageChoice,
-    typer.Option(help="Frames: copy, none (leave them out), plan (leave out craters, boulders and labels too)."),
+    typer.Option(help="copy: copy the frames; none: omit them; plan: omit craters, boulders and labels too."),
 ]
 
 LinkOption = Annotated[
@@ -44,7 +44,7 @@ def add_to(app: typer.Typer) -> None:
 
 
 def _new_dataset(out: str, overwrite: bool, *inputs: str) -> AbstractContextManager[str]:
-    """The address to write the new dataset `out` to, as a context manager; `inputs` are its source datasets."""
+    """Return a context manager with the address to write to; `inputs` are the source datasets."""
     return replaceable(out, ("dataset.json",), overwrite=overwrite, inputs=inputs)
 
 
@@ -67,7 +67,7 @@ def merge(
     link: LinkOption = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Merge several datasets into one. A scene or frame that is in two of them is written once."""
+    """Merge several datasets into one. A scene or frame that is in several datasets is written once."""
     from perilune_shared.editing.merge import merge as merge_datasets
 
     with _new_dataset(out, overwrite, *datasets) as folder, progress_bar() as progress:
@@ -83,7 +83,7 @@ def subset(
         typer.Option(help='Condition on columns, for example "radius_px > 5" or "split == \'test\'"; may be repeated.'),
     ] = None,
     frames: Annotated[int | None, typer.Option(help="Maximum number of frames.")] = None,
-    mb: Annotated[float | None, typer.Option(help="Maximum size of all PNGs, 10^6 bytes.")] = None,
+    mb: Annotated[float | None, typer.Option(help="Maximum total size of the PNGs, 10^6 bytes.")] = None,
     images: ImagesOption = "copy",
     link: LinkOption = False,
     overwrite: OverwriteFolder = False,
@@ -102,10 +102,10 @@ def split(
     dataset: DatasetArgument,
     out: OutOption,
     by: Annotated[
-        SplitUnit, typer.Option(help="Unit of the split. `frame` follows the paper: such splits share terrain.")
+        SplitUnit, typer.Option(help="Assign whole scenes, trajectories or frames. With `frame`, splits share terrain.")
     ] = "scene",
-    val: Annotated[float, typer.Option(help="Share of units in the split val.")] = 0.1,
-    test: Annotated[float, typer.Option(help="Share of units in the split test.")] = 0.1,
+    val: Annotated[float, typer.Option(help="Share of scenes, trajectories or frames in val.")] = 0.1,
+    test: Annotated[float, typer.Option(help="Share of scenes, trajectories or frames in test.")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the split.")] = 0,
     images: ImagesOption = "copy",
     link: LinkOption = False,
@@ -128,7 +128,7 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
     if not differing:
         answer("no difference")
         return
-    rows = [(each.place, each.column, each.rows, each.example, each.first, each.second) for each in differing]
+    rows = [(each.table, each.column, each.rows, each.example, each.first, each.second) for each in differing]
     answer_table(("where", "column", "rows", "example", "first", "second"), rows)
     raise typer.Exit(EXIT_DIFFERENT)
 
@@ -147,10 +147,10 @@ def migrate(
 def pack(
     dataset: DatasetArgument,
     out: OutOption,
-    shard_mb: Annotated[float, typer.Option(help="Size of a shard of frames, megabytes.")] = 128,
+    shard_mb: Annotated[float, typer.Option(help="Approximate size of a shard, megabytes.")] = 128,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Pack frames with poses and labels into Parquet shards by split, and each table into one file, for streaming."""
+    """Pack a dataset for streaming: frames, poses and labels into shards, each table into one file."""
     from perilune_shared.editing.pack import pack as pack_dataset
 
     with _new_dataset(out, overwrite, dataset) as folder, progress_bar() as progress:

@@ -1,4 +1,4 @@
-"""`perilune-manifest export` and `card`: convert a dataset to other formats, and write its dataset card."""
+"""Commands `perilune-manifest export` and `card`: other formats and the dataset card."""
 
 from typing import Annotated, Literal
 
@@ -55,7 +55,7 @@ def export(
     link: LinkOption = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Write labels, trajectories or metadata in formats of other tools."""
+    """Export labels, trajectories or metadata in the format of another tool."""
     from perilune_shared.config.errors import nearest
     from perilune_shared.dataset.keys import check_keys
     from perilune_shared.dataset.names import SPLITS
@@ -85,7 +85,7 @@ def export(
             raise UserError("--split", "", split, "no --split: Croissant describes the whole dataset")
         with progress_bar() as progress:
             written = export_croissant(opened, out, progress)
-        _say(f"{written}: written")
+        answer(f"{written}: written")
         return
     if out is None:
         raise UserError("--out", "", "none", f"a new folder for the {format} files")
@@ -103,7 +103,7 @@ def export(
                 done = f"{export_tum(opened, folder, progress, split)} trajectories"
             case "kitti":
                 done = f"{export_kitti(opened, folder, progress, split)} trajectories"
-    _say(f"{out}: {done}")
+    answer(f"{out}: {done}")
 
 
 def card(
@@ -115,20 +115,15 @@ def card(
     licence: Annotated[
         str | None,
         typer.Option(
-            help="Licence under which you publish the dataset, as an SPDX expression such as CC-BY-4.0. A card in the "
-            "dataset also writes it into dataset.json, for exports and merges. [default: the one in dataset.json, "
-            "which is not stated for datasets that you render]"
+            help="Licence under which you publish the dataset, as an SPDX expression such as CC-BY-4.0. If the card is "
+            "written in the dataset, the licence is also written into dataset.json, for exports and merges. [default: "
+            "the licence in dataset.json; a dataset that you rendered states none]"
         ),
     ] = None,
 ) -> None:
-    """Write a dataset card: counts, histograms, labelled frames, licence and the command to reproduce the data."""
+    """Write a dataset card: counts, histograms, labelled frames, licence, and how to reproduce the data."""
     from perilune_shared.export.card import write_card
 
     with progress_bar() as progress:
         page, picture = write_card(ps.open_dataset(dataset), out, progress, licence)
-    _say(f"{page}, {picture}: written")
-
-
-def _say(line: str) -> None:
-    # Text, since a plain string would be parsed as markup.
-    answer(line)
+    answer(f"{page}, {picture}: written")

@@ -1,4 +1,4 @@
-"""`perilune-manifest`: validate, inspect, edit and export datasets, without Blender and without torch.
+"""`perilune-manifest`: validate, inspect, edit and export datasets. Needs neither Blender nor torch.
 
 Commands import their modules only when they run, so that `--help` does not load pandas and pyarrow.
 """
@@ -53,7 +53,7 @@ def stats(dataset: DatasetArgument) -> None:
     frame = summary(opened)
     info = opened.info
     state = "" if info.complete else ", not complete"
-    # One measure per row, so that the table fits a narrow terminal.
+    # One quantity per row, so that the table fits a narrow terminal.
     measures = frame.set_index("split").astype(object).T
     head = ["", *(shortened(one_line(split)) for split in measures.columns)]
     rows = [[name, *values] for name, values in measures.iterrows()]

@@ -1,1 +1,1 @@
-"""Settings: presets, YAML files and single values resolved into checked sections, and pages about them."""
+"""Load configurations from presets, YAML files and single settings; check and print them."""

@@ -52,18 +52,18 @@ _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "ma
 
 
 _KEY = "[key]"
-"""The name by which pydantic locates an error in a mapping's key, not in its value."""
+"""Last part of pydantic's location if a key of a mapping is wrong, not the value."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a suggestion for an unknown name: the most similar known name, or all known names if none is similar."""
+    """Return the most similar known name, or all known names if none is similar, worded as a suggestion."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=_MIN_SIMILARITY)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
 
 
 def expected_of(fault: ErrorDetails) -> str:
-    """Return what pydantic expected, worded to follow "expected"."""
+    """Return what pydantic expected, worded to follow "expected" in a message."""
     kind, context = fault["type"], fault.get("ctx", {})
     if kind in _COUNTED:
         bound, key = _COUNTED[kind]
@@ -87,9 +87,10 @@ def formatted(value: Any) -> str:
 def user_error_of(
     error: ValidationError, model: type[BaseModel], section: str, sources: list[tuple[str, dict[str, Any]]]
 ) -> UserError:
-    """Return the first error as a UserError.
+    """Return the first of pydantic's errors as a UserError.
 
-    The section was merged from `sources`, pairs of name and content; later sources override earlier ones.
+    `sources` are the pairs of name and content from which the section was merged; later sources override earlier ones.
+    The UserError names the last source that contains the wrong setting.
     """
     fault = error.errors(include_url=False)[0]
     location = [str(part) for part in fault["loc"]]
@@ -104,7 +105,7 @@ def user_error_of(
 
 
 def got_of(fault: ErrorDetails) -> str:
-    """Return the wrong value, or the contradictory settings that the message names."""
+    """Return the wrong value, or the contradictory settings that pydantic's message names."""
     if fault["type"] == "missing":
         return "nothing"
     value = fault["input"]
@@ -137,13 +138,13 @@ def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
             field = section.model_fields.get(key)
             annotation = None if field is None else field.annotation
         else:
-            # A key of a mapping, or the number of an item: continue with the type of the values.
+            # `key` is a key of a mapping or the number of an item: continue with the type of the values.
             annotation = next(iter(typing.get_args(_container_in(annotation))[-1:]), None)
     return [name for section in _sections_in(annotation)[:1] for name in section.model_fields]
 
 
 def _parts(annotation: Any) -> list[Any]:
-    """Return the members of a union, or any other type alone, without Annotated."""
+    """Return the members of a union; a list with the type itself if it is no union. Removes Annotated."""
     if typing.get_origin(annotation) is typing.Annotated:
         return _parts(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
@@ -156,7 +157,7 @@ def _sections_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _container_in(annotation: Any) -> Any:
-    """Return the mapping, list or tuple in a type; a tuple of any length is returned as a list."""
+    """Return the dict or list type in a type; a tuple type is returned as a list type."""
     for part in _parts(annotation):
         if typing.get_origin(part) in (dict, list):
             return part

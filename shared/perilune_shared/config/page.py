@@ -1,4 +1,4 @@
-"""Format a resolved configuration as YAML with a comment on each key: meaning, unit, choices and default."""
+"""Format a resolved configuration as YAML; comments state meaning, choices and default of each key."""
 
 import json
 import textwrap
@@ -35,7 +35,8 @@ class Key:
 def keys(section: str, config: Section) -> Iterator[Key]:
     """Yield every key of a resolved section, in the order of the configuration file.
 
-    The keys of an optional section are yielded even if it is not given; a key without a default then shows `required`.
+    The keys of an optional section are yielded even if the section is not set. A key without a default then has the
+    value `required`.
     """
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
@@ -81,7 +82,7 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _choices(field: FieldInfo) -> tuple[str, ...]:
-    """Return the values of a Literal, even one inside a union with other types."""
+    """Return the values of a Literal, also if it is a member of a union."""
     kinds = [field.annotation, *typing.get_args(field.annotation)]
     return tuple(
         str(value) for kind in kinds if typing.get_origin(kind) is typing.Literal for value in typing.get_args(kind)
@@ -118,5 +119,5 @@ def _flow(value: Any) -> str:
 
 
 def _is_span(value: Section) -> bool:
-    """Whether a section is a pair of bounds (low, high), which is shown as one value."""
+    """Whether a section has only the bounds `low` and `high`, so that it is shown on one line."""
     return set(type(value).model_fields) == {"low", "high"}

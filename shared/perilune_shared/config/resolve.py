@@ -33,7 +33,7 @@ SectionType = TypeVar("SectionType", bound=Section)
 
 
 def read_config_file(path: Path) -> dict[str, dict]:
-    """Read the sections of a user's YAML file. Raises UserError on a missing file or an unknown section."""
+    """Read the sections of a user's YAML file. Raises UserError if the file cannot be read as sections."""
     if not path.is_file():
         raise UserError(path, "configuration", "no such file", "a YAML file")
     if path.stat().st_size > _LARGEST_FILE_BYTES:
@@ -72,9 +72,10 @@ def resolve(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """Resolve `section` from a preset of `package`, a user's file and single settings.
+    """Resolve a section of the configuration from a preset, a user's file and single settings.
 
-    Later sources override. Raises UserError with the source, the key, the value and the expected value.
+    `package` contains the presets. `settings` are texts such as "dataset.seed=3". Later sources override earlier ones.
+    Raises UserError with the source, the key, the value and the expected value.
     """
     if preset not in PRESETS:
         raise UserError("--preset", "", preset, nearest(preset, PRESETS))
@@ -91,7 +92,10 @@ def resolve_over(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """Do the work of `resolve`, with plain data `base` instead of a preset; messages call it `base_name`."""
+    """Resolve a section as `resolve` does, from plain data `base` instead of a preset.
+
+    Error messages call the data `base_name`.
+    """
     sources: list[tuple[str, dict]] = [(base_name, base)]
     if config_file is not None:
         sources.append((str(config_file), read_config_file(config_file).get(section, {})))

@@ -1,7 +1,7 @@
 """Parse untrusted YAML 1.2 with the core schema (specification 1.2.2, section 10.3), and write YAML.
 
-Only values in the core schema's forms become numbers, booleans or null. `yes`, `off`, `1:30`, `1_000` and `2024-01-17`
-are text; `012` is 12 (octal is `0o14`); `1e-4` is a number. Keys are always text.
+In the core schema, `yes`, `off`, `1:30`, `1_000` and `2024-01-17` are text, `012` is the number 12 (octal is `0o14`),
+and `1e-4` is a number. Keys are always text.
 
 The parser is stricter than YAML. A repeated key, an alias, an anchor, a tag, a directive, a second document and a key
 that is not a scalar are errors. Size and depth are limited.
@@ -45,12 +45,12 @@ _CORE_SCHEMA: tuple[tuple[re.Pattern, Callable[[str], Any]], ...] = (
     (re.compile(r"[-+]?\.(inf|Inf|INF)"), lambda text: float(text.replace(".", "").lower())),
     (re.compile(r"\.(nan|NaN|NAN)"), lambda text: float("nan")),
 )
-# Text that needs no quotes in any YAML version.
+# Text that is read as text without quotes in every YAML version.
 _PLAIN_TEXT = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null)$)[A-Za-z][\w ./()-]*(?<! )", re.IGNORECASE)
 
 
 class _Refused(ValueError):
-    """Error for valid YAML that this parser does not accept; states what was found and what is expected."""
+    """Error for valid YAML that this parser does not accept."""
 
     def __init__(self, event: Event, got: str, expected: str = _EXPECTED):
         self.got, self.expected = f"{got} at line {event.start_mark.line + 1}", expected
@@ -59,7 +59,7 @@ class _Refused(ValueError):
 def parse_yaml(text: str, where: object) -> Any:
     """Parse YAML text to plain data (dict, list, str, int, float, bool, None); empty text gives None.
 
-    Raises UserError, which names `where`, if the text is not YAML or if this parser does not accept it.
+    Raises UserError if the text is not YAML or if this parser does not accept it. Messages name `where`.
     """
     if len(text) > _MAX_CHARACTERS:
         raise UserError(where, "size", f"{len(text)} characters", f"at most {_MAX_CHARACTERS}")

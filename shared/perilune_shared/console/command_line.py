@@ -1,4 +1,4 @@
-"""Create and run a command line: threads, one-line errors, exit codes and the options of all programs."""
+"""Create and run command lines: common options, threads, one-line errors and exit codes."""
 
 import atexit
 import contextlib
@@ -30,16 +30,16 @@ Verbose = Annotated[
         "--verbose", "-v", callback=_describe_threads, help="Print the usable cores and the thread variables."
     ),
 ]
-"""Option of every program; it precedes the command: `perilune-train -v detect train`."""
+"""Option of every program, written before the command: `perilune-train -v detect train`."""
 
 OverwriteFolder = Annotated[
     bool, typer.Option("--overwrite", help="Replace the folder of --out, if an earlier run of this command wrote it.")
 ]
-"""Option of commands that write a new folder; they pass it to `storage.replacement.replaceable`."""
+"""Option of commands that write a new folder; pass its value to `storage.replacement.replaceable`."""
 
 
 def new_program(name: str, version: str, summary: str) -> typer.Typer:
-    """Create a program without commands, with the options -h, --verbose and --version and with shell completion."""
+    """Create a program with -h, --verbose, --version and shell completion, but without commands."""
     app = typer.Typer(
         name=name,
         help=summary,
@@ -66,7 +66,7 @@ def new_program(name: str, version: str, summary: str) -> typer.Typer:
 
 
 def add_renamed(app: typer.Typer, old: str, new: str, command: Callable[..., None]) -> None:
-    """Keep the old name of a renamed command: hidden in the help; its use prints a line on standard error."""
+    """Keep the old name of a renamed command. Help does not list it; using it prints the new name."""
 
     @wraps(command)
     def renamed(*arguments: Any, **options: Any) -> None:
@@ -84,7 +84,7 @@ def one_command(function: Callable[..., None]) -> typer.Typer:
 
 
 _UsageError: Any = typer.BadParameter.__base__
-"""The error of wrong options and arguments: Click's class in older versions of Typer, now its copy."""
+"""Error class for wrong options: Click's in older versions of Typer, Typer's own copy in newer ones."""
 
 _UNTRACKED = {
     "DO_NOT_TRACK": "1",
@@ -96,20 +96,20 @@ _UNTRACKED = {
 
 
 def _check_arguments() -> None:
-    """Raise UserError on a path that is not UTF-8: tables, pages and some libraries cannot store it."""
+    """Raise UserError on an argument that is not UTF-8: tables, pages and some libraries cannot store it."""
     for argument in sys.argv[1:]:
         if any("\ud800" <= sign <= "\udfff" for sign in argument):
             raise UserError("command line", "argument", argument, "text or a path in UTF-8")
 
 
 def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -> None:
-    """Run a command line; print wrong options, user errors and disk errors in one line and exit with code 2.
+    """Run a command line. On a wrong option, user error or disk error, print a line and exit with code 2.
 
-    Before it runs, set the threads of the numerical libraries (`threads.set_up_program`), which must not be imported
-    yet, and switch off the telemetry of libraries.
+    First sets the threads of the numerical libraries (`threads.set_up_program`) and switches off the telemetry of
+    libraries. The numerical libraries must not be imported yet.
 
     Ctrl-C ends the command with one line and exit code 130. If the command is still running `ended_after_s` seconds
-    later, the process is ended together with its child processes. Ctrl-C is ignored once all work is done.
+    after Ctrl-C, the process is ended together with its child processes. Ctrl-C is ignored once all work is done.
     """
     with _interrupts() as interrupted, ended_by_interrupt(after_s=ended_after_s, at_end=_end_children):
         message = _error_of(app, interrupted)
@@ -121,14 +121,11 @@ def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -
 
 
 def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
-    """Run a command line.
-
-    Returns the line to print if it ended with a user error or Ctrl-C, otherwise None.
-    """
+    """Run a command line; return the line to print after an error or Ctrl-C, or None after success."""
     try:
         _check_arguments()
         set_up_program()
-        for name, value in (_UNTRACKED | _folders()).items():
+        for name, value in (_UNTRACKED | _matplotlib_folder()).items():
             os.environ.setdefault(name, value)
         _run(app)
     except UserError as error:
@@ -139,7 +136,7 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
 
         return STOPPED if interrupted else f"error: {usage_line(error)}"
     except SystemExit as stop:
-        # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
+        # Typer turns Ctrl-C into SystemExit with exit code 130.
         if interrupted or stop.code == EXIT_INTERRUPTED:
             return STOPPED
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
@@ -157,22 +154,22 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
 
 
 def _run(app: Callable[[], object]) -> None:
-    """Call a command line; a Typer program raises the error of a wrong option instead of printing it in a box."""
+    """Call a command line. Typer raises the error of a wrong option instead of printing it in a box."""
     if not isinstance(app, typer.Typer):
         app()
         return
     try:
         code = app(standalone_mode=False)
     except _UsageError as error:
-        # A program without arguments has printed its help.
+        # The program was called without arguments and has printed its help.
         if type(error).__name__ == "NoArgsIsHelpError":
             raise SystemExit(EXIT_USER_ERROR) from None
         raise
     raise SystemExit(code if type(code) is int else 0)
 
 
-def _folders() -> dict[str, str]:
-    """Return the variable that puts Matplotlib's font list into perilune's cache.
+def _matplotlib_folder() -> dict[str, str]:
+    """Return the environment variable that puts Matplotlib's font list into perilune's cache.
 
     The result is empty without a home folder.
     """
@@ -186,7 +183,7 @@ def _folders() -> dict[str, str]:
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[bool]]:
-    """Raise KeyboardInterrupt on Ctrl-C and record it in the yielded list; no effect if Ctrl-C is ignored."""
+    """On Ctrl-C, raise KeyboardInterrupt and append to the yielded list. No effect if Ctrl-C is ignored."""
     pressed: list[bool] = []
     before = signal.getsignal(signal.SIGINT)
     is_main = threading.current_thread() is threading.main_thread()

@@ -1,6 +1,6 @@
 """Handle Ctrl-C: end a program with one line, or delay the interrupt until a step ends.
 
-Imports as little as possible: until `end_at_interrupt` is called, Python prints a traceback at Ctrl-C.
+This module imports as little as possible: Python prints a traceback at Ctrl-C until `end_at_interrupt` is called.
 """
 
 import atexit
@@ -17,20 +17,21 @@ from perilune_shared.errors import EXIT_INTERRUPTED, STOPPED
 _BELOW_BAR = "\n\x1b[?25h"
 """Line feed, and the control sequence that shows the cursor again."""
 _UNFINISHED: dict[str, None] = {}
-"""Paths to remove if Ctrl-C ends the process before its own code can."""
+"""Paths to remove if Ctrl-C ends the process before the code that wrote them can remove them."""
 _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
 
 
 def start(module: str) -> None:
-    """Import a module and call its function `main`, which calls `command_line.run_command_line`."""
+    """Import a module and call its `main`; Ctrl-C during the import ends the process with one line."""
     end_at_interrupt()
     importlib.import_module(module).main()
 
 
 def end_at_interrupt() -> None:
-    """Make Ctrl-C end the process at once with one line and exit code 130, unless it is ignored.
+    """Make Ctrl-C end the process at once with one line and exit code 130.
 
-    Call it in a script before large imports and before anything is written. `run_command_line` replaces it.
+    No effect if Ctrl-C is ignored or has another handler. Call this function in a script before large imports and
+    before anything is written. `run_command_line` later installs a handler that lets the command clean up.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
@@ -53,9 +54,9 @@ def _end(*_: object) -> None:
 def interrupts_held() -> Iterator[None]:
     """Delay KeyboardInterrupt until the block ends. A second Ctrl-C ends the process at once.
 
-    Without the delay, Cycles' Python callback discards the interrupt and rendering continues, and Numba may crash if it
-    is interrupted while it loads compiled code. If Ctrl-C is ignored, as in a process that a shell started in the
-    background, it stays ignored.
+    Two libraries need the delay. Cycles calls Python and discards an interrupt in that call, so rendering would
+    continue. Numba may crash if it is interrupted while it loads compiled code. If Ctrl-C is ignored, for example in a
+    background process of a shell, it stays ignored.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
@@ -104,15 +105,15 @@ def _remove_unfinished() -> None:
 
 @contextlib.contextmanager
 def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """End the process with one line and exit code 130 if the block still runs `after_s` seconds after Ctrl-C.
+    """End the process with exit code 130 if the block still runs `after_s` seconds after Ctrl-C.
 
-    Python raises KeyboardInterrupt only between two of its own instructions, and one call of Blender or NumPy may take
-    longer than `after_s`. Use it only in commands whose output survives SIGKILL.
+    Python raises KeyboardInterrupt only between two Python instructions, and one call of Blender or NumPy may take
+    longer than `after_s`. Use this function only in commands whose output survives SIGKILL.
 
-    Before the process ends, `at_end` is called in another thread; it may end the processes that the block started. If
-    the block itself ends with KeyboardInterrupt, `at_end` is called in this thread, since the interrupt may have
-    stopped the code that ends those processes. Files and folders passed to `unfinished` are removed. No effect if
-    Ctrl-C is ignored or outside the main thread.
+    Before the process ends, `at_end` is called in another thread, for example to end child processes of the block. Then
+    files and folders passed to `unfinished` are removed, and one line is printed. If the block itself ends with
+    KeyboardInterrupt, `at_end` is called in the block's thread, since the interrupt may have stopped the code that ends
+    the child processes. No effect if Ctrl-C is ignored or outside the main thread.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
         yield
@@ -137,7 +138,7 @@ def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda:
 
 
 def _end_late(asked: int, ended: int, after_s: float, at_end: Callable[[], object]) -> None:
-    """Wait for Ctrl-C in the pipe `asked`, then for the end of the block, which closes the other end of `ended`."""
+    """Wait for Ctrl-C (pipe `asked`), then for the end of the block (pipe `ended`), at most `after_s`."""
     while True:
         ready, _, _ = select.select([asked, ended], [], [])
         if ended in ready:

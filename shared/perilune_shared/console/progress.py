@@ -8,20 +8,20 @@ from typing import Any, Protocol
 
 
 class Progress(Protocol):
-    """The methods of a progress bar that long tasks call; rich.progress.Progress has them."""
+    """The methods of a progress bar that long tasks call; `rich.progress.Progress` has these methods."""
 
     def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
-        """Start a task of `total` steps and return its id. `unit` names the steps, in the plural."""
+        """Start a task of `total` steps and return its id. The field `unit` names the steps, in the plural."""
 
     def advance(self, task_id: Any, advance: float = 1) -> None:
         """Count further steps of a task as completed."""
 
     def update(self, task_id: Any, **fields: Any) -> None:
-        """Set fields of a task: `completed`, or a `note` on the current step."""
+        """Set fields of a task, such as the number of steps `completed` or a `note` on the current step."""
 
 
 class _NoProgress:
-    """Progress that is not shown."""
+    """Progress that discards all reports."""
 
     def add_task(self, description: str, *, total: float | None, **fields: Any) -> None:
         pass
@@ -34,7 +34,7 @@ class _NoProgress:
 
 
 NO_PROGRESS: Progress = _NoProgress()
-"""Default of functions that report progress."""
+"""Default value of the parameter `progress`: reports are discarded."""
 
 
 def say(line: str, style: str | None = None) -> None:

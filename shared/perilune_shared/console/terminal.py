@@ -22,7 +22,7 @@ from rich.text import Text
 
 from perilune_shared.errors import one_line
 
-# In Jupyter, Rich would draw widgets; they need another package, and Rich warns if it is missing.
+# Not Jupyter: Rich would draw widgets, which need another package, and warn if that package is missing.
 console = Console(stderr=True, force_jupyter=False)
 """Console for standard error and the progress bar; text printed on it appears above the bar."""
 _LOG_INTERVAL_S = 60.0
@@ -36,7 +36,7 @@ def say(line: object, style: str | None = None) -> None:
 
 
 def say_page(text: str) -> None:
-    """Print several lines on standard error. The caller must keep names from files within one line."""
+    """Print several lines on standard error. Names from files must not contain line feeds."""
     console.print(Text(_lines(text)), soft_wrap=True)
 
 
@@ -79,7 +79,7 @@ def _lines(text: str) -> str:
 
 
 class _Steps(MofNCompleteColumn):
-    """Column with the completed and all steps; with one decimal if their number is no integer, as for megabytes."""
+    """Column with completed and total steps, with one decimal if the total is not an integer (megabytes)."""
 
     def render(self, task) -> Text:
         if task.total is None or float(task.total).is_integer():
@@ -107,12 +107,12 @@ class _Note(ProgressColumn):
     """Column with the task's current note, if it has one."""
 
     def render(self, task) -> Text:
-        # The column stays foldable for Rich, so that it narrows before the others do.
+        # The column itself has no `no_wrap`, so that Rich narrows it before the other columns.
         return Text(one_line(task.fields.get("note", "")), no_wrap=True, overflow="ellipsis")
 
 
 class _LoggedProgress(Progress):
-    """Progress that prints a line once a minute if the console is not a terminal; Rich alone prints only the end."""
+    """Progress that prints a line per minute if the console is not a terminal; Rich prints only the end."""
 
     def __init__(self, *columns: ProgressColumn, clock: Callable[[], float], **fields: Any) -> None:
         super().__init__(*columns, get_time=clock, **fields)
@@ -136,15 +136,15 @@ class _LoggedProgress(Progress):
 
 
 def _unwrapped() -> Column:
-    # A task takes one line in a narrow terminal too.
+    # Keeps each task on one line, also in a narrow terminal.
     return Column(no_wrap=True, overflow="ellipsis")
 
 
 def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
-    """Create a progress bar on standard error: name, steps, rate, remaining time and a note on the current step.
+    """Create a progress bar on standard error: name, steps, rate, remaining time and a note.
 
-    In a file or pipe, print one line per task instead, at most once a minute and at the end. `clock` returns the time
-    in seconds.
+    If standard error is a file or pipe, it prints one line per task instead, at most once a minute and at the end.
+    `clock` returns the time in seconds.
     """
     return _LoggedProgress(
         _Name(table_column=_unwrapped()),

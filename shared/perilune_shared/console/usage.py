@@ -16,11 +16,11 @@ _WORDINGS = (
     (r"(.*) is not a valid float(.*)", "a number"),
     (r"(.*) is not a valid boolean(.*)", "true or false"),
 )
-"""Messages of Typer and Click about a wrong value, and what they expect. Group 1 is the value."""
+"""Messages of Typer and Click about a wrong value (group 1), and what was expected ({} is group 2)."""
 
 
 def usage_line(error: Any) -> str:
-    """Return the line to print for a `UsageError` of Typer or Click, without the leading "error: "."""
+    """Return the line that describes a `UsageError` of Typer or Click, without the leading "error: "."""
     kind, parameter = type(error).__name__, getattr(error, "param", None)
     name = getattr(error, "option_name", None) or (_name(parameter) if parameter is not None else None)
     command = error.ctx.command if error.ctx else None
@@ -46,7 +46,7 @@ def _got(name: str, value: object, expected: str) -> str:
 
 
 def _unknown(kind: str, name: str, known: Any, error: Any) -> str:
-    """Return a line on an unknown option or command, with the most similar known name if there is one."""
+    """Return the line on an unknown option or command, with the most similar known name if there is one."""
     close = get_close_matches(name, known, n=1)
     hint = f"; did you mean {close[0]}?" if close else _help_hint(error)
     return f"no such {kind} {one_line(shortened(name))}{hint}"
@@ -67,7 +67,7 @@ def _name(parameter: Any) -> str:
 
 
 def _wrong_value(error: Any) -> tuple[object, str]:
-    """Return a parameter's value and what was expected instead."""
+    """Return the wrong value of a parameter, and what was expected."""
     message = re.sub(r"^(Value error|Assertion failed), ", "", error.message).rstrip(".")
     for pattern, expected in _WORDINGS:
         if wording := re.fullmatch(pattern, message):

@@ -1,8 +1,8 @@
 """Conditions on columns for the option `--where`: arithmetic and comparisons in Python syntax.
 
 A condition is parsed with `ast`, type-checked against the schema, and compiled to an expression of pyarrow.compute. It
-is never executed as Python code. A column is given by its name, or as `table.column` if several tables have it;
-`position_m[2]` is an element of a vector. As in SQL, a comparison with null is neither true nor false.
+is never executed as Python code. A column is given by its name, or as `table.column` if several tables have a column of
+this name; `position_m[2]` is an element of a vector. As in SQL, a comparison with null is neither true nor false.
 """
 
 import ast
@@ -22,7 +22,7 @@ from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 
 _SEARCHED = ("frames", "labels", "scenes", "craters", "trajectories")
-"""Tables in which a column name without a table is looked up, in this order."""
+"""Tables that conditions may use, in the order in which a column name without a table is looked up."""
 _COMPARISONS: dict[type, Callable] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
@@ -55,7 +55,7 @@ class _Value:
 
 
 class Condition:
-    """A parsed condition."""
+    """A parsed condition on frames or labels."""
 
     def __init__(self, text: str):
         """Parse `text`. Raises UserError on invalid syntax, unknown columns or mismatched types."""
@@ -71,7 +71,7 @@ class Condition:
         return any(table in ("labels", "craters") for table, _ in self.columns)
 
     def columns_of_only(self, table: str) -> list[str] | None:
-        """Return the columns that the condition uses if all belong to `table`, otherwise None."""
+        """Return the columns that the condition uses, or None if not all of them belong to `table`."""
         return (
             sorted(name for _, name in self.columns) if {table} == {of_table for of_table, _ in self.columns} else None
         )
@@ -81,7 +81,10 @@ class Condition:
         return self._compiled(lambda table, name: name)
 
     def holds(self, rows: pa.Table) -> NDArray[np.bool_]:
-        """Evaluate the condition (N,) on columns named `table.column`. Raises UserError if numbers overflow."""
+        """Return for each row (N,) whether the condition is true. Raises UserError if numbers overflow.
+
+        The columns of `rows` are named `table.column`.
+        """
         mask = np.zeros(len(rows), np.bool_)
         try:
             rows_that_hold = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
@@ -255,5 +258,5 @@ def _constant(value: bool | float | str) -> _Value:
 
 
 def columns_of(conditions: Iterable[Condition]) -> set[tuple[str, str]]:
-    """Return all columns, as (table, name), that the conditions use."""
+    """Return the columns that the conditions use, each as (table, name)."""
     return {key for condition in conditions for key in condition.columns}

@@ -38,13 +38,13 @@ class Frame:
 
     @property
     def image(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Grey levels (height, width), 8 or 16 bits.
+        """Grey values (height, width), 8 or 16 bits.
 
-        Raises UserError if the file is not such a PNG or its size differs from the manifest.
+        Raises UserError if the file is not a grey PNG of 8 or 16 bits, or if its size differs from the manifest.
         """
         from PIL import Image
 
-        # Check the size, since decoders accept a PNG whose last bytes are missing.
+        # Decoders accept a PNG whose last bytes are missing, so check the file size.
         size_bytes = self.row["png_bytes"]
         if pd.notna(size_bytes) and len(self.png) != size_bytes:
             expected = f"{int(size_bytes)} bytes; see `perilune-manifest validate`, and render the damaged frame again"
@@ -72,5 +72,5 @@ class Frame:
 
     def __repr__(self) -> str:
         split, time_s, altitude_m = self.row["split"], self.row["time_s"], self.row["position_m"][2]
-        about = f"{split}, time {time_s:.1f} s, {altitude_m:.0f} m above the site, {len(self.labels)} labels"
-        return one_line(f"Frame({self.frame_id}: {about})")
+        summary = f"{split}, time {time_s:.1f} s, {altitude_m:.0f} m above the site, {len(self.labels)} labels"
+        return one_line(f"Frame({self.frame_id}: {summary})")

@@ -1,4 +1,4 @@
-"""The index of a dataset: path, size and SHA-256 of every file except dataset.json and the index itself.
+"""The index of a dataset: path, size and SHA-256 of every file except dataset.json and the index.
 
 dataset.json names the parts of the index with their hashes. The name of a part is derived from its content, so a new
 index never overwrites the old one; dataset.json states which one is valid.
@@ -34,7 +34,7 @@ INDEX = pa.schema(
 MAX_ROWS = 2_000_000
 """Maximum number of rows of a part."""
 MAX_TOTAL_ROWS = 4_000_000
-"""Maximum number of rows of all parts; each row takes about 0.4 kB of memory while the files are checked."""
+"""Maximum number of rows of all parts; a row takes about 0.4 kB of memory while files are checked."""
 LARGEST_FILE_BYTES = 2**36
 _ROWS_PER_GROUP = 2**16
 _LONGEST_PATH = 500
@@ -50,7 +50,7 @@ def index_rows(written: Iterable[WrittenFile]) -> pa.Table:
 
 
 def frame_rows(frames: pa.Table) -> pa.Table:
-    """Return the index rows of all files named in the table frames, by kind, then in the order of the frames.
+    """Return the index rows of all files named in the table frames, by kind, then by row of frames.
 
     Raises UserError if a frame has a path without size or hash.
     """
@@ -58,7 +58,10 @@ def frame_rows(frames: pa.Table) -> pa.Table:
 
 
 def scene_file_rows(scenes: pa.Table) -> pa.Table:
-    """Return the index rows of all files named in the table scenes. Raises UserError as `frame_rows` does."""
+    """Return the index rows of all files named in the table scenes.
+
+    Raises UserError if a scene has a path without size or hash.
+    """
     return _named_files(scenes, "scenes", SCENE_FILE_KINDS)
 
 
@@ -76,7 +79,7 @@ def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
 
 
 def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
-    """Write the parts of an index and return their records for dataset.json; the rows may be in any order."""
+    """Write the parts of an index from rows in any order; return their records for dataset.json."""
     if len(rows) > MAX_TOTAL_ROWS:
         expected = f"at most {MAX_TOTAL_ROWS}; pack the frames, or split the dataset"
         raise UserError(store, "files", len(rows), expected)
@@ -94,12 +97,9 @@ def write_index(store: Store, rows: pa.Table) -> tuple[IndexPart, ...]:
 
 
 def seal(store: Store, info: DatasetInfo, rows: pa.Table) -> DatasetInfo:
-    """Write the index, then dataset.json with it, then delete other indexes.
+    """Write the index, then dataset.json, then delete older indexes; return the content of dataset.json.
 
-    Returns the content of dataset.json.
-
-    If the dataset has an index already and the files in it are unchanged, the dataset matches its index at every
-    moment.
+    If all files of the older index are unchanged, the dataset matches its index at every moment.
     """
     info = info.model_copy(update={"index": write_index(store, rows)})
     write_info(store, info)
@@ -145,10 +145,10 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
     stated = part.stated_groups()
     for group in range(part.n_groups):
         # Check the paths of each small group before decompressing the next one.
-        in_group = part.file.metadata.row_group(group).num_rows
-        if part.n_rows > MAX_ROWS or in_group > _ROWS_PER_GROUP:
+        n_group_rows = part.file.metadata.row_group(group).num_rows
+        if part.n_rows > MAX_ROWS or n_group_rows > _ROWS_PER_GROUP:
             expected = f"at most {MAX_ROWS}, at most {_ROWS_PER_GROUP} in a row group"
-            raise UserError(where, "rows", f"{part.n_rows}, {in_group} in a row group", expected)
+            raise UserError(where, "rows", f"{part.n_rows}, {n_group_rows} in a row group", expected)
         rows = part.read(groups=[group])
         _check_rows(where, rows)
         for error in false_statistics(part, next(stated, {}), rows):
@@ -157,7 +157,7 @@ def _checked_groups(store: Store, recorded: IndexPart) -> Iterable[pa.Table]:
 
 
 def _check_rows(where: str, rows: pa.Table) -> None:
-    """Raise UserError about the first row that is invalid."""
+    """Raise UserError on the first invalid row."""
     paths = rows["path"]
     plain = pc.and_(pc.match_substring_regex(paths, _PATH), pc.less_equal(pc.binary_length(paths), _LONGEST_PATH))
     sizes = pc.and_(pc.greater_equal(rows["bytes"], 0), pc.less_equal(rows["bytes"], LARGEST_FILE_BYTES))

@@ -29,10 +29,10 @@ def read_object(address: Address) -> dict[str, Any]:
     if store.folder is not None:
         path = store.folder / INFO_NAME
         if not path.exists() and not path.is_symlink():
-            within = [
+            subfolders = [
                 f"{store.folder / kind}" for kind in ("detect", "nav") if (store.folder / kind / INFO_NAME).is_file()
             ]
-            raise UserError(store, INFO_NAME, "no such file", " or ".join(within) or _EXPECTED)
+            raise UserError(store, INFO_NAME, "no such file", " or ".join(subfolders) or _EXPECTED)
         store.plain_size(INFO_NAME)
     try:
         text = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
@@ -51,9 +51,9 @@ def read_object(address: Address) -> dict[str, Any]:
 
 
 def _with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a dict from members.
+    """Return the members of a JSON object as a dict.
 
-    Raises ValueError on a duplicate name: JSON readers disagree on which one is valid.
+    Raises ValueError on a duplicate name, since JSON readers disagree on which member is valid.
     """
     members: dict[str, Any] = {}
     for name, value in pairs:
@@ -87,10 +87,7 @@ def read_info(address: Address) -> DatasetInfo:
 
 
 def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
-    """Validate plain data as a DatasetInfo.
-
-    Raises UserError about the first wrong field; messages name `path`.
-    """
+    """Return plain data as a validated DatasetInfo. Raises UserError on the first wrong field of `path`."""
     try:
         info = DatasetInfo.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -107,7 +104,7 @@ def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
 
 
 def _check_texts(info: DatasetInfo, path: object) -> None:
-    """Check the texts of recipes: settings are untrusted input and are shown on pages and terminals."""
+    """Check the texts of recipes: they are untrusted and are shown on pages and terminals."""
     for recipe in info.recipes.values():
         unsafe = _unsafe_text([recipe.config, recipe.developed_from.camera_config if recipe.developed_from else None])
         if unsafe is not None:
@@ -115,10 +112,7 @@ def _check_texts(info: DatasetInfo, path: object) -> None:
 
 
 def _unsafe_text(tree: object) -> str | None:
-    """Return the first text or member name in plain data that contains unsafe characters.
-
-    Returns None if there is none.
-    """
+    """Return the first text or member name with unsafe characters in plain data, or None if all are safe."""
     if isinstance(tree, str):
         return None if tree.isprintable() and not set(tree) & set("<>&`$") else tree
     if isinstance(tree, dict):
@@ -129,7 +123,7 @@ def _unsafe_text(tree: object) -> str | None:
 
 
 def write_info(address: Address, info: DatasetInfo) -> None:
-    """Write dataset.json atomically. Raises UserError if texts of its recipes contain unsafe characters."""
+    """Write dataset.json atomically. Raises UserError if a text of a recipe has unsafe characters."""
     store = open_store(address)
     store.replace(INFO_NAME, info_bytes(info, store.at(INFO_NAME)))
 
@@ -137,20 +131,20 @@ def write_info(address: Address, info: DatasetInfo) -> None:
 def info_bytes(info: DatasetInfo, where: object) -> bytes:
     """Return the content of dataset.json.
 
-    Raises UserError, which names `where`, if texts of recipes are unsafe.
+    Raises UserError if a text of a recipe has unsafe characters. Messages name `where`.
     """
     _check_texts(info, where)
     return with_own_hash(info.model_dump_json(indent=2).encode())
 
 
 def with_own_hash(content: bytes) -> bytes:
-    """Return a JSON object with the last member `sha256`: the hash of the text before that member."""
+    """Return a JSON object with an added last member `sha256`: the hash of the text before it."""
     head = content.rstrip().removesuffix(b"}").rstrip()
     return head + f',\n  "{_OWN_HASH}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()
 
 
 def has_own_hash(store: Store) -> bool:
-    """Whether dataset.json still matches the hash that it contains."""
+    """Whether dataset.json matches the hash that it contains, so that it was not edited by hand."""
     content = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
     head, _, _ = content.rpartition(f',\n  "{_OWN_HASH}": '.encode())
     return with_own_hash(head + b"}") == content

@@ -1,7 +1,7 @@
 """Check a dataset's keys: each key is unique, and each referenced row exists.
 
-A join on broken keys silently returns wrong rows. `validate` reports every such fault with its file and row. The checks
-here raise an error at the first fault.
+A join on broken keys silently returns wrong rows. The checks in this module raise an error at the first fault;
+`perilune-manifest validate` reports every fault with its file and row.
 """
 
 from collections.abc import Mapping
@@ -23,10 +23,10 @@ _HINT = "see `perilune-manifest validate`"
 
 
 def check_keys(dataset: Dataset) -> None:
-    """Raise UserError if a key is not unique, or if a row refers to a missing scene, trajectory, frame or crater.
+    """Raise UserError if a key is not unique, or if a row refers to a missing row of another table.
 
-    Also raises it if the statistics of a part would hide rows of a scene, trajectory or split from readers. Reads
-    labels one row group at a time and keeps 8 bytes of memory per label.
+    Also raises UserError if false statistics of a part would hide rows of a scene, trajectory or split from readers.
+    Reads labels one row group at a time and needs 8 bytes of memory per label.
     """
     _check_statistics(dataset)
     check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
@@ -39,7 +39,7 @@ def check_keys(dataset: Dataset) -> None:
 
 
 def _check_statistics(dataset: Dataset) -> None:
-    """Raise UserError if a footer has wrong statistics for a column by which readers select row groups."""
+    """Raise UserError on false statistics of a column by which readers select row groups."""
     for table, schema in TABLES.items():
         names = [name for name in _SELECTED_BY if name in schema.names]
         for path in dataset.parts(table):
@@ -51,10 +51,10 @@ def _check_statistics(dataset: Dataset) -> None:
 
 
 class KeyCheck:
-    """Check the keys of scenes, trajectories, frames and craters on creation; check labels as the caller adds them.
+    """Checks keys: of scenes, trajectories, frames and craters on creation, of labels as they are added.
 
     Pass all labels of the dataset to `add_labels`, in batches, then call `finish`. Keys of boulders are not checked,
-    since no other row refers to them.
+    since no other row refers to boulders.
     """
 
     def __init__(self, dataset: Dataset, frames: pa.Table):
@@ -104,7 +104,7 @@ class KeyCheck:
         known[known] = (index < len(self._keys)) & (self._keys[np.minimum(index, len(self._keys) - 1)] == key[known])
         if not known.all():
             row = rows.slice(int(np.argmin(known)), 1).to_pylist()[0]
-            found = f"no crater {row['crater_id']} of a label of {row['frame_id']} names"
+            found = f"{row['crater_id']} in a label of {row['frame_id']}"
             raise UserError(self._dataset.store, "labels: crater_id", found, f"a crater of the frame's scene; {_HINT}")
         self._seen.append(frame * len(self._numbers) + number)
         return frame
@@ -116,21 +116,18 @@ class KeyCheck:
             keys.sort()
         repeated = np.flatnonzero(np.diff(keys) == 0)
         if len(repeated):
-            frame_place, number_place = divmod(int(keys[repeated[0]]), len(self._numbers))
-            frame_id = next(name for name, index in self._frame_of.items() if index == frame_place)
-            found = f"crater {self._numbers[number_place]} of {frame_id} twice"
+            frame, number = divmod(int(keys[repeated[0]]), len(self._numbers))
+            frame_id = next(name for name, index in self._frame_of.items() if index == frame)
+            found = f"crater {self._numbers[number]} of {frame_id} twice"
             raise UserError(self._dataset.store, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
 
 
-def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
-    """Return the value in `place_of` for each text of a column (N,); -1 if it is missing.
-
-    Looks up equal texts once.
-    """
+def _looked_up(column: pa.ChunkedArray, index_of: Mapping[str, int]) -> NDArray[np.int64]:
+    """Return the value in `index_of` of each text of a column (N,), or -1 for a missing text."""
     looked_up = []
     for chunk in column.chunks:
         words = chunk.dictionary_encode()
-        indices = [*(place_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
+        indices = [*(index_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
         looked_up.append(np.array(indices, np.int64)[words.indices.fill_null(len(indices) - 1).to_numpy()])
     return np.concatenate(looked_up) if looked_up else np.empty(0, np.int64)
 
@@ -152,9 +149,9 @@ def _checked_ids_and_keys(
 
 
 def _check_known(
-    dataset: Dataset, table: str, name: str, column: pa.ChunkedArray, place_of: Mapping[str, int]
+    dataset: Dataset, table: str, name: str, column: pa.ChunkedArray, index_of: Mapping[str, int]
 ) -> NDArray[np.int64]:
-    numbers = _looked_up(column, place_of)
+    numbers = _looked_up(column, index_of)
     if (numbers < 0).any():
         missing = column[int(np.argmin(numbers))].as_py()
         raise UserError(dataset.store, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")

@@ -1,4 +1,4 @@
-"""Columns of labels that repeat columns of their frames, so that the table labels can be used alone."""
+"""Columns of labels that repeat columns of frames, so that labels can be used without frames."""
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -8,7 +8,7 @@ from perilune_shared.errors import UserError
 
 
 def with_frame_columns(labels: pa.Table, frames: pa.Table) -> pa.Table:
-    """Return labels with the scene_id and split of their frames; both columns may be absent or outdated.
+    """Return labels with the scene_id and split of their frames. Replaces both columns if they exist.
 
     `frames` has at least frame_id, scene_id and split. Raises UserError if a label's frame is missing.
     """

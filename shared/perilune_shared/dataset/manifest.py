@@ -1,10 +1,10 @@
-"""Read a dataset: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in shards/.
+"""Read a dataset: dataset.json, Parquet parts under manifest/, frames under frames/ or in shards/.
 
 Parts are written atomically and never rewritten. Use:
 
     dataset = open_dataset("data/small/detect")
-    dataset.labels, dataset[0].image                                                    # pandas, NumPy
-    dataset.table("labels", ["frame_id", "radius_px"], split="test")                    # Arrow, reads only these
+    dataset.labels, dataset[0].image                                    # pandas, NumPy
+    dataset.table("labels", ["frame_id", "radius_px"], split="test")    # Arrow; reads only these columns and rows
 """
 
 import contextlib
@@ -36,7 +36,7 @@ LARGEST_FRAME_BYTES = 2**30
 """Maximum size of a PNG or EXR, bytes."""
 _MAX_KEPT_OPEN = 32
 _MAX_REQUESTS = 16
-"""Number of frames that are read from an object store at a time."""
+"""Number of frames that are requested from an object store at the same time."""
 
 
 class Dataset:
@@ -51,9 +51,9 @@ class Dataset:
 
     @contextlib.contextmanager
     def parts_kept_open(self) -> Iterator[None]:
-        """Open and check each part only once within the block, for callers that read scene by scene.
+        """Keep parts open within the block, so that callers that read scene by scene do not check them again.
 
-        Use it only while no process writes to the dataset: a changed part is not read again.
+        Use this only while no process writes to the dataset: a changed part is not read again.
         """
         self._opened = {}
         try:
@@ -74,7 +74,7 @@ class Dataset:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the PNGs; the first one if there are several (see `camera_of`)."""
+        """Camera of the PNGs; the first camera if there are several (see `camera_of`)."""
         return self.info.camera.intrinsics()
 
     def camera_of(self, row: Mapping[str, Any]) -> Camera:
@@ -82,12 +82,12 @@ class Dataset:
         return self.info.camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     def exr_camera_of(self, row: Mapping[str, Any]) -> Camera:
-        """Return the camera of a frame's EXR, given the same row as for `camera_of`."""
+        """Return the camera of a frame's EXR, given its row in the table frames with the column `camera`."""
         return self.info.exr_camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     @property
     def exr_camera(self) -> Camera:
-        """Camera of the EXRs, or of the PNGs if there are no EXRs; the first one if there are several."""
+        """Camera of the EXRs, or of the PNGs without EXRs; the first camera if there are several."""
         return (self.info.exr_camera or self.info.camera).intrinsics()
 
     @functools.cached_property
@@ -156,7 +156,7 @@ class Dataset:
         return Frame(row, labels.to_pandas(), png)
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[str]:
-        """Return the paths of a table's parts, sorted; ids limit them to parts that may contain matching rows."""
+        """Return the sorted paths of the parts of a table, or of those that may have rows with the ids."""
         paths = self._listed.get(table)
         if paths is None:
             paths = parquet_files(self.store, f"manifest/{table}")
@@ -173,12 +173,12 @@ class Dataset:
         split: str | None = None,
         where: Condition | None = None,
     ) -> pa.Table:
-        """Read all or some columns of a table as Arrow: all rows, or those of a scene, trajectory or split.
+        """Read columns of a table as Arrow: all rows, or the rows of a scene, trajectory or split.
 
-        A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table. Only the
-        required parts, row groups and columns are read; statistics show which row groups cannot match. Craters and
-        boulders belong to no split. Raises UserError if a part is truncated or has another schema, or if the table or a
-        column is unknown.
+        Without `columns`, read all columns. A trajectory_id needs its scene_id. `where` selects rows by a condition on
+        columns of this table. `split` has no effect on craters and boulders, which belong to no split. Only the
+        required parts, row groups and columns are read. Raises UserError if a part is truncated or has another schema,
+        or if the table or a column is unknown.
         """
         _check_names(table, columns)
         if split is not None and split not in SPLITS:
@@ -204,17 +204,20 @@ class Dataset:
         return {name: self.table(name, scene_id=scene_id) for name in TABLES}
 
     def file(self, relative: str) -> Path:
-        """Return the local path of a frame's file. Raises UserError if it is outside the dataset or not local."""
+        """Return the local path of a file, from its path relative to the dataset.
+
+        Raises UserError if the file is outside the dataset or the dataset is in an object store.
+        """
         if self.store.folder is None:
             raise UserError(self.store, "address", "an object store", "a local folder")
         return files.inside(self.store.folder, relative)
 
     def pngs(self, frames: pa.Table, split: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """Yield frame_id and PNG bytes of the frames in `frames`, which has frame_id and png_path.
+        """Yield frame_id and PNG bytes of each row of `frames`, a table with frame_id and png_path.
 
-        If all belong to one split, pass it as `split`: shards of other splits are then not read. Frames stored as files
-        are yielded in the order of the rows, packed frames in the order in which they are stored. Raises UserError if a
-        frame is missing.
+        If all frames belong to one split, pass `split`, so that shards of other splits are not read. Frames stored as
+        files come in the order of the rows, packed frames in the order of the shards. Raises UserError if a frame is
+        missing.
         """
         if self.info.images in ("absent", "planned"):
             command = "regenerate" if self.info.images == "absent" else "dataset --manifest"
@@ -238,7 +241,7 @@ class Dataset:
                 )
 
     def shards(self, split: str | None = None) -> list[str]:
-        """Return the paths of the Parquet files with packed frames of one split or all, sorted by name."""
+        """Return the paths of the shards (Parquet files with packed frames) of one split or all, sorted."""
         return shards_of(self.store, split)
 
 
@@ -252,9 +255,9 @@ def open_dataset(address: Address) -> Dataset:
 
 
 def open_single(address: Address) -> Dataset:
-    """Open a dataset of one camera.
+    """Open a dataset that has one camera.
 
-    Raises UserError as `open_dataset` does, and if there are several cameras.
+    Raises UserError as `open_dataset` does, and if the dataset has several cameras.
     """
     dataset = open_dataset(address)
     check_single(dataset)
@@ -278,7 +281,7 @@ def _name_of(row: Mapping[str, Any], info: DatasetInfo, where: object) -> str | 
 
 
 def count_rows(dataset: Dataset) -> Counts:
-    """Count the rows of each table, from the footers of its parts."""
+    """Return the number of rows of each table, from the footers of its parts."""
     counts = {name: sum(dataset.open_part(part, name).n_rows for part in dataset.parts(name)) for name in TABLES}
     return Counts(**counts)
 

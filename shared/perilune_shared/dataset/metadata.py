@@ -22,13 +22,13 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array
 
 NOT_STATED = "LicenseRef-not-stated"
-"""Licence of a dataset whose author has not stated a licence. A merge keeps it in the joined expression."""
+"""Licence of a dataset whose author has not stated one. A merge keeps it as a term of the licence."""
 LARGEST_IMAGE_PX = 2**27
 """Largest image that readers decompress, pixels."""
 _LARGEST_INDEX_BYTES = 2**30
 _FAR = 1e9
 _ROTATION_TOLERANCE = 1e-6
-# Names appear in tables, pages and quoted shell commands: only letters, digits and punctuation that is safe there.
+# Names appear in tables, pages and quoted shell commands, so only characters that are safe there are valid.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$")]
 _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _CameraName = Annotated[str, Field(pattern=CAMERA_PATTERN)]
@@ -36,12 +36,9 @@ _Row = tuple[float, float, float]
 
 
 def _printable(text: str) -> str:
-    """Return `text` unchanged.
-
-    Raises ValueError on unprintable characters, e.g. controls and bidirectional marks.
-    """
+    """Return `text`. Raises ValueError on unprintable characters, such as bidirectional marks."""
     if not text.isprintable():
-        raise ValueError("text should be printable")
+        raise ValueError("printable text")
     return text
 
 
@@ -53,7 +50,7 @@ class _Info(BaseModel):
 
 
 class CameraRecord(_Info):
-    """Camera in dataset.json: the fields of `Camera`, limited to plausible values, and the mounting in O_B."""
+    """Camera in dataset.json: the fields of `Camera` with limits, and the mounting on the lander (O_B)."""
 
     width_px: Annotated[int, Field(gt=0, le=100_000)]
     """Image width, pixels."""
@@ -77,10 +74,10 @@ class CameraRecord(_Info):
     @model_validator(mode="after")
     def _possible(self) -> "CameraRecord":
         if self.width_px * self.height_px > LARGEST_IMAGE_PX:
-            raise ValueError(f"width_px times height_px should be at most {LARGEST_IMAGE_PX}")
+            raise ValueError(f"width_px times height_px of at most {LARGEST_IMAGE_PX}")
         rows = np.array(self.rotation_camera_from_body)
         if not (np.abs(rows @ rows.T - np.eye(3)) < _ROTATION_TOLERANCE).all() or np.linalg.det(rows) < 0:
-            raise ValueError("rotation_camera_from_body should be a rotation")
+            raise ValueError("rotation_camera_from_body to be a rotation")
         return self
 
     @classmethod
@@ -90,7 +87,7 @@ class CameraRecord(_Info):
         rotation_camera_from_body: Array = ROTATION_CAMERA_FROM_BODY,
         position_in_body_m: _Row = (0.0, 0.0, 0.0),
     ) -> "CameraRecord":
-        """Record a camera. By default it is at the body's origin and looks straight down if the body is level."""
+        """Record a camera. By default it is at the origin of O_B and looks along -Z_B."""
         x, y, z = rotation_camera_from_body.tolist()
         rows = tuple(x), tuple(y), tuple(z)
         return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=position_in_body_m)
@@ -122,27 +119,28 @@ class Counts(_Info):
 
 
 class Origin(_Info):
-    """The dataset whose EXRs another dataset was developed from."""
+    """The dataset that provided the EXRs from which another dataset was developed."""
 
     name: Name
     """Name of that dataset."""
     sha256: _Sha256
-    """SHA-256 of its dataset.json."""
+    """SHA-256 of that dataset's dataset.json."""
     camera_config: dict[str, Any] | None
-    """Section `dataset.camera` of that dataset's configuration, or `dataset.cameras` if it has several cameras; null if
-    unknown. Terrain and EXRs were made for these cameras."""
+    """Section `dataset.camera` (or `dataset.cameras`) of that dataset's configuration; null if unknown.
+
+    Terrain and EXRs were made for these cameras."""
 
 
 class Recipe(_Info):
-    """Settings, random seed and versions.
+    """What scenes and frames were generated from: settings, random seed and versions.
 
-    Together with the seeds in the tables, they determine scenes and frames.
+    A recipe and the seeds in the tables determine scenes and frames completely.
     """
 
     preset: Name
     """Preset on which the settings are based."""
     kind: Kind
-    """Which of the preset's datasets this is: detect or nav."""
+    """Purpose of the dataset, detect or nav; each preset has settings for both."""
     seed: Annotated[int, Field(ge=0)]
     """Random seed from which every random stream is derived."""
     config: dict[str, Any]
@@ -160,7 +158,7 @@ class Recipe(_Info):
 
 
 class IndexPart(_Info):
-    """One part of the dataset's index (perilune_shared.dataset.index)."""
+    """Record of one part of the index of the dataset (perilune_shared.dataset.index)."""
 
     path: Annotated[str, Field(pattern=r"^index/[0-9a-f]{16}\.parquet$")]
     """Path relative to the dataset; the file name is the first 16 digits of the hash."""
@@ -185,21 +183,24 @@ class DatasetInfo(_Info):
     complete: bool
     """False while rendering is in progress or was interrupted."""
     images: ImageState
-    """Where the frames are: files (in frames/), packed (in shards/*.parquet), absent, or planned (no labels yet
-    either)."""
+    """Where the frames are: files (in frames/), packed (in shards/*.parquet), absent, or planned.
+
+    A planned dataset has neither frames nor labels yet."""
     split_by: SplitUnit
-    """Unit of the split; no unit is in two splits. If it is not scene, splits may share terrain."""
+    """What no split divides: scene, trajectory or frame. Unless it is scene, splits may share terrain."""
     camera: CameraRecord
     """Camera of all frames (PNG)."""
     exr_camera: CameraRecord | None = None
-    """Camera of the EXRs, without distortion; its view covers the view of `camera`. null if there are no EXRs."""
+    """Camera of the EXRs, without distortion, with at least the view of `camera`; null without EXRs."""
     cameras: dict[_CameraName, CameraRecord] | None = None
-    """Cameras by name, if there are several. The column `camera` of the table frames contains the name; the field
-    `camera` above is then the first camera."""
+    """Cameras by name; null if there is only one camera.
+
+    The column `camera` of the table frames contains the name. The field `camera` above is the first of these cameras.
+    """
     exr_cameras: dict[_CameraName, CameraRecord] | None = None
-    """Cameras of the EXRs by name, if there are several cameras and there are EXRs."""
+    """Cameras of the EXRs by name; null without EXRs or if there is only one camera."""
     recipes: dict[str, Recipe]
-    """Recipes by key; each scene refers to one."""
+    """Recipes by key; each scene refers to one recipe by the column `recipe`."""
     history: tuple[_Line, ...] = ()
     """Edits since rendering, one line each."""
     counts: Counts
@@ -213,20 +214,20 @@ class DatasetInfo(_Info):
     def _names_agree(self) -> "DatasetInfo":
         names = list(self.cameras or {})
         if self.cameras is not None and (len(names) < 2 or self.cameras[names[0]] != self.camera):
-            raise ValueError("cameras should be two or more, the first of them equal to camera")
+            raise ValueError("two or more cameras, the first of them equal to camera")
         if self.exr_cameras is not None and list(self.exr_cameras) != names:
-            raise ValueError("exr_cameras should have the names of cameras")
+            raise ValueError("exr_cameras with the names of cameras")
         return self
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit unused fields for several cameras, so that dataset.json of a single camera keeps its bytes."""
+        """Omit `cameras` and `exr_cameras` if null: dataset.json of one camera keeps its older form."""
         values: dict[str, Any] = handler(self)
         return {key: value for key, value in values.items() if value is not None or key not in _OF_SEVERAL}
 
     @property
     def leak(self) -> str:
-        """Warning to append to the split unit if splits may share terrain; otherwise empty."""
+        """Warning to append to `split_by` if splits may share terrain; otherwise empty."""
         return "" if self.split_by == "scene" else ": splits share terrain, so test metrics are optimistic"
 
     def camera_of(self, name: str | None) -> CameraRecord:
@@ -234,9 +235,9 @@ class DatasetInfo(_Info):
         return self.camera if self.cameras is None or name is None else self.cameras[name]
 
     def exr_camera_of(self, name: str | None) -> CameraRecord:
-        """Return the EXR camera of frames whose column `camera` is `name`.
+        """Return the camera of the EXRs of frames whose column `camera` is `name`.
 
-        Returns their PNG camera if there are no EXRs.
+        Returns the camera of their PNGs if there are no EXRs. Raises KeyError on an unknown name.
         """
         if self.cameras is None or name is None:
             return self.exr_camera or self.camera
@@ -245,18 +246,18 @@ class DatasetInfo(_Info):
     def with_cameras(self, names: Iterable[str]) -> "DatasetInfo":
         """Return a copy with only the named cameras.
 
-        With one name it describes an ordinary dataset of one camera.
+        With one name, the copy describes a dataset of one camera.
         """
         used = set(names)
         if self.cameras is None or not used & self.cameras.keys() or used >= self.cameras.keys():
             return self
-        kept = [name for name in self.cameras if name in used]
+        remaining = [name for name in self.cameras if name in used]
         fields: dict[str, Any] = {}
         for single, several in (("camera", "cameras"), ("exr_camera", "exr_cameras")):
             records = getattr(self, several)
             if records is not None:
-                chosen = {name: records[name] for name in kept}
-                fields |= {single: chosen[kept[0]], several: chosen if len(kept) > 1 else None}
+                chosen = {name: records[name] for name in remaining}
+                fields |= {single: chosen[remaining[0]], several: chosen if len(remaining) > 1 else None}
         return self.model_copy(update=fields)
 
     def recipe(self) -> Recipe:
@@ -265,7 +266,7 @@ class DatasetInfo(_Info):
         return recipe
 
     def row_time_s(self, recipe: object) -> float:
-        """Return the row time of the rolling shutter, seconds, for the key of a recipe.
+        """Return the row time of the rolling shutter, seconds, in the recipe with a key.
 
         Returns 0 without a rolling shutter.
         """
@@ -281,5 +282,5 @@ class DatasetInfo(_Info):
 
 
 def recipes_of(*recipes: Recipe) -> dict[str, Recipe]:
-    """Return the recipes by their keys."""
+    """Return a dict of recipes by key."""
     return {recipe.key: recipe for recipe in recipes}

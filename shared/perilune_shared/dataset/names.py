@@ -10,20 +10,27 @@ Kind = Literal["detect", "nav"]
 Split = Literal["train", "val", "test"]
 """Part of a dataset for training, validation or test."""
 SplitUnit = Literal["scene", "trajectory", "frame"]
-"""Unit of a split: all rows of a unit belong to one split."""
+"""What a split never divides: all rows of a scene, trajectory or frame belong to one split."""
 ImageState = Literal["files", "packed", "absent", "planned"]
-"""Where the frames are: under frames/, in shards/*.parquet, omitted, or not rendered yet (then without labels)."""
+"""Where the frames are: under frames/, packed in shards/*.parquet, omitted, or not rendered yet.
+
+Planned frames have no labels yet."""
 ImageKind = Literal["png", "exr", "lidar"]
-"""The files of a frame: image of the sensor; radiance with depth and crater index; ranges of the flash lidar."""
+"""Kinds of files of a frame.
+
+`png` is the image of the sensor, `exr` has radiance, depth and crater index, `lidar` has ranges of the flash lidar."""
 SceneFileKind = Literal["hazard"]
-"""The files of a scene: its hazard map."""
+"""Kinds of files of a scene: the hazard map."""
 ImageChoice = Literal["copy", "none", "plan"]
-"""How frames are written: `copy`, `none` (omitted), or `plan` (frames, craters, boulders and labels omitted: scenes
-and poses determine them)."""
+"""What a new dataset contains: frames (`copy`), no frames (`none`), or scenes and poses (`plan`).
+
+A plan omits craters, boulders and labels too, since scenes and poses determine them."""
 ImageMode = Literal[ImageChoice, "link"]
-"""ImageChoice, or `link`: hard links where the file system allows them. Editing a frame then changes both datasets."""
+"""ImageChoice, or `link`: hard-link frames where possible.
+
+Editing a linked frame changes both datasets."""
 WHOLE_TABLE = "all"
-"""Name of the part that contains all rows of its table, or the first rows if the table has several such parts."""
+"""Name of the part with all rows of its table, or with the first rows if they fill several parts."""
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
 """Pattern of scene_id and trajectory_id, which become file names."""
@@ -40,20 +47,20 @@ SUFFIXES: dict[ImageKind | SceneFileKind, str] = {
     "lidar": ".lidar.exr",
     "hazard": ".tif",
 }
-"""How the name of each file ends."""
+"""End of the file name, by kind."""
 SCENE_FILE_KINDS: tuple[SceneFileKind, ...] = get_args(SceneFileKind)
 
 
 def frame_path(frame_id: str, kind: ImageKind) -> str:
-    """Return the path of a frame's file relative to the dataset, as written by this version.
+    """Return the path, relative to the dataset, at which this version writes a file of a frame.
 
-    Readers use the manifest. The columns png_path, exr_path and lidar_path of other datasets may contain other paths.
+    Readers use the columns png_path, exr_path and lidar_path instead: other datasets may have other paths.
     """
     return f"frames/{frame_id}{SUFFIXES[kind]}"
 
 
 def scene_file_path(scene_id: str, kind: SceneFileKind) -> str:
-    """Return the path of a scene's file relative to the dataset, as written by this version."""
+    """Return the path, relative to the dataset, at which this version writes a file of a scene."""
     return f"{kind}/{scene_id}{SUFFIXES[kind]}"
 
 
@@ -63,7 +70,7 @@ def stem_of(path: str) -> str:
 
 
 def is_whole(stem: str) -> bool:
-    """Whether a part of this name may contain rows of any scene."""
+    """Whether a part with the name `stem` may contain rows of any scene."""
     return stem.partition(".")[0] == WHOLE_TABLE
 
 
@@ -73,13 +80,13 @@ def frame_id_of(scene_id: str, trajectory_id: str, frame_index: int) -> str:
 
 
 def trajectory_of_camera(camera: str, trajectory_id: str) -> str:
-    """Return the trajectory_id of the frames of one of several cameras along a trajectory of the body."""
+    """Return the trajectory_id for the frames of one camera, if the lander has several cameras."""
     return f"{camera}-{trajectory_id}"
 
 
 def trajectory_of_body(camera: str, trajectory_id: str) -> str:
-    """Return the name of the body's trajectory, given the camera and the trajectory_id of its frames.
+    """Return the name of the lander's trajectory from a camera and the trajectory_id of its frames.
 
-    Frames of one instant share scene_id, this name and frame_index.
+    Frames of several cameras at one instant have this name, scene_id and frame_index in common.
     """
     return trajectory_id.removeprefix(f"{camera}-")

@@ -1,4 +1,4 @@
-"""Packed frames: shards/<split>-00000-of-00012.parquet, one row per frame with pose, image and labels."""
+"""Packed frames: shards/<split>-00000-of-00012.parquet, one row per frame: pose, image and labels."""
 
 import json
 import re
@@ -34,7 +34,7 @@ LABEL = pa.struct([field for field in TABLES["labels"] if field.name not in TABL
 
 
 def features_of(columns: list[pa.Field]) -> bytes:
-    """Return the value of the Parquet metadata `huggingface`, which makes `datasets` decode the column `image`."""
+    """Return the Parquet metadata `huggingface`, which makes `datasets` decode the column `image`."""
     features = {field.name: {"_type": "Image"} if field.name == "image" else _feature(field.type) for field in columns}
     return json.dumps({"info": {"features": features}}).encode()
 
@@ -72,7 +72,7 @@ def split_of(shard: str) -> str:
 
 
 def shards_of(store: Store, split: str | None = None) -> list[str]:
-    """Return the paths of a dataset's shards, or of one split's, sorted by name; other files are ignored."""
+    """Return the paths of all shards, or of the shards of one split, sorted by name."""
     paths = [path for path in parquet_files(store, FOLDER) if _NAME.fullmatch(path.rpartition("/")[2])]
     return [path for path in paths if split in (None, split_of(path))]
 
@@ -83,9 +83,9 @@ def open_shard(store: Store, path: str) -> Part:
 
 
 def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> Iterator[tuple[str, bytes]]:
-    """Yield frame_id and PNG bytes of packed frames of one split or all, in the order in which they are stored.
+    """Yield frame_id and PNG bytes of the given packed frames, in the order of the shards.
 
-    Raises UserError if a frame is missing.
+    `split` limits the search to the shards of one split. Raises UserError if a frame is missing.
     """
     missing = set(frame_ids)
     for path in shards_of(store, split):
@@ -106,9 +106,9 @@ def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> 
 
 
 def packed_rows(frames: pa.Table, labels: pa.Table, pngs: list[bytes | None]) -> pa.Table:
-    """Combine rows of `frames` (N), rows of `labels` and PNG bytes (N) into rows of a shard (N).
+    """Return the N rows of a shard from N rows of `frames`, rows of `labels` and N contents of PNGs.
 
-    Labels of other frames are omitted; the labels of a frame keep their order.
+    Labels of other frames are omitted. The labels of a frame keep their order.
     """
     row_of = pc.index_in(labels["frame_id"], frames["frame_id"].combine_chunks())
     frame_of = pc.fill_null(row_of, len(frames)).to_numpy()

@@ -1,4 +1,4 @@
-"""Read the rows of a part that belong to a scene, a trajectory or a split; skip row groups by their statistics."""
+"""Read the rows of a part that belong to a scene, trajectory or split; skip other row groups."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from perilune_shared.errors import UserError
 
 
 def may_contain(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
-    """Whether a part of this name may contain rows of a scene, and of a trajectory in it."""
+    """Whether a part with the name `stem` may contain rows of a scene, or of one of its trajectories."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem) or scene_id is None:
         return True
@@ -27,9 +27,10 @@ def rows_of_part(
     split: str | None,
     where: Condition | None,
 ) -> pa.Table:
-    """Read the rows of a part that belong to a scene, a trajectory and a split and satisfy `where`.
+    """Read the columns `names` of the rows of a part that fulfil all given restrictions.
 
-    None selects any.
+    The restrictions are scene, trajectory, split and the condition `where`; None means no restriction. Statistics show
+    which row groups cannot contain such rows; these groups are not read.
     """
     columns = part.schema.names
     equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}

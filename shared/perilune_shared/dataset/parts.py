@@ -1,8 +1,8 @@
-"""One Parquet part of a table: written once and atomically, and read with limits, since parts are untrusted input.
+"""Write Parquet parts of a table atomically; read parts with limits, since they are untrusted input.
 
-The name of a part states which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. If a table is a single
-file, it is the part `all`, and each row group contains one scene or a few trajectories. A table above the limits
-continues in `all.0001` and so on.
+The name of a part states which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. A table in a single file
+is the part `all`; each of its row groups contains one scene or a few trajectories. A table with too many rows for one
+part continues in `all.0001` and so on.
 """
 
 import contextlib
@@ -33,9 +33,9 @@ from perilune_shared.storage.store import Address, Store, open_store
 from perilune_shared.storage.thrift import Fields, items_of
 
 MAX_ROWS_WRITTEN = 2_000_000
-"""Maximum number of rows of a written part; below the reader's limits for every table."""
+"""Maximum number of rows of a written part; readers accept this number of rows for every table."""
 _MAX_TEXT_BYTES = 1000
-# Maximum length of lists in a footer. It also limits the depth of the schema: deep nesting can crash the process.
+# Maximum length of a list in a footer. This also limits the nesting of the schema, which could crash the process.
 _MAX_LIST = 10_000
 _MAX_FOOTER_TEXT_BYTES = 10_000_000
 _FOOTER_END_BYTES = 8
@@ -49,7 +49,7 @@ _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_I
 
 @dataclass(frozen=True, slots=True)
 class WrittenFile:
-    """A file that was written, hashed while its bytes were in memory."""
+    """Path, size and hash of a written file. The hash is of the bytes in memory, not of the disk."""
 
     path: str
     """Path relative to the dataset."""
@@ -105,7 +105,7 @@ class Part:
             texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
             self.file = self._parquet(texts)
             self.found = self.file.metadata.schema.to_arrow_schema()
-            # Stored, since each access to pyarrow's metadata creates new objects.
+            # Store the paths, since each access to pyarrow's metadata creates new objects.
             columns = self.file.metadata.schema
             self._paths = [columns.column(index).path for index in range(len(columns))]
             check_footer(self.file.metadata, self.places_of(self.schema.names), self._n_bytes, self.address)
@@ -121,7 +121,8 @@ class Part:
     def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
         """Open the file; read the columns `texts` as dictionaries.
 
-        Without dictionaries, a short file could decompress to gigabytes of text before its length is checked.
+        Without dictionaries, a short file could decompress to gigabytes of text before the length of the texts is
+        checked.
         """
         source = self._source()
         options = {
@@ -136,7 +137,7 @@ class Part:
         return pq.ParquetFile(source, read_dictionary=[name for name in texts if name in names], **options)
 
     def _source(self) -> Any:
-        """Return a source for pyarrow: a local path, the bytes of a small file, or an object read by range."""
+        """Return a source for pyarrow: the bytes of a small file, a local path, or an object read by ranges."""
         if self._content is not None:
             return pa.BufferReader(self._content)
         return self._ranges if self.store.folder is None else self.store.folder / self.path
@@ -164,17 +165,17 @@ class Part:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
 
     def places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
-        """Return positions and paths of the file's columns that belong to the named fields."""
+        """Return position and path of each column of the file that belongs to one of the named fields."""
         wanted = set(names)
         return [(index, path) for index, path in enumerate(self._paths) if path.split(".")[0] in wanted]
 
     def read(
         self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
     ) -> pa.Table:
-        """Read the given columns of the given row groups; by default all.
+        """Read columns of row groups; by default all columns and all groups.
 
-        Raises UserError if they cannot be read, or if ids of scenes, trajectories or frames are not safe file names.
-        `any_ids` skips the check of ids.
+        Raises UserError if the rows cannot be read, or if an id of a scene, trajectory or frame is not a safe file
+        name. `any_ids` skips the check of ids.
         """
         chosen = list(range(self.n_groups) if groups is None else groups)
         names = list(columns) if columns is not None else self.schema.names
@@ -209,7 +210,7 @@ class Part:
 
     @contextlib.contextmanager
     def _bytes_of(self, groups: list[int], names: list[str]) -> Iterator[BinaryIO]:
-        """Open the file to read columns of row groups; from an object store, fetch all of them in advance."""
+        """Open the file to read columns of row groups; in an object store, first fetch all their bytes."""
         if self._ranges is None:
             with self.store.open(self.path) if self._content is None else io.BytesIO(self._content) as stream:
                 yield stream
@@ -223,7 +224,7 @@ class Part:
             yield cast(BinaryIO, self._ranges)
 
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
-        """Check that the pages do not exceed the sizes in the footer, which were checked earlier."""
+        """Check that pages do not exceed the sizes in the footer; the footer was checked on opening."""
         metadata = self.file.metadata.row_group(group)
         for index, name in self.places_of(names):
             if (group, name) in self._checked:
@@ -234,7 +235,7 @@ class Part:
                 found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
                 expected = f"at most {column.total_uncompressed_size} and {column.num_values}, as in the footer"
                 raise UserError(self.address, name, found, expected)
-            # With a dictionary, a small file could repeat one image and decompress to any size: refuse it.
+            # Refuse a dictionary of images: a small file could repeat one image and decompress to any size.
             if name.startswith("image.") and pages.has_dictionary:
                 raise UserError(self.address, name, "a dictionary", "plain bytes for each frame")
             self._checked.add((group, name))
@@ -250,16 +251,18 @@ class Part:
                 raise UserError(self.address, name, repr(mismatch), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
-        """Return the row groups whose statistics allow texts in [low, high)."""
+        """Return the row groups that may contain texts in [low, high), according to their statistics."""
         footer = self.file.metadata
         names = [footer.schema.column(i).path for i in range(footer.num_columns)]
         index = names.index(column) if column in names else -1
         chosen = []
         for group in range(footer.num_row_groups):
-            known = footer.row_group(group).column(index).statistics if index >= 0 else None
+            stated = footer.row_group(group).column(index).statistics if index >= 0 else None
             try:
                 excluded = (
-                    known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
+                    stated is not None
+                    and stated.has_min_max
+                    and not (str(stated.min) < high and str(stated.max) >= low)
                 )
             except (pa.ArrowException, ValueError):  # statistics of another type, or not UTF-8
                 excluded = False
@@ -268,7 +271,7 @@ class Part:
         return chosen
 
     def groups_where(self, condition: pc.Expression) -> list[int]:
-        """Return the row groups whose statistics allow rows that fulfil a condition."""
+        """Return the row groups that may contain rows that fulfil a condition, by their statistics."""
         try:
             # The footer was checked when the part was opened.
             source, local = self._source(), None
@@ -301,7 +304,7 @@ def write_part(
     """Write the part `manifest/<table>/<name>.parquet` of a dataset.
 
     Raises FileExistsError if the file exists, unless `replace` is true. Raises UserError if `name` is not a valid part
-    name; it may come from an untrusted dataset.
+    name, since `name` may come from an untrusted dataset.
     """
     store = open_store(address)
     if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):

@@ -1,6 +1,6 @@
-"""The tables of a dataset: every column with its type, unit and frame of reference (schema version 4).
+"""The tables of a dataset: type, unit and frame of reference of each column (schema version 4).
 
-Real columns of labels are float32. In an image of 1024 pixels float32 resolves 0.0001 px; no rim can be located that
+Real columns of labels are float32, which resolves 0.0001 px in an image of 1024 pixels; no rim can be located that
 precisely. Poses, craters and times are float64, since ellipses are computed from them to 0.000001 px.
 
 Every Parquet file contains these units and meanings as metadata, so a single file documents itself.
@@ -25,7 +25,10 @@ def complete(table: str, rows: pa.Table) -> pa.Table:
 
 
 def stored(table: str, rows: pa.Table) -> pa.Table:
-    """Return `rows` as written to files: `complete`, without columns of `ONLY_IF_USED` in which all rows are null."""
+    """Return `rows` as they are written to files.
+
+    All columns are present (`complete`), except columns of `ONLY_IF_USED` without any value.
+    """
     rows = complete(table, rows)
     unused = [name for name in ONLY_IF_USED.get(table, ()) if rows[name].null_count == len(rows)]
     return rows.drop_columns(unused) if unused else rows
@@ -48,7 +51,9 @@ _TRAJECTORY = _column("trajectory_id", _TEXT, "", "the descent within its scene"
 _FRAME = _column("frame_id", _TEXT, "", "scene_id/trajectory_id/frame_index with 6 digits")
 _SPLIT = "train, val or test"
 ANGULAR_VELOCITY = ("wx_radps", "wy_radps", "wz_radps")
-"""Columns of the camera's angular velocity in `frames`; not one list, since Parquet readers fail on nullable lists."""
+"""Columns of the camera's angular velocity in `frames`.
+
+There is no single list column, since Parquet readers fail on nullable lists."""
 
 TABLES: dict[str, pa.Schema] = {
     "scenes": _table(
@@ -242,7 +247,7 @@ TABLES: dict[str, pa.Schema] = {
     ),
 }
 OPTIONAL_TABLES = ("inertial", "ranges")
-"""Tables that are written only if they have rows; they were added without a new schema version."""
+"""Tables that are written only if they have rows. They were added without a new schema version."""
 _HAZARD = ("hazard_path", "hazard_sha256", "hazard_bytes")
 _LIDAR = ("lidar_path", "lidar_sha256", "lidar_bytes")
 _ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius", *ANGULAR_VELOCITY, *_LIDAR)
@@ -253,14 +258,18 @@ MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {
     "frames": (*_ABSENT_IN_FRAMES, "camera"),
     "shards": _ABSENT_IN_FRAMES,
 }
-"""Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls.
-To add one, append a column with `nullable=True` to its table and add its name here, and to ONLY_IF_USED."""
+"""Columns that a file may lack, by table; readers then fill them with nulls.
+
+These columns were added without a new schema version. To add another column, append it to its table with
+`nullable=True`, and add its name here and to ONLY_IF_USED."""
 ONLY_IF_USED: dict[str, tuple[str, ...]] = {
     "scenes": _HAZARD,
     "craters": _MEASURED_RIM,
     "frames": (*ANGULAR_VELOCITY, *_LIDAR, "camera"),
 }
-"""Columns of MAY_BE_ABSENT that are written only if a row has a value, so that other datasets keep their bytes."""
+"""Columns of MAY_BE_ABSENT that are written only if they have a value.
+
+Datasets without values keep the bytes that they had before the column was added."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],
     "craters": ["scene_id", "crater_id"],

@@ -1,7 +1,8 @@
 """Compare the statistics in the footer of a Parquet part with its values.
 
-Readers use these statistics to skip row groups, so a false one hides rows. pyarrow does not show all of the footer:
-other programs also read the older fields of minimum and maximum, and trust writers whose statistics pyarrow ignores.
+Readers skip row groups by these statistics, so a false statistic hides rows. This module parses the footer itself,
+since pyarrow ignores some statistics that other programs use: those in the older fields for minimum and maximum, and
+those of certain writers.
 """
 
 from collections.abc import Iterator
@@ -21,14 +22,15 @@ _EXTREMES = {1: "max", 2: "min", 5: "max", 6: "min"}
 _OF_GROUP = {4: "a sort order"}
 _OF_CHUNK = {1: "values in another file", 4: "a page index", 6: "a page index"}
 _OF_COLUMN = {14: "a Bloom filter"}
-"""Other footer entries by which programs select or find rows. No version of this package writes them."""
+"""Further footer entries by which programs select or find rows. No version of perilune writes them."""
 _BYTES = {pa.int64(): "<i8", pa.int32(): "<i4", pa.float64(): "<f8", pa.float32(): "<f4", pa.bool_(): "?"}
 
 
 def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[UserError]:
-    """Yield an error for each false statistic of a row group: `stated` is its RowGroup, `rows` has columns of it.
+    """Yield an error for each false statistic of a row group, and for each entry that cannot be checked.
 
-    Entries that cannot be checked, such as Bloom filters, are errors too.
+    `stated` is the RowGroup struct in the footer; `rows` has the columns to check, with all rows of the group. Bloom
+    filters are an example of entries that cannot be checked.
     """
     for number in _OF_GROUP.keys() & stated.keys():
         yield UserError(part.address, "row group", _OF_GROUP[number], "none")
@@ -44,7 +46,7 @@ def false_statistics(part: Part, stated: Fields, rows: pa.Table) -> Iterator[Use
 
 
 def _leaves(column: pa.Array) -> Iterator[pa.Array]:
-    """Yield the arrays that Parquet stores as columns, in Parquet's order, without the elements of null lists."""
+    """Yield the arrays that Parquet stores as columns, in its order, without elements of null lists."""
     if pa.types.is_struct(column.type):
         for index in range(column.type.num_fields):
             yield from _leaves(pc.struct_field(column, index))
@@ -55,7 +57,7 @@ def _leaves(column: pa.Array) -> Iterator[pa.Array]:
 
 
 def _false_of_column(address: str, path: str, chunk: Fields, values: pa.Array) -> Iterator[UserError]:
-    """Yield an error for each false statistic of one column: `chunk` is its ColumnChunk."""
+    """Yield an error for each false statistic of a column; `chunk` is its ColumnChunk in the footer."""
     metadata = chunk[_METADATA]
     for notes, fields in ((_OF_CHUNK, chunk), (_OF_COLUMN, metadata)):
         for number in sorted(notes.keys() & fields.keys()):

@@ -1,4 +1,4 @@
-"""Write whole tables: the parts `all`, `all.0001` and so on, of at most a given number of rows each."""
+"""Write whole tables: the parts `all`, `all.0001` and so on, each up to a maximum number of rows."""
 
 from collections import defaultdict
 
@@ -16,7 +16,7 @@ _MIN_ROWS_PER_GROUP, _MAX_GROUPS = 1000, 200
 class WholeTables:
     """Writer of all tables of a dataset. Rows stay in memory until a part is full.
 
-    With `replace`, existing parts are overwritten; otherwise they cause a FileExistsError.
+    With `replace`, existing parts are overwritten. Without it, an existing part raises FileExistsError.
     """
 
     def __init__(self, store: Store, *, max_rows: int = MAX_ROWS_WRITTEN, replace: bool = False):
@@ -46,7 +46,7 @@ class WholeTables:
             rows = rows[free:]
 
     def finish(self) -> list[WrittenFile]:
-        """Write buffered rows, and one empty part for each required table without rows; return all parts."""
+        """Write buffered rows, and an empty part for each required table without rows; return all parts."""
         for name in TABLES:
             is_needed = name not in OPTIONAL_TABLES and not self._n_parts[name]
             if self._n_buffered[name] or is_needed:

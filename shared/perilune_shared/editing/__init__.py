@@ -1,1 +1,1 @@
-"""Make datasets from other datasets: subset, merge, split, pack, attach, migrate. Compare them: diff."""
+"""Make datasets from others (subset, merge, split, pack, attach, migrate) and compare them (diff)."""

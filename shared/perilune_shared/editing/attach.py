@@ -21,12 +21,13 @@ def attach(
     *,
     link: bool = False,
 ) -> None:
-    """Write a dataset from a manifest without frames and its frames in the folder `frames_root`.
+    """Write a dataset from a manifest without frames and from its frames in the folder `frames_root`.
 
-    Frames are copied, or hard-linked with `link`. Every PNG must match the hash in the manifest. With `rehash` the
-    hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. The
-    EXRs, the flash lidar images and the hazard map of a scene are each included if all their files exist. Raises
-    UserError if a frame is missing or does not match, and if the manifest is a plan, which has no labels.
+    Frames are copied, or hard-linked with `link`. Every file must match its hash in the manifest. With `rehash`, the
+    hashes of the files replace the hashes in the manifest, for example if frames were rendered on another kind of
+    machine. For each scene, EXRs, flash lidar images and the hazard map are each included only if all files of this
+    kind exist. Raises UserError if a frame is missing or a file does not match, or if the manifest has frames or is a
+    plan without labels.
     """
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":
@@ -51,7 +52,7 @@ def attach(
 
 
 def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
-    """Return a scene's rows of `frames` with the hashes of the existing files."""
+    """Return a scene's rows of `frames` with paths, sizes and hashes of the existing files."""
     names = [f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256")]
     rows = frames.select(["frame_id", "camera", *names]).to_pylist()
     columns: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
@@ -80,7 +81,7 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
 
 
 def _checked_scene(source: Dataset, scenes: pa.Table, rehash: bool) -> pa.Table:
-    """Return a scene's row with the hashes of its existing files."""
+    """Return a scene's row of `scenes` with paths, sizes and hashes of the existing files."""
     row = scenes.to_pylist()[0]
     for kind in SCENE_FILE_KINDS:
         for name, value in _file(source, row, kind, rehash).items():
@@ -89,9 +90,9 @@ def _checked_scene(source: Dataset, scenes: pa.Table, rehash: bool) -> pa.Table:
 
 
 def _file(source: Dataset, row: dict, kind: str, rehash: bool) -> dict[str, str | int | None]:
-    """Return path, bytes and sha256 of a row's file; None for a missing file.
+    """Return path, bytes and sha256 of a row's file, each None for a missing file.
 
-    Raises UserError on a mismatch.
+    Raises UserError if the hash differs from the row, unless `rehash` is true.
     """
     path = row[f"{kind}_path"]
     size = source.store.size(path) if path is not None else None

@@ -18,14 +18,14 @@ _COPY_NUMBER = "copy"
 class Difference:
     """A column in which rows differ, or rows that exist in only one dataset."""
 
-    place: str
+    table: str
     """Name of the table, or dataset.json."""
     column: str
     """Column or field; empty if whole rows are missing."""
     rows: int
-    """Number of rows that differ."""
+    """Number of rows that differ or are missing."""
     example: str
-    """Key of the first such row."""
+    """Key of the first row that differs."""
     first: str
     """Value of the example in the first dataset."""
     second: str
@@ -33,25 +33,23 @@ class Difference:
 
 
 def differences(first: Dataset, second: Dataset) -> list[Difference]:
-    """Return all differences in content; how parts and frames are stored does not matter."""
+    """Return all differences in content, whatever the division into parts and the storage of frames."""
     result = list(_info(_plain(first), _plain(second), ""))
     first_ids, second_ids = set(first.scene_ids()), set(second.scene_ids())
-    for here, other, only in ((first_ids, second_ids, True), (second_ids, first_ids, False)):
-        missing = sorted(here - other)
+    for missing, values in ((first_ids - second_ids, ("present", "-")), (second_ids - first_ids, ("-", "present"))):
         if missing:
-            present = ("present", "-") if only else ("-", "present")
-            result.append(Difference("scenes", "", len(missing), missing[0], *present))
+            result.append(Difference("scenes", "", len(missing), min(missing), *values))
     gathered: dict[tuple[str, str], Difference] = {}
     for scene_id in sorted(first_ids & second_ids):
         for name in TABLES:
             pair = (dataset.table(name, scene_id=scene_id).to_pandas() for dataset in (first, second))
             for each in _rows(name, *pair):
-                key = (each.place, each.column + (each.first if not each.column else ""))
+                key = (each.table, each.column + (each.first if not each.column else ""))
                 earlier = gathered.get(key)
                 total = each.rows + (earlier.rows if earlier else 0)
                 example = earlier or each
                 gathered[key] = Difference(
-                    example.place, example.column, total, example.example, example.first, example.second
+                    example.table, example.column, total, example.example, example.first, example.second
                 )
     return result + list(gathered.values())
 
@@ -74,14 +72,14 @@ def _rows(table: str, old: pd.DataFrame, new: pd.DataFrame) -> Iterator[Differen
     """Yield the differences in one table of one scene."""
     keys = KEYS[table]
     if any(frame.duplicated(keys).any() for frame in (old, new)):
-        # Number rows with equal keys in an order that does not depend on their order in the file.
+        # Number rows with equal keys by their values, so that their order in the file does not matter.
         old, new = (_numbered(frame, keys) for frame in (old, new))
         keys = [*keys, _COPY_NUMBER]
     old, new = (frame.set_index(keys).sort_index() for frame in (old, new))
-    for here, other, present in ((old, new, ("present", "-")), (new, old, ("-", "present"))):
-        missing = here.index.difference(other.index)
+    only_old, only_new = old.index.difference(new.index), new.index.difference(old.index)
+    for missing, values in ((only_old, ("present", "-")), (only_new, ("-", "present"))):
         if len(missing):
-            yield Difference(table, "", len(missing), _text(missing[0]), *present)
+            yield Difference(table, "", len(missing), _text(missing[0]), *values)
     common = old.index.intersection(new.index)
     old, new = old.loc[common], new.loc[common]
     for column in old.columns:
@@ -98,7 +96,7 @@ def _rows(table: str, old: pd.DataFrame, new: pd.DataFrame) -> Iterator[Differen
 
 
 def _numbered(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
-    """Add a column that numbers the rows of each key from 0."""
+    """Sort rows by their values, and add a column that numbers the rows with equal keys from 0."""
     plain = [name for name in rows.columns if not (rows[name].dtype == object and rows[name].map(np.ndim).gt(0).any())]
     rows = rows.sort_values(plain, kind="stable", ignore_index=True)
     return rows.assign(**{_COPY_NUMBER: rows.groupby(keys).cumcount()})

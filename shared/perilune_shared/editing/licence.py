@@ -19,24 +19,24 @@ def _spdx() -> Licensing:
 
 
 def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
-    """Return the SPDX expression for data under all of the given licences (pairs of place and licence).
+    """Return the SPDX expression that joins the given licences by AND.
 
-    Equal licences appear once; alternatives are in parentheses. A licence that SPDX does not list needs a name of the
-    form LicenseRef-<name>.
-    Raises UserError, which names the place, on an invalid SPDX expression or an unknown licence.
+    `licences` are pairs of dataset (for error messages) and licence. Equal licences appear once; alternatives are in
+    parentheses. A licence that SPDX does not list needs a name of the form LicenseRef-<name>. Raises UserError on an
+    invalid SPDX expression or an unknown licence.
     """
     spdx = _spdx()
     terms: dict[str, str] = {}
     for where, text in licences:
         for term in _terms(spdx, where, text):
-            # Simplify, so that the order of alternatives does not matter.
+            # Terms that differ only in the order of alternatives are equal when simplified.
             terms.setdefault(str(term.simplify()), str(term))
     parsed = [spdx.parse(term) for _, term in sorted(terms.items())]
     return str(spdx.AND(*parsed)) if len(parsed) > 1 else str(parsed[0])
 
 
 def _terms(spdx: Licensing, where: object, text: str) -> list[Any]:
-    """Return the terms that an expression joins by AND."""
+    """Return the terms that a licence expression joins by AND."""
     expected = "an SPDX licence expression such as CC-BY-4.0, or LicenseRef-<name>"
     try:
         expression = spdx.parse(text)

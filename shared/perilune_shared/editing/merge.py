@@ -32,15 +32,15 @@ def merge(
 ) -> None:
     """Write the frames of all sources, each once, as one dataset.
 
-    Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. Equal
-    trajectories are merged, and different ones renamed, in the same way. A frame that occurs in several sources is
-    taken from the first one, with split and labels; so is the hazard map of a scene. Counts, splits and the split unit
-    are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, a licence is not an SPDX
-    expression, or two copies of a frame were rendered differently.
+    Equal scenes (recipe, seed, Sun, craters) become one scene; different scenes with equal names are renamed.
+    Trajectories are merged and renamed in the same way. A frame that occurs in several sources is taken from the first
+    of them, with its split and labels. The hazard map of a scene is also taken from the first source. Counts, splits
+    and `split_by` are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, if a licence
+    is not an SPDX expression, or if two copies of a frame were rendered differently.
     """
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
-    for source in {_place(source): source for source in sources}.values():
+    for source in {_location(source): source for source in sources}.values():
         check_single(source)
         check_source(source, out, progress)
     info = _joined_info(sources, name, state_of(list(sources), images))
@@ -79,7 +79,7 @@ def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetI
     return info.changed("merge of " + ", ".join(source.info.name for source in sources))
 
 
-def _place(source: Dataset) -> object:
+def _location(source: Dataset) -> object:
     return source.store.folder.resolve() if source.store.folder is not None else source.store
 
 
@@ -99,9 +99,10 @@ def _has_exrs(source: Dataset) -> bool:
 
 
 def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
-    """Group equal scenes: for each scene_id of the result, list (index of a source, scene_id in that source).
+    """Group equal scenes of the sources.
 
-    Crater ids are not compared for plans, which have no labels.
+    For each scene_id of the result, lists the equal scenes as (index of the source, scene_id in the source). Crater ids
+    are not compared for plans, which have no labels.
     """
     groups: dict[str, list[tuple[int, str]]] = {}
     known: dict[tuple, str] = {}
@@ -110,7 +111,7 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
             source_id = row.pop("scene_id")
             # Ignore files, since a packed copy of a scene has none.
             row = {name: value for name, value in row.items() if not name.startswith(SCENE_FILE_KINDS)}
-            # Labels refer to craters by id, so the ids must be equal too.
+            # Labels refer to craters by id, so equal scenes must have equal crater ids.
             craters = (
                 [] if planned else source.table("craters", ["crater_id"], scene_id=source_id)["crater_id"].to_pylist()
             )
@@ -134,7 +135,7 @@ def free_name(name: str, taken: Container[str]) -> str:
 def _join(
     scene_id: str, members: Sequence[tuple[Dataset, str]]
 ) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
-    """Return the tables of a merged scene and, for each source, the frames taken from it and their new frame_ids."""
+    """Return the tables of a merged scene; for each source, the frames taken and the new frame_ids."""
     joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels", *OPTIONAL_TABLES)}
     used_frames: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
     known_trajectories: list[tuple[dict, str]] = []
@@ -148,10 +149,10 @@ def _join(
                 name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _TERRAIN_TABLES
             }
         new_ids, rows = _trajectories(tables["trajectories"], known_trajectories)
-        rows = _moved(rows, scene_id, new_ids)
+        rows = _with_new_ids(rows, scene_id, new_ids)
         joined["trajectories"].append(rows)
         for name in OPTIONAL_TABLES:
-            joined[name].append(of_trajectories(_moved(tables[name], scene_id, new_ids), rows))
+            joined[name].append(of_trajectories(_with_new_ids(tables[name], scene_id, new_ids), rows))
         frames = tables["frames"]
         old = frames.select(["frame_id", "trajectory_id", "frame_index", *_FIXED_IN_FRAMES]).to_pylist()
         names = {
@@ -175,9 +176,9 @@ def _join(
 
 
 def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
-    """Return the new id of each trajectory of a member, and the rows of trajectories not yet in `known`.
+    """Return the new id of each trajectory, and the rows of trajectories that are not yet in `known`.
 
-    `known` contains the trajectories of earlier members (content and new id); new ones are added to it.
+    `known` has content and new id of the trajectories of earlier sources; new trajectories are added to it.
     """
     names: dict[str, str] = {}
     new = []
@@ -204,10 +205,10 @@ def _check_same(source: Dataset, row: dict, earlier: dict) -> None:
 
 def _renamed(frames: pa.Table, scene_id: str, new_ids: dict[str, str], names: dict[str, str]) -> pa.Table:
     ids = [names[frame_id] for frame_id in frames["frame_id"].to_pylist()]
-    return with_column(_moved(frames, scene_id, new_ids), "frame_id", ids)
+    return with_column(_with_new_ids(frames, scene_id, new_ids), "frame_id", ids)
 
 
-def _moved(rows: pa.Table, scene_id: str, new_ids: dict[str, str]) -> pa.Table:
-    """Return rows with the ids that scene and trajectories have in the merged dataset."""
+def _with_new_ids(rows: pa.Table, scene_id: str, new_ids: dict[str, str]) -> pa.Table:
+    """Return rows with the new scene_id and trajectory_ids."""
     rows = with_column(rows, "scene_id", [scene_id] * len(rows))
     return with_column(rows, "trajectory_id", [new_ids[name] for name in rows["trajectory_id"].to_pylist()])

@@ -1,8 +1,8 @@
 """Convert datasets of older schema versions to the current one.
 
-Version 2 added the column `origin` to `craters` and made age and fresh depth nullable. Version 3 added
-recipes and content hashes to `scenes`, `contrast` to `labels`, hashes of all files, and the state of the frames.
-Version 4 added `scene_id` and `split` to `labels`, and made their real columns float32.
+Version 2 added the column `origin` to `craters` and made age and fresh depth nullable. Version 3 added recipe and
+content hash to `scenes`, `contrast` to `labels`, hashes of all files, and the state of the frames (`images`).
+Version 4 added `scene_id` and `split` to `labels`, and made the real columns of `labels` float32.
 """
 
 from collections.abc import Callable, Mapping
@@ -48,9 +48,9 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2, "3": _TABLE
 def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Convert a dataset of an older schema version to the current one.
 
-    Frames are copied, or hard-linked with `link`. Versions 1 and 2 did not record the contrast of labels, so it becomes
-    null. Raises UserError if the dataset has the current version already, is damaged or incomplete, or has packed
-    frames.
+    Frames are copied, or hard-linked with `link`. The contrast of labels becomes null for versions 1 and 2, which did
+    not record it. Raises UserError if the dataset has the current version already, is damaged or incomplete, or has
+    packed frames.
     """
     store = open_store(address)
     content, path = read_object(store), store.at(INFO_NAME)
@@ -79,7 +79,7 @@ def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *,
 
 
 def _info(content: dict[str, Any], path: str) -> DatasetInfo:
-    """Convert dataset.json. Versions 1 and 2 had settings, seed and versions without recipes."""
+    """Convert dataset.json. In versions 1 and 2, the fields of the only recipe are at the top level."""
     version = content["schema_version"]
     line = f"migrated from schema version {version}"
     if version == "3":
@@ -112,14 +112,14 @@ def _info(content: dict[str, Any], path: str) -> DatasetInfo:
 
 
 class _OldDataset(Dataset):
-    """A dataset of an older schema version; its rows are converted to the current version on reading."""
+    """A dataset of an older schema version. `rows` converts its rows to the current version."""
 
     def __init__(self, store: Store, info: DatasetInfo, version: str):
         super().__init__(store, info)
         self.version = version
 
     def rows(self, table: str, scene_id: str | None = None) -> pa.Table:
-        """Read a table for one scene or all, with the columns of the current version."""
+        """Read a table: the rows of one scene with the current columns, or all rows with the old columns."""
         schema = OLD_TABLES[self.version][table]
         pieces = [Part(self.store, part, table, schema, self.version).read() for part in self.parts(table, scene_id)]
         rows = pa.concat_tables(pieces) if pieces else schema.empty_table()
@@ -145,7 +145,7 @@ class _OldDataset(Dataset):
         return [split_of.get(frame_id) for frame_id in frame_ids.to_pylist()]
 
     def _added(self, table: str, name: str, rows: pa.Table, scene_id: str) -> pa.Array:
-        """Return a column that the older version lacks."""
+        """Return the values of a column that the older version lacks."""
         n = len(rows)
         fill: dict[tuple[str, str], Callable[[], list]] = {
             ("labels", "scene_id"): lambda: [scene_id] * n,

@@ -1,7 +1,4 @@
-"""Pack a dataset into shards that can be streamed, and unpack it.
-
-A shard has frames with pose, image and labels.
-"""
+"""Pack a dataset into shards for streaming (frames with pose, image and labels), and unpack it."""
 
 from collections.abc import Iterator, Sequence
 
@@ -22,10 +19,10 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 
 MAX_FRAMES_WRITTEN = 100_000
-"""Maximum number of frames of a shard: at most 1,563 row groups, while readers accept 10,000."""
+"""Maximum number of frames of a shard; a shard then has far fewer row groups than readers accept."""
 _MAX_SHARD_MB = 2000
 _FRAMES_PER_GROUP, _BYTES_PER_GROUP = 64, 2**23
-"""Maximum frames and bytes of a row group, the unit in which a stream is read and shuffled."""
+"""Maximum frames and bytes of a row group. A stream reads and shuffles whole row groups."""
 _NOT_PACKED = [f"{kind}_{name}" for kind in ("exr", "lidar") for name in ("path", "sha256", "bytes")]
 _NOT_PACKED_OF_SCENES = [f"{kind}_{name}" for kind in SCENE_FILE_KINDS for name in ("path", "sha256", "bytes")]
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
@@ -40,12 +37,12 @@ def pack(
     max_rows: int = MAX_ROWS_WRITTEN,
     max_frames: int = MAX_FRAMES_WRITTEN,
 ) -> None:
-    """Write a packed dataset: frames in shards of about `shard_mb` megabytes, readable by Hugging Face `datasets`.
+    """Write a packed dataset, with frames in shards of about `shard_mb` megabytes (10^6 bytes).
 
-    Each shard contains frames of one split, ordered by scene, trajectory and frame index. A table of more than
-    `max_rows` rows becomes several parts, and a shard contains at most `max_frames` frames, to stay within the limits
-    of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs, flash
-    lidar images and hazard maps are not packed; their columns become null.
+    Hugging Face `datasets` can read the shards. A shard contains at most `max_frames` frames of one split, ordered by
+    scene, trajectory and frame index. Each table becomes one part, or several parts of at most `max_rows` rows. If the
+    dataset has no frames, only its tables are packed. EXRs, flash lidar images and hazard maps are not packed; their
+    columns become null.
     """
     check_source(source, out, progress)
     if not 0 < shard_mb <= _MAX_SHARD_MB:
@@ -70,9 +67,9 @@ def pack(
 
 
 def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: list[list[int]]) -> Iterator[int]:
-    """Write the shards of one split with row groups of the given sizes.
+    """Write the shards of one split; yield the number of frames of each written row group.
 
-    Yields the size of each row group written.
+    `shards` has, for each shard, the number of frames of each row group.
     """
     groups = _groups(source, split, [size for shard in shards for size in shard])
     for number, shard in enumerate(shards):
@@ -107,7 +104,7 @@ def _sizes(source: Dataset, split: str, shard_bytes: float, max_frames: int) -> 
 
 
 def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Table]:
-    """Yield the row groups of a split, of `sizes` frames each. Holds only a few trajectories in memory."""
+    """Yield row groups of a split with `sizes` frames. Holds only a few trajectories in memory."""
     trajectories = _trajectories(source, split)
     frames, labels = TABLES["frames"].empty_table(), TABLES["labels"].empty_table()
     for size in sizes:
@@ -123,7 +120,7 @@ def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Ta
 def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
     """Yield frames and labels of each trajectory of a split.
 
-    Frames are in order and refer to no files but PNGs.
+    Frames are sorted. Their columns for EXRs and flash lidar images are null.
     """
     columns = ["scene_id", "trajectory_id", "split"]
     for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
@@ -135,9 +132,9 @@ def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Ta
 
 
 def unpack(source: Dataset, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
-    """Write a dataset with frames as files.
+    """Write a dataset with each frame in its own file.
 
-    Frames that are files already are copied, or hard-linked with `link`.
+    If the frames of the source are files already, copy them, or hard-link them with `link`.
     """
     check_source(source, out, progress)
     info: DatasetInfo = source.info.changed("unpacked")

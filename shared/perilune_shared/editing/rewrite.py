@@ -1,4 +1,4 @@
-"""Write a changed copy of a dataset; used by all tools that change or select rows."""
+"""Write a changed copy of a dataset, for all commands that change or select rows."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,17 +24,17 @@ class Rewriting:
     """How a dataset is rewritten."""
 
     info: DatasetInfo
-    """The new `dataset.json`, except for its counts and `images`."""
+    """Content of the new dataset.json; `counts` and `images` are replaced."""
     change: Callable[[SceneTables], SceneTables]
     """Returns the new tables of a scene from the old ones."""
     images: ImageMode
-    """How the frames are written: copied, hard-linked, omitted or planned."""
+    """How frames are written; see `ImageMode`."""
     scene_ids: Sequence[str] | None = None
     """Scenes to write; None for all."""
 
 
 def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progress = NO_PROGRESS) -> None:
-    """Change the scenes of `source` and write them into `out`.
+    """Write the changed scenes of `source` as a new dataset `out`.
 
     Scenes and labels without frames are omitted. The caller must have checked the source (`check_source`).
     """
@@ -60,8 +60,8 @@ def rewrite(source: Dataset, out: Address, rewriting: Rewriting, progress: Progr
 def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
-    A dataset is refused if it is incomplete, if the files do not match the index (a new index would hide the damage),
-    if keys are broken, or if `out` is inside the dataset.
+    The dataset must be complete, must match its index (a new index would hide damage) and must have valid keys. `out`
+    must be outside the dataset.
     """
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
@@ -72,14 +72,14 @@ def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS
 
 
 def _within(store: Store, other: Store) -> bool:
-    """Whether a store is the other store or a folder inside it."""
+    """Whether a store is `other` or a folder inside `other`."""
     if store.folder is not None and other.folder is not None:
         return store.folder.resolve().is_relative_to(other.folder.resolve())
     return store == other or store.address.startswith(f"{other.address}/")
 
 
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
-    """Return how the result stores its frames. Raises UserError if only some of the sources have frames."""
+    """Return where the frames of the result are. Raises UserError if only some sources have frames."""
     states = {source.info.images for source in sources}
     if states == {"planned"} or images == "plan":
         return "planned"
@@ -96,5 +96,5 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
 
 
 def without_derived_rows(tables: SceneTables) -> SceneTables:
-    """Return a scene without craters, boulders, labels and measurements; seed and poses reproduce them."""
+    """Return a scene without craters, boulders, labels and measurements, which rendering reproduces."""
     return tables | {name: tables[name].slice(0, 0) for name in _DERIVED_TABLES}

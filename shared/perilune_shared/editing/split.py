@@ -22,7 +22,7 @@ class Split:
     """How a dataset is split."""
 
     by: SplitUnit = "scene"
-    """Unit that is never divided between splits: scene, trajectory or frame."""
+    """What is never divided between splits (the unit): scene, trajectory or frame."""
     val_share: float = 0.1
     """Share of the units in the validation split."""
     test_share: float = 0.1
@@ -40,12 +40,17 @@ def split_dataset(
 ) -> None:
     """Write a dataset whose scenes, trajectories or frames are randomly assigned to train, val and test.
 
-    By default scenes are assigned, with shares of 0.1. Units are identified by content, not by name
-    (`terrains_and_flights`). Scenes with the same terrain are one unit, even if their names or Sun directions differ;
-    so are all scenes on one elevation model. Trajectories of one flight are one unit, even if the flight was rendered
-    or developed several times. Frames with equal poses are one unit. `frame` with shares of 0.1 is the paper's
-    protocol: all three splits contain the same terrain, so test metrics are optimistic; `split_by` in dataset.json
-    records it. Each split with a share above 0 gets at least one unit. Raises UserError if there are too few units.
+    By default scenes are assigned, with shares of 0.1 for val and test. Units are identified by content, not by name
+    (`terrains_and_flights`):
+
+    - Scenes with the same terrain are one unit, even if their names or Sun directions differ. All scenes on one
+      elevation model are one unit.
+    - Trajectories of one flight are one unit, even if the flight was rendered or developed several times.
+    - Frames with equal poses over the same terrain are one unit.
+
+    The paper's protocol is `frame` with shares of 0.1. All three splits then contain the same terrain, so test metrics
+    are optimistic; `split_by` in dataset.json records the unit. Each split with a share above 0 gets at least one unit.
+    Raises UserError if there are too few units.
     """
     split = split or Split()
     by, val_share, test_share, seed = split.by, split.val_share, split.test_share, split.seed
@@ -75,10 +80,10 @@ def split_dataset(
 def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     """Return a table of all frames, sorted by frame_id, with the columns `terrain`, `flight` and `pose`.
 
-    `terrain` is the key from `terrain_of`. `pose` numbers the distinct pairs of position and rotation over a terrain.
-    Trajectories over one terrain are one flight if they have equal random seeds or a common pose, for example if a
-    flight was developed again or rendered with another Sun. A split by one of these columns puts equal values in one
-    split.
+    A split by one of these columns keeps rows with equal values together. `terrain` is the key from `terrain_of`.
+    `pose` is a number for each distinct position and rotation over a terrain; all cameras at one instant have the same
+    number. `flight` is a number for trajectories over one terrain that have equal random seeds or a common pose, for
+    example because a flight was developed again or rendered with another Sun.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
     rows = dataset.table("frames", [*columns, "camera", "frame_index"]).sort_by("frame_id")
@@ -95,7 +100,7 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     # Adding 0.0 turns negative zero into zero.
     poses = pd.DataFrame(np.hstack(numbers) + 0.0).assign(terrain=frames["terrain"].to_numpy())
     frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
-    if dataset.info.cameras is not None:  # the poses of all cameras at one instant are one unit
+    if dataset.info.cameras is not None:
         rig = rows.select(["scene_id", "trajectory_id", "camera", "frame_index"]).to_pylist()
         names = [trajectory_of_body(str(row["camera"]), row["trajectory_id"]) for row in rig]
         instant = frames.assign(body=names, index=rows["frame_index"].to_numpy()).groupby(["scene_id", "body", "index"])
@@ -107,10 +112,10 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
 
 
 def _connected_groups(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Return the group number of each row (N,): rows with the same unit or an equal value of any key share a group.
+    """Return the group number of each row (N,).
 
-    Rows that are connected only through other rows share a group too. `unit` (N,) has numbers from 0; `keys` are arrays
-    (N,).
+    Two rows are in one group if they have equal units or an equal value of any key, or if other rows connect them in
+    this way. `unit` (N,) has numbers from 0; each array in `keys` has the shape (N,).
     """
     root = np.arange(unit.max(initial=-1) + 1)
 

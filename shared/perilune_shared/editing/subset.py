@@ -38,10 +38,10 @@ def subset(
 ) -> None:
     """Write the frames and labels that fulfil all conditions, up to a limit.
 
-    A condition on columns of frames, trajectories and scenes selects frames. A condition that uses labels or craters
-    selects labels and keeps all frames. Scenes keep all craters and boulders, since these identify the terrain. With a
-    `limit`, trajectories are taken from each scene in turn until the limit is reached, so that the subset has many
-    terrains; the last trajectory is truncated. Raises UserError if no frame is left.
+    A condition that uses only columns of frames, trajectories and scenes selects frames. A condition that uses labels
+    or craters selects labels and keeps all frames. Scenes keep all craters and boulders, since these identify the
+    terrain. Up to `limit`, trajectories are taken from each scene in turn, so that the subset has many terrains; the
+    last trajectory may be truncated. Raises UserError if no frame fulfils the conditions.
     """
     conditions = [Condition(text) for text in where]
     on_frames = [condition for condition in conditions if not condition.on_labels]
@@ -76,7 +76,7 @@ def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
     for condition in on_frames:
         names = condition.columns_of_only("frames")
         if names is not None:
-            # Do not pass `where` to Dataset.table: it would skip row groups by statistics that were not checked.
+            # Dataset.table with `where` would skip row groups by statistics that `check_keys` does not check.
             rows = source.table("frames", list(dict.fromkeys(["scene_id", *names])))
             chosen = condition.holds(rows.rename_columns([f"frames.{name}" for name in rows.column_names]))
             scene_ids &= set(rows["scene_id"].filter(pa.array(chosen)).unique().to_pylist())
@@ -108,7 +108,7 @@ def _first_frames(source: Dataset, on_frames: Sequence[Condition], limit: Limit)
 
 
 def _all_hold(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
-    """Return for each row of a scene's frames or labels whether it fulfils all conditions (N,)."""
+    """Return for each row (N,) of a scene's frames or labels whether it fulfils all conditions."""
     mask = np.ones(len(rows), bool)
     if not conditions or not len(rows):
         return mask
@@ -120,7 +120,7 @@ def _all_hold(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Tab
 
 
 def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> pa.ChunkedArray:
-    """Return a column of a table of one scene, joined to rows of frames or labels."""
+    """Return a column of any table of a scene, with one value for each of `rows` (frames or labels)."""
     values = tables[table][name]
     if table == "scenes":
         return values.take(np.zeros(len(rows), np.int64))

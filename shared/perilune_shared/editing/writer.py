@@ -1,6 +1,7 @@
 """Write a new dataset atomically, scene by scene, for all editing commands.
 
-The row counts, the number of frames and split of each trajectory, and the split unit are recomputed from the rows.
+The writer recomputes from the rows: the number of rows of each table, the number of frames and the split of each
+trajectory, and `split_by` in dataset.json.
 """
 
 import contextlib
@@ -33,7 +34,7 @@ _PER_TRAJECTORY = ("frames", "labels")
 
 
 class DatasetWriter:
-    """Writer of a dataset; created by `new_dataset`."""
+    """Writer of a new dataset. Create it with `new_dataset`."""
 
     def __init__(self, store: Store, info: DatasetInfo, *, max_rows: int = MAX_ROWS_WRITTEN):
         self.store, self.info = store, info
@@ -49,8 +50,7 @@ class DatasetWriter:
         """Append one scene that has frames.
 
         Recomputes the number of frames and the split of each trajectory, and sets the paths at which `add_images`
-        stores the frames. Raises UserError unless the table scenes has exactly one row and the trajectory of each frame
-        exists.
+        stores the frames. Raises UserError unless there is exactly one scene and the trajectory of each frame exists.
         """
         check_scene("new dataset", tables)
         frames = with_new_paths(tables["frames"])
@@ -77,7 +77,7 @@ class DatasetWriter:
             self._tables.add(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
 
     def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
-        """Copy frames that are files from another dataset: `frames` are its rows, `names` maps old to new frame_ids.
+        """Write images of `source` as files: `frames` are its rows, `names` maps old to new frame_ids.
 
         With `link`, make hard links where the file system allows it.
         """
@@ -94,7 +94,7 @@ class DatasetWriter:
                     self._copy(source, row[f"{kind}_path"], frame_path(names[frame_id], kind), link=link)
 
     def add_scene_files(self, source: Dataset, scenes: pa.Table, scene_id: str, *, link: bool) -> None:
-        """Copy a scene's files, such as the hazard map: `scenes` is its row in `source`, `scene_id` the new id."""
+        """Copy a scene's files (hazard map): `scenes` is its row in `source`, `scene_id` its new id."""
         for kind in SCENE_FILE_KINDS:
             path = scenes[f"{kind}_path"][0].as_py()
             if path is not None:
@@ -107,20 +107,17 @@ class DatasetWriter:
             self.store.write(to, source.store.read(path, most_bytes=LARGEST_FRAME_BYTES), durable=False)
 
     def add_file(self, path: str, content: bytes) -> None:
-        """Write a file that is neither a table nor an image."""
+        """Write a file that is neither a table nor an image, such as a shard."""
         self.store.write(path, content, durable=False)
         self._index.append(index_rows([WrittenFile.of(path, content)]))
 
     def finish(self, out: Address) -> None:
-        """Write buffered rows, the index, then dataset.json.
-
-        Raises UserError about `out` if there are no frames.
-        """
+        """Write buffered rows, the index, then dataset.json. Raises UserError if there are no frames."""
         counts = self._tables.counts
         if not counts.frames:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
         self._index.append(index_rows(self._tables.finish()))
-        # One flight may occur twice: rendered, and developed again with another sensor.
+        # Trajectories with equal seeds over one terrain are one flight, e.g. developed again with another sensor.
         trajectory_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_trajectory.values())
         terrain_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
         unit: SplitUnit = "frame" if trajectory_in_two_splits else "trajectory" if terrain_in_two_splits else "scene"
@@ -138,12 +135,12 @@ def new_dataset(
     *,
     max_rows: int = MAX_ROWS_WRITTEN,
 ) -> Iterator[DatasetWriter]:
-    """Yield a writer for a new dataset; it appears at `out` only when the block succeeds.
+    """Yield a writer for a new dataset. The dataset appears at `out` only if the block succeeds.
 
-    Each table is one part, or several of at most `max_rows` rows. `info` provides the metadata
-    that is not computed from the rows. Raises UserError if there are no frames or `out` is not empty.
+    Each table becomes one part, or several parts of at most `max_rows` rows. `info` provides the metadata that is not
+    computed from the rows. Raises UserError if there are no frames or `out` is not empty.
     """
-    # Copies with replaced fields have not been validated.
+    # Pydantic does not validate copies with replaced fields.
     checked_info(json.loads(info.model_dump_json()), out)
     claim = info_bytes(info.model_copy(update={"complete": False, "index": ()}), out)
     with new_store(out, INFO_NAME, claim) as store:
@@ -153,14 +150,14 @@ def new_dataset(
 
 
 def check_scene(where: object, tables: SceneTables) -> None:
-    """Raise UserError about `where` unless there is exactly one scene and the trajectory of each frame exists."""
+    """Raise UserError unless there is exactly one scene and the trajectory of each frame exists."""
     scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
         raise UserError(where, "scenes", found, "one row for the scene; see `perilune-manifest validate`")
-    odd = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
-    if odd:
-        found = f"no {scenes[0].as_py()}/{min(odd)}"
+    missing = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
+    if missing:
+        found = f"no {scenes[0].as_py()}/{min(missing)}"
         raise UserError(where, "trajectories", found, "the trajectory of every frame; see `perilune-manifest validate`")
 
 
@@ -173,7 +170,7 @@ def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
 
 
 def with_new_paths(frames: pa.Table) -> pa.Table:
-    """Return frames with the file paths of the new dataset; the source dataset may use other paths."""
+    """Return frames with the file paths of a new dataset; a source dataset may have other paths."""
     ids = frames["frame_id"].to_pylist()
     for kind in IMAGE_KINDS:
         name = f"{kind}_path"
@@ -198,7 +195,7 @@ def of_trajectories(rows: pa.Table, trajectories: pa.Table) -> pa.Table:
 
 
 def _with_counts_and_splits(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
-    """Return the trajectories that have frames, with the number of frames and their common split."""
+    """Return the trajectories that have frames, with number of frames and split (null if frames differ)."""
     counted = frames.group_by("trajectory_id").aggregate(
         [("frame_id", "count"), ("split", "count_distinct"), ("split", "min")]
     )

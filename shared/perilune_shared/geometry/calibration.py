@@ -1,8 +1,9 @@
-"""Read a camera from a YAML file: perilune's own settings, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
+"""Read a camera from a YAML file: settings, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
 
-These programs put the centre of the top-left pixel at (0, 0) and perilune at (0.5, 0.5), so half a pixel is added to
-the principal point. Distortion is Brown-Conrady's (`plumb_bob`, `radtan`). The equidistant model (Kannala and Brandt
-2006, doi 10.1109/TPAMI.2006.153) is replaced by the Brown-Conrady distortion that fits best, if it fits within 0.05 px.
+In these calibrations the centre of the top-left pixel is at (0, 0). In perilune it is at (0.5, 0.5), so half a pixel is
+added to the principal point. The distortion model of perilune is Brown-Conrady (`plumb_bob`, `radtan`). An equidistant
+distortion (Kannala and Brandt 2006, doi 10.1109/TPAMI.2006.153) is replaced by the best-fitting Brown-Conrady
+distortion. The file is refused if the fit error exceeds 0.05 px.
 """
 
 import re
@@ -27,33 +28,33 @@ _BROWN = ("plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "br
 _EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
 _LARGEST_SIDE_PX = 100_000
 _LARGEST_FIT_PX = 0.05
-"""Maximum error of a Brown-Conrady distortion that replaces an equidistant one, pixels."""
+"""Maximum fit error of a Brown-Conrady distortion that replaces an equidistant distortion, pixels."""
 _WIDEST_RAD = np.radians(80)
 _HALF_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A camera from another program's file."""
+    """A camera from a calibration file of another program."""
 
     camera: Camera
     """Intrinsics."""
     rotation_camera_from_body: Array | None
-    """Rotation (3, 3) from the inertial unit's axes; None if the file has none."""
+    """Rotation (3, 3) from the frame of the inertial unit to the camera; None if the file states none."""
     position_in_body_m: tuple[float, float, float]
-    """Centre of projection in the inertial unit's frame, metres; 0 if the file has none."""
+    """Centre of projection in the frame of the inertial unit, metres; zeros if the file states none."""
 
 
 def read_camera_file(path: Path) -> Calibration | dict[str, Any]:
-    """Return the calibration in a file, or the plain mapping if the file has perilune's own settings.
+    """Return the calibration in a file, or the mapping in the file if it has settings of perilune.
 
-    Raises UserError if the file cannot be read as either.
+    The mapping is not validated. Raises UserError if the file is not YAML or its calibration is not supported.
     """
     content = _mapping(path)
     keys = {key.lower(): key for key in content}
     cameras = [key for key in content if re.fullmatch(r"cam\d+", key)]
     if len(cameras) > 1:
-        raise UserError(path, "camera", f"several of Kalibr: {', '.join(cameras)}", "a file with one of these sections")
+        raise UserError(path, "camera", f"several cameras: {', '.join(cameras)}", "a file with one of these sections")
     if cameras:
         section = content[cameras[0]]
         if not isinstance(section, dict):
@@ -79,7 +80,7 @@ def _mapping(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         raise UserError(path, "camera", "bytes that are not UTF-8", "a YAML file") from None
     if text.lstrip().startswith("<"):
-        raise UserError(path, "camera", "XML, as of OpenCV", "YAML: give cv::FileStorage a name that ends in .yaml")
+        raise UserError(path, "camera", "an XML file of OpenCV", "YAML: give cv::FileStorage a name that ends in .yaml")
     if "CAMERA_ID" in text and text.lstrip().startswith("#"):
         raise UserError(path, "camera", "COLMAP's cameras.txt", "a calibration of OpenCV, ROS or Kalibr, or fx_px ...")
     content = parse_yaml(_plain(text), path)
@@ -121,9 +122,9 @@ def _kalibr(path: Path, content: dict[str, Any]) -> Calibration:
 
 
 def _opencv(path: Path, content: dict[str, Any]) -> Calibration:
-    """Return the camera in a file of OpenCV's FileStorage or ROS's camera_calibration, or in a camera_info message.
+    """Return the camera in a file of OpenCV (FileStorage) or ROS (camera_calibration, camera_info).
 
-    Keys are in lower case.
+    The keys of `content` are in lower case.
     """
     name = next(name for name in _MATRIX if name in content)
     fx, skew, cx, zero, fy, cy, *last = _numbers(path, name, content[name], (9,))
@@ -140,11 +141,11 @@ def _opencv(path: Path, content: dict[str, Any]) -> Calibration:
     if content.get("fisheye_model") == 1:
         stated = stated or "equidistant"
     region = content.get("roi")
-    changes = [content.get("binning_x"), content.get("binning_y")]
-    if any(value not in (None, 0, 1) for value in changes):
-        raise UserError(path, "binning_x", changes[0], "0 or 1: the camera of the whole image")
+    for name in ("binning_x", "binning_y"):
+        if content.get(name) not in (None, 0, 1):
+            raise UserError(path, name, content[name], "0 or 1: a calibration without binning")
     if isinstance(region, dict) and any(region.get(key) for key in ("x_offset", "y_offset", "width", "height")):
-        raise UserError(path, "roi", region, "zeros: the camera of the whole image")
+        raise UserError(path, "roi", region, "zeros: a calibration of the whole image")
     pair = _numbers(path, "image size", size, (2,))
     return Calibration(_camera(path, pair, (fx, fy, cx, cy), stated, coefficients), None, (0.0, 0.0, 0.0))
 
@@ -159,7 +160,7 @@ def _camera(
 ) -> Camera:
     """Return a pinhole camera with distortion.
 
-    An unnamed distortion model follows from the number of coefficients.
+    Without the name of a model, the distortion is Brown-Conrady, but four coefficients then raise UserError.
     """
     width, height = (int(value) for value in size)
     if [width, height] != list(size) or not 1 <= min(size) <= max(size) <= _LARGEST_SIDE_PX:
@@ -192,7 +193,7 @@ def _fields(camera: Camera) -> tuple[int, int, float, float, float, float]:
 
 
 def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camera:
-    """Return the camera with the best-fitting Brown-Conrady distortion for an equidistant one.
+    """Return the camera with the Brown-Conrady distortion that best fits an equidistant distortion.
 
     Raises UserError if the fit error is too large.
     """
@@ -230,9 +231,9 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
 
 
 def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:
-    """Return finite numbers from a list, a list of lists or a mapping with `data`.
+    """Return the numbers in a list, a list of lists or a mapping with `data`.
 
-    Raises UserError on others.
+    Raises UserError on anything else, on infinite numbers, and unless the count is one of `lengths`.
     """
     if isinstance(value, dict):
         value = value.get("data")

@@ -22,8 +22,9 @@ from perilune_shared.geometry.frames import Array
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
-"""Default mounting: the camera looks along -Z_B, and its x axis points along X_B. If the body is level in O_L, this
-is the paper's "along the negative axis of Z_L"."""
+"""Default mounting: the camera looks along -Z_B, and its x axis points along X_B.
+
+For a level body this is the paper's viewing direction, "along the negative axis of Z_L"."""
 _MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""
 
@@ -59,9 +60,10 @@ class Camera:
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def project(self, points_camera_m: ArrayLike) -> Array:
-        """Project points (..., 3) in O_C, metres, to pixels (..., 2).
+        """Project points (..., 3) in O_C, metres, to image coordinates (..., 2), pixels.
 
-        NaN if the point is not in front of the camera, or is so far off the axis that the distortion folds back.
+        Returns NaN for a point that is not in front of the camera, or so far off the axis that the distortion folds
+        back.
         """
         p = np.asarray(points_camera_m, np.float64)
         z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
@@ -71,10 +73,10 @@ class Camera:
         return np.stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px], axis=-1)
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Return directions (..., 3) in O_C with z = 1 through pixels (..., 2); multiply by the depth z to get points.
+        """Return rays (..., 3), O_C, with z = 1 through image coordinates (..., 2), pixels.
 
-        Inverts the distortion with an error below 1e-10. NaN if no ray reaches the pixel before the distortion folds
-        back.
+        A ray times a depth is a point. The distortion is inverted with an error below 1e-10, in coordinates divided by
+        the focal length. Returns NaN if no ray reaches the pixel before the distortion folds back.
         """
         uv = np.asarray(pixels, np.float64)
         x = (uv[..., 0] - self.cx_px) / self.fx_px
@@ -84,17 +86,17 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def pixel_centres(self) -> Array:
-        """Return the image coordinates (height, width, 2) of all pixel centres."""
+        """Return the image coordinates (height, width, 2), pixels, of all pixel centres."""
         u, v = np.meshgrid(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
         return np.stack([u, v], axis=-1)
 
     def inside(self, pixels: ArrayLike) -> np.ndarray:
-        """Whether pixels (..., 2) are inside the image; false for NaN."""
+        """Whether image coordinates (..., 2), pixels, are inside the image; false for NaN."""
         uv = np.asarray(pixels, np.float64)
         return (uv[..., 0] >= 0) & (uv[..., 0] < self.width_px) & (uv[..., 1] >= 0) & (uv[..., 1] < self.height_px)
 
     def outline(self) -> Array:
-        """Return image coordinates (M, 2) along the outer edge of the image, half a pixel apart."""
+        """Return image coordinates (M, 2), pixels, along the edge of the image, half a pixel apart."""
         u, v = (np.linspace(0, size, 2 * size + 1) for size in (self.width_px, self.height_px))
         sides = [(u, 0 * u), (u, 0 * u + self.height_px), (0 * v, v), (0 * v + self.width_px, v)]
         return np.concatenate([np.stack(side, axis=-1) for side in sides])
@@ -104,10 +106,10 @@ class Camera:
         return bool(np.isnan(self.rays(self.outline())).any())
 
     def covering_pinhole(self) -> "Camera":
-        """Return a camera without distortion, with the same focal lengths, that covers the whole view of this camera.
+        """Return a camera without distortion that covers the whole view of this camera.
 
-        Its image extends this camera's image by whole pixels on each side where needed. Returns this camera if it has
-        no distortion. Raises ValueError if the distortion folds back inside the image.
+        The focal lengths are equal; the image is larger by whole pixels on each side where needed. Returns this camera
+        if it has no distortion. Raises ValueError if the distortion folds back inside the image.
         """
         if not any(self.distortion):
             return self
@@ -132,9 +134,9 @@ class Camera:
         return bool((seen >= -1e-6).all() and (seen <= np.array([self.width_px, self.height_px]) + 1e-6).all())
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Distort coordinates.
+        """Return distorted coordinates, or NaN where the distortion has folded back.
 
-        Returns NaN beyond the fold of the radial part or where the mapping reverses its orientation.
+        It has folded back beyond the fold of its radial part, or where its Jacobian determinant is not positive.
         """
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
@@ -180,7 +182,7 @@ class Camera:
         return np.where(converged, x, np.nan), np.where(converged, y, np.nan)
 
     def _radial_table(self, largest: float) -> Array:
-        """Tabulate radii before and after radial distortion (2, 2000), ascending, to about `largest` or to the fold."""
+        """Return ascending radii before and after radial distortion (2, 2000), up to `largest` or the fold."""
         k1, k2, _, _, k3 = self.distortion
         fold = _fold_radius(self.distortion)
         end = min(fold, 1.0)
@@ -193,7 +195,7 @@ class Camera:
 
 @lru_cache
 def _fold_radius(distortion: Distortion) -> float:
-    """Return the smallest r > 0 at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) has a maximum, or infinity."""
+    """Return the smallest r > 0 where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing, or infinity."""
     k1, k2, _, _, k3 = distortion
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     turns = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
@@ -201,6 +203,6 @@ def _fold_radius(distortion: Distortion) -> float:
 
 
 def camera_from_site(points_site_m: ArrayLike, position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> Array:
-    """Transform points (..., 3) from O_L to O_C, metres, for a camera at position_m (3,) in O_L."""
+    """Transform points (..., 3) from O_L to O_C, metres, for a camera at `position_m` (3,), O_L."""
     offset = np.asarray(points_site_m, np.float64) - np.asarray(position_m, np.float64)
     return offset @ np.asarray(rotation_camera_from_site, np.float64).T

@@ -1,9 +1,10 @@
-"""Project circles in space to ellipses in the image: exactly without lens distortion, by a fit with distortion.
+"""Project circles in space to ellipses in the image: exactly, or by a fit if the lens distorts.
 
 A circle with centre c, radius r and normal n is the set c + r (cos t p + sin t q), where p and q span its plane. Its
 image is the conic H^-T diag(1, 1, -1) H^-1 with H = K [r p, r q, c] (Hartley & Zisserman, Multiple View Geometry,
-2nd ed., section 8.1; for craters Christian et al. 2021, doi 10.1007/s40295-021-00287-8). The image of the circle's
-centre is not the centre of the ellipse. The distorted image of a circle is not an ellipse; an ellipse is fitted to it.
+2nd ed., section 8.1; for craters Christian et al. 2021, doi 10.1007/s40295-021-00287-8). The centre of the circle is
+not projected to the centre of the ellipse. If the lens distorts, the image of a circle is not an ellipse, so an ellipse
+is fitted to it.
 """
 
 from dataclasses import dataclass
@@ -21,28 +22,28 @@ _UNIT_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 @dataclass(frozen=True, slots=True)
 class Ellipses:
-    """N ellipses in the image; NaN if the image of the circle is not an ellipse."""
+    """N ellipses in the image; NaN where the image of a circle is not an ellipse."""
 
     cx_px: Array
-    """Centre, pixels from the left edge (N,)."""
+    """Centres (N,), pixels from the left edge."""
     cy_px: Array
-    """Centre, pixels from the top edge (N,)."""
+    """Centres (N,), pixels from the top edge."""
     a_px: Array
-    """Semi-major axis, pixels (N,)."""
+    """Semi-major axes (N,), pixels."""
     b_px: Array
-    """Semi-minor axis, pixels (N,)."""
+    """Semi-minor axes (N,), pixels."""
     theta_rad: Array
-    """Direction of the semi-major axis, from x towards y, in [0, pi) (N,)."""
+    """Directions (N,) of the semi-major axes, from x towards y, in [0, pi)."""
 
     def bounding_boxes(self) -> Array:
-        """Return tight boxes (N, 4) of the whole ellipses as x0, y0, x1, y1, pixels, not clipped to the image."""
+        """Return the tight boxes (N, 4) x0, y0, x1, y1 of the ellipses, pixels, not clipped to the image."""
         cos, sin = np.cos(self.theta_rad), np.sin(self.theta_rad)
         half_w = np.hypot(self.a_px * cos, self.b_px * sin)
         half_h = np.hypot(self.a_px * sin, self.b_px * cos)
         return np.stack([self.cx_px - half_w, self.cy_px - half_h, self.cx_px + half_w, self.cy_px + half_h], axis=-1)
 
     def radius_px(self) -> Array:
-        """Return the radius of the circle of equal area, sqrt(a b), pixels (N,)."""
+        """Return the radii (N,) of the circles of equal area, sqrt(a b), pixels."""
         return np.sqrt(self.a_px * self.b_px)
 
 
@@ -59,11 +60,14 @@ def plane_basis(normals: ArrayLike) -> tuple[Array, Array]:
 
 
 def rim_points(centres_m: ArrayLike, normals: ArrayLike, radii_m: ArrayLike, n_points: int) -> Array:
-    """Return points (N, n_points, 3) evenly spaced on N circles with centres (N, 3), normals (N, 3), radii (N,)."""
+    """Return evenly spaced points (N, n_points, 3) on N circles.
+
+    Circles have centres (N, 3), metres, unit normals (N, 3) and radii (N,), metres.
+    """
     p, q = plane_basis(normals)
     angle = 2 * np.pi * np.arange(n_points) / n_points
-    round_trip = np.cos(angle)[:, None] * p[:, None, :] + np.sin(angle)[:, None] * q[:, None, :]
-    return np.asarray(centres_m)[:, None, :] + np.asarray(radii_m)[:, None, None] * round_trip
+    unit_circles = np.cos(angle)[:, None] * p[:, None, :] + np.sin(angle)[:, None] * q[:, None, :]
+    return np.asarray(centres_m)[:, None, :] + np.asarray(radii_m)[:, None, None] * unit_circles
 
 
 def project_circles(
@@ -71,9 +75,10 @@ def project_circles(
 ) -> Ellipses:
     """Project N circles in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3).
 
-    With distortion, fit an ellipse to 64 points of the rim by least squares. The points are within 0.05 px of the
-    ellipse for radii up to 50 px and 5 px of distortion in the corners of 256 px images. NaN if the image is not an
-    ellipse: the circle reaches behind the camera or past the fold of the distortion, or is seen edge on.
+    If the lens distorts, an ellipse is fitted to 64 points of the circle by least squares. The points are within
+    0.05 px of the ellipse for radii up to 50 px and distortions up to 5 px in the corners of 256 px images. Returns NaN
+    if the image is not an ellipse: the circle reaches behind the camera or past the fold of the distortion, or is seen
+    edge on.
     """
     c, n = np.asarray(centres_camera_m, np.float64), np.asarray(normals_camera, np.float64)
     r = np.asarray(radii_m, np.float64)
@@ -94,9 +99,12 @@ def project_circles(
 
 
 def _exact(camera: Camera, c: Array, h: Array, bad: Array) -> Ellipses:
-    """Project circles with centres c (N, 3) and matrices [r p, r q, c] (N, 3, 3); undefined if `bad` (N,)."""
+    """Project circles without distortion; results are undefined where `bad` (N,) is true.
+
+    `c` (N, 3) are the centres, `h` (N, 3, 3) the matrices [r p, r q, c].
+    """
     h[bad] = np.eye(3)
-    # Use image coordinates relative to the projected centre: otherwise small, distant ellipses lose precision.
+    # Image coordinates relative to the projected centre keep the precision of small, distant ellipses.
     u0, v0 = (
         np.where(bad, 0, c[:, 0] / np.where(bad, 1, c[:, 2])),
         np.where(bad, 0, c[:, 1] / np.where(bad, 1, c[:, 2])),
@@ -115,8 +123,8 @@ def _exact(camera: Camera, c: Array, h: Array, bad: Array) -> Ellipses:
 def fit_ellipses(points_px: ArrayLike) -> Ellipses:
     """Fit N ellipses to N sets of M points (N, M, 2), pixels, by direct least squares.
 
-    The points are first whitened (shifted, rotated and scaled) so that they are close to a unit circle. There the
-    algebraic residual is about twice the distance, and the condition does not depend on size, position or flatness.
+    The points are first shifted, rotated and scaled so that they are close to a unit circle. There the algebraic
+    residual is about twice the distance, and the condition number does not depend on size, position or flatness.
     """
     points = np.asarray(points_px, np.float64)
     middle = points.mean(axis=1)

@@ -40,8 +40,8 @@ def matrix_from_quaternion(rotation_wxyz: ArrayLike) -> Array:
 def quaternion_from_matrix(rotation: ArrayLike) -> Array:
     """Return the quaternion (4,) with w >= 0 of a rotation matrix (3, 3).
 
-    Computed as the eigenvector of the largest eigenvalue (Bar-Itzhack 2000, doi 10.2514/2.4654), which is also accurate
-    for rotations by 180 degrees.
+    It is computed as an eigenvector (Bar-Itzhack 2000, doi 10.2514/2.4654), which is accurate for all rotations,
+    including those by 180 degrees.
     """
     r = np.asarray(rotation, dtype=np.float64)
     k = np.array(
@@ -68,10 +68,10 @@ def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
 
 
 def rotation_vectors(rotation: ArrayLike) -> Array:
-    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3), for angles well below 180
-    degrees.
+    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3).
 
-    The angle is computed from sine and cosine; the arc cosine alone is inexact for small angles.
+    Use it for angles well below 180 degrees. The angle is computed from sine and cosine, since the arc cosine alone is
+    inexact for small angles.
     """
     r = np.asarray(rotation, np.float64)
     skew = r - np.swapaxes(r, -1, -2)
@@ -82,19 +82,17 @@ def rotation_vectors(rotation: ArrayLike) -> Array:
 
 
 def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
-    """Return the unit vector (3,) in O_L towards the Sun.
-
-    The azimuth is clockwise from north, so 90 degrees is east.
-    """
+    """Return the unit vector (3,), O_L, towards the Sun; the azimuth is clockwise from north."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     east, north = np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation)
     return np.array([-east, -north, np.sin(elevation)])
 
 
 def earth_direction(latitude_deg: float, longitude_deg: float) -> Array:
-    """Return the unit vector (3,) in O_L towards the Earth's mean position, above latitude 0, longitude 0.
+    """Return the unit vector (3,), O_L, from a site towards the mean position of the Earth.
 
-    Approximation: ignores libration (up to about 8 degrees) and the parallax of the site (up to 0.3 degrees).
+    The Earth is on average above latitude 0, longitude 0. Libration (up to about 8 degrees) and the parallax of the
+    site (up to 0.3 degrees) are neglected.
     """
     latitude, longitude = np.radians([latitude_deg, longitude_deg])
     west, south = np.sin(longitude), np.sin(latitude) * np.cos(longitude)
@@ -104,10 +102,10 @@ def earth_direction(latitude_deg: float, longitude_deg: float) -> Array:
 def selenographic_from_site(
     x_m: ArrayLike, y_m: ArrayLike, latitude_deg: float, longitude_deg: float
 ) -> tuple[Array, Array]:
-    """Convert x and y in O_L, metres, to latitude and longitude, degrees, for a site at the given coordinates.
+    """Convert x and y in O_L, metres, to latitude and longitude, degrees.
 
-    Inverse of `site_from_selenographic`. The plane maps to the sphere by an azimuthal equidistant projection about
-    the site: distance and bearing from the site are preserved. At a pole, where "towards the south pole" is
+    Inverse of `site_from_selenographic`; the site is at (latitude_deg, longitude_deg). The projection is azimuthal
+    equidistant: it preserves distance and bearing from the site. At a pole, where "towards the south pole" is
     ambiguous, -Y is along the meridian longitude_deg.
     """
     west, south = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
@@ -128,7 +126,10 @@ def selenographic_from_site(
 def site_from_selenographic(
     point_latitude_deg: ArrayLike, point_longitude_deg: ArrayLike, latitude_deg: float, longitude_deg: float
 ) -> tuple[Array, Array]:
-    """Convert points on the sphere to x and y in O_L, metres, for a site at (latitude_deg, longitude_deg)."""
+    """Convert latitudes and longitudes, degrees, to x and y in O_L, metres.
+
+    Inverse of `selenographic_from_site`; the site is at (latitude_deg, longitude_deg).
+    """
     lat, lon = (
         np.radians(np.asarray(point_latitude_deg, np.float64)),
         np.radians(np.asarray(point_longitude_deg, np.float64)),

@@ -7,7 +7,10 @@ from perilune_shared.geometry.inertial_grades import HOUR_S, STANDARD_GRAVITY_MP
 
 
 def drawn_errors(errors: InertialErrors, interval_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draw errors of mean angular rates, rad/s, and of mean specific forces, m/s^2, over N intervals: (N, 3) each."""
+    """Draw errors (N, 3) of mean angular rates, rad/s, and (N, 3) of mean specific forces, m/s^2.
+
+    Each rate and force is the mean over one of the N intervals.
+    """
     per_s, per_root_s = np.radians(1) / HOUR_S, 1 / np.sqrt(HOUR_S)
     mg = STANDARD_GRAVITY_MPS2 / 1000
     gyro = _drawn(
@@ -28,9 +31,9 @@ def drawn_errors(errors: InertialErrors, interval_s: Array, rng: np.random.Gener
 
 
 def _drawn(rng: np.random.Generator, interval_s: Array, bias: float, walk: float, noise: float) -> Array:
-    """Draw errors (N, 3) for the standard deviations of the bias, its random walk and white noise.
+    """Draw errors (N, 3) from the standard deviations of the bias, its random walk and the white noise.
 
-    `walk` and `noise` (of the integrated quantity) are per square root of a second.
+    `walk`, and `noise` of the integrated quantity, are per square root of a second.
     """
     size = len(interval_s), 3
     root = np.sqrt(interval_s)[:, None]

@@ -1,4 +1,4 @@
-"""Errors of inertial measurement units by grade, for the simulation of the table `inertial` and for filters.
+"""Errors of inertial measurement units by grade, to simulate the table `inertial` and for filters.
 
 Each axis has white noise and a bias that starts at a random value and follows a random walk. Scale factors,
 misalignment and quantisation are not simulated.
@@ -15,18 +15,18 @@ STANDARD_GRAVITY_MPS2 = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class InertialErrors:
-    """Errors of an inertial measurement unit, standard deviations on each axis."""
+    """Errors of an inertial measurement unit: standard deviations, on each axis."""
 
     gyro_bias_deg_per_h: float
     """Bias of the angular rate at the start, degrees per hour."""
     gyro_bias_walk_deg_per_h: float
-    """Random walk of this bias in one hour, degrees per hour."""
+    """Random walk of the angular rate's bias over one hour, degrees per hour."""
     angular_random_walk_deg: float
     """White noise of the angular rate: angle after integration over one hour, degrees."""
     accelerometer_bias_mg: float
     """Bias of the specific force at the start, thousandths of standard gravity."""
     accelerometer_bias_walk_mg: float
-    """Random walk of this bias in one hour, thousandths of standard gravity."""
+    """Random walk of the specific force's bias over one hour, thousandths of standard gravity."""
     velocity_random_walk_mps: float
     """White noise of the specific force: velocity after integration over one hour, metres per second."""
 
@@ -35,6 +35,8 @@ GRADES: dict[InertialGrade, InertialErrors] = {
     "tactical": InertialErrors(10.0, 10.0, 0.1, 1.0, 1.0, 0.06),
     "navigation": InertialErrors(0.01, 0.01, 0.002, 0.05, 0.05, 0.01),
 }
-"""Errors of each grade: biases and noise within the ranges that Groves (Principles of GNSS, Inertial, and Multisensor
-Integrated Navigation Systems, 2nd edition, 2013, section 4.4) gives for tactical and aviation grade. The random walks
-are our own choice: in one minute a bias changes by an eighth of its size."""
+"""Errors of each grade.
+
+Biases and noise are within the ranges for tactical and aviation grade in Groves (Principles of GNSS, Inertial, and
+Multisensor Integrated Navigation Systems, 2nd edition, 2013, section 4.4). The random walks are our own choice: in one
+minute a bias changes by about an eighth of its size."""

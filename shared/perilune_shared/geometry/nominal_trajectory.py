@@ -1,8 +1,8 @@
 """The nominal trajectory: the planned path, which the guidance knows before the flight.
 
-The paper uses "a parabola" from 1500 m to 200 m without details. Here the vertical speed is constant and the
-horizontal speed decreases linearly to zero at the end point. The path is a parabola with a vertical axis that ends
-vertically: p(t) = p0 + v0 t + a t^2 / 2.
+The paper uses "a parabola" from 1500 m to 200 m without details. Here the vertical speed is constant, and the
+horizontal speed decreases linearly to zero at the end point: p(t) = p0 + v0 t + a t^2 / 2 with a horizontal a. The path
+is a parabola with a horizontal axis; it is vertical at its end.
 """
 
 from collections.abc import Sequence
@@ -36,10 +36,9 @@ class NominalTrajectory:
         azimuth_deg: float,
         duration_s: float,
     ) -> "NominalTrajectory":
-        """Create a trajectory to a point above the site.
+        """Create a trajectory that ends above the site.
 
-        It starts `downrange_m` from the site; seen from the site, the start is in the direction `azimuth_deg`,
-        clockwise from north.
+        The start is `downrange_m` from the site, in the direction `azimuth_deg` (from the site, clockwise from north).
         """
         azimuth = np.radians(azimuth_deg)
         x, y = -np.sin(azimuth) * downrange_m, -np.cos(azimuth) * downrange_m
@@ -53,7 +52,7 @@ class NominalTrajectory:
 
     @property
     def approach_deg(self) -> int:
-        """Direction from the site to the start, as the function `approach_deg` returns it."""
+        """Direction from the site to the start, whole degrees clockwise from north."""
         return approach_deg(self.position_m)
 
     def position_at(self, time_s: ArrayLike) -> Array:
@@ -69,8 +68,8 @@ class NominalTrajectory:
 
 
 def approach_deg(start_m: Sequence[float]) -> int:
-    """Return the direction from the site to a start (3,) in O_L, whole degrees clockwise from north.
+    """Return the direction from the site to the start (3,), O_L, whole degrees clockwise from north.
 
-    It is 0 if the start is above the site.
+    Returns 0 if the start is directly above the site.
     """
     return round(float(np.degrees(np.arctan2(-start_m[0], -start_m[1])))) % 360 if any(start_m[:2]) else 0

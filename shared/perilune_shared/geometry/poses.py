@@ -25,11 +25,11 @@ class Pose:
     """Position, rotation and velocity of a camera."""
 
     position_m: Array
-    """Position, O_L, metres (3,)."""
+    """Position (3,), O_L, metres."""
     rotation_camera_from_site: Array
     """Rotation matrix (3, 3); O_C has x to the right of the image, y down and z along the line of sight."""
     velocity_mps: Array
-    """Velocity, O_L, metres per second (3,); causes motion blur."""
+    """Velocity (3,), O_L, metres per second; causes motion blur."""
 
     @property
     def rotation_wxyz(self) -> Array:
@@ -49,10 +49,11 @@ class Pose:
 
 
 def look_down(altitude_m: float, tilt_deg: float = 0.0, azimuth_deg: float = 0.0) -> Pose:
-    """Return the pose of a camera above the site that looks down, tilted from straight down.
+    """Return the pose of a camera above the site that looks down, with an optional tilt.
 
-    `altitude_m` is the height above the site. The line of sight leans by `tilt_deg` (0 to 180) towards `azimuth_deg`,
-    and so does the top of the image: by default north is up. Raises UserError on values outside these ranges.
+    `altitude_m` is the height above the site. The line of sight is tilted by `tilt_deg` (0 to 180) from straight down
+    towards `azimuth_deg`. The top of the image points towards `azimuth_deg` too, so by default north is up. Raises
+    UserError on values out of range.
 
         pose = look_down(altitude_m=800, tilt_deg=10)
     """
@@ -66,12 +67,12 @@ def look_down(altitude_m: float, tilt_deg: float = 0.0, azimuth_deg: float = 0.0
 def look_at(position_m: ArrayLike, target_m: ArrayLike = (0.0, 0.0, 0.0)) -> Pose:
     """Return the pose of a camera at `position_m` that looks at `target_m`, both (3,), O_L, metres.
 
-    The image is upright: its top shows the ground farthest from the camera, or is north if the camera looks straight
-    down. Raises UserError if position and target are equal, or if one of them is not three finite numbers.
+    The top of the image shows the ground that is farthest from the camera. If the camera looks straight down, north is
+    up. Raises UserError if position and target are equal, or if one of them is not three finite numbers.
 
         pose = look_at(position_m=(300, 0, 500))
     """
-    position, target = _place("position_m", position_m), _place("target_m", target_m)
+    position, target = _position("position_m", position_m), _position("target_m", target_m)
     west, south, up = (target - position).tolist()
     away = math.hypot(west, south)
     if away == 0 and up == 0:
@@ -89,11 +90,11 @@ def descent(
     azimuth_deg: float = 0.0,
     duration_s: float = 65.0,
 ) -> list[Pose]:
-    """Return poses along a parabola to a point above the site, with their velocities.
+    """Return poses, with velocities, along a parabola that ends above the site.
 
-    The camera looks straight down. Trajectory and attitude are the nominal ones of datasets, without perturbations
-    (`NominalTrajectory.parabola`), so south is up in the images. The trajectory starts `downrange_m` from the site, in
-    the direction `azimuth_deg`. Frames are evenly spaced in time. Raises UserError on values out of range.
+    The poses are those of a dataset without perturbations (`NominalTrajectory.parabola`): the camera looks straight
+    down, and south is up in the images. The trajectory starts `downrange_m` from the site, in the direction
+    `azimuth_deg`. Frames are evenly spaced in time. Raises UserError on values out of range.
 
         poses = descent(n_frames=20, start_altitude_m=1000)
     """
@@ -112,21 +113,21 @@ def descent(
 
 
 def _rotation(tilt_rad: float, azimuth_rad: float) -> Array:
-    """Return rotation_camera_from_site (3, 3) for a line of sight that leans from straight down towards an azimuth."""
+    """Return rotation_camera_from_site (3, 3) for a line of sight at a tilt towards an azimuth."""
     sine, cosine = math.sin(azimuth_rad), math.cos(azimuth_rad)
     sight = np.array([-sine * math.sin(tilt_rad), -cosine * math.sin(tilt_rad), -math.cos(tilt_rad)])
     right = np.array([-cosine, sine, 0.0])
     return np.stack([right, np.cross(sight, right), sight])
 
 
-def _check(where: str, field: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless a value is a number from `least` to `most`."""
+def _check(where: str, field: str, value: float, low: float, high: float) -> None:
+    """Raise UserError unless a value is a number from `low` to `high`."""
     is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not is_number or not least <= value <= most:
-        raise UserError(where, field, value, f"a number from {least:g} to {most:g}")
+    if not is_number or not low <= value <= high:
+        raise UserError(where, field, value, f"a number from {low:g} to {high:g}")
 
 
-def _place(field: str, value: ArrayLike) -> Array:
+def _position(field: str, value: ArrayLike) -> Array:
     """Return a position as an array (3,). Raises UserError on anything but three finite numbers."""
     try:
         values = np.asarray(value, np.float64)

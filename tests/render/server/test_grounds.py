@@ -88,9 +88,9 @@ def test_clients_on_other_scenes_do_not_change_a_clients_frames(address, grounds
             image(second, scene)
             assert (image(first, 0) == plain).all()
         # By now scene 1 was forgotten, and is generated again.
-        assert len(grounds._kept) == MAX_KEPT and 1 not in grounds._kept
+        assert len(grounds._in_memory) == MAX_KEPT and 1 not in grounds._in_memory
         assert (image(first, 1) == own).all()
-        assert len(grounds._kept) == MAX_KEPT
+        assert len(grounds._in_memory) == MAX_KEPT
 
 
 def test_a_client_has_one_scene_in_the_queue(simulated):
@@ -108,7 +108,7 @@ def test_a_client_has_one_scene_in_the_queue(simulated):
 
 def test_a_scene_that_cannot_be_generated_is_an_error_for_those_who_ask_for_it(simulated, monkeypatch):
     grounds = Grounds(simulated, 3)
-    monkeypatch.setattr(Grounds, "_grown", lambda self, number: 1 / 0)
+    monkeypatch.setattr(Grounds, "_new_scene", lambda self, number: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         while grounds.simulated(1, "client") is None:
             pass

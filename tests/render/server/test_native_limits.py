@@ -147,20 +147,20 @@ def test_a_place_is_freed_by_idling(simulated):
         start = time.monotonic()
         assert other.scene().n_scenes == 1  # asks again until then
         assert time.monotonic() - start > 0.5
-        until(lambda: not running.native._places)
+        until(lambda: not running.native._admitted)
         assert idle.scene().n_scenes == 1  # connected again
 
 
 def test_a_full_queue_of_scenes_is_a_reason_to_ask_again(simulated, monkeypatch):
     monkeypatch.setattr("perilune_render.server.grounds.MAX_WAITING", 1)
     begin = threading.Event()
-    grown = Grounds._grown
+    grown = Grounds._new_scene
 
     def slow(self, number):
         begin.wait(20)
         return grown(self, number)
 
-    monkeypatch.setattr(Grounds, "_grown", slow)
+    monkeypatch.setattr(Grounds, "_new_scene", slow)
     grounds = Grounds(simulated, 5)
     with (
         NativeRunning(grounds) as running,

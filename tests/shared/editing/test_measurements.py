@@ -50,7 +50,7 @@ def test_merged_halves_give_the_dataset_back(nav, tmp_path):
     merge(halves, tmp_path / "whole")
     made = open_dataset(tmp_path / "whole")
     assert validate(made) == []
-    assert {each.place for each in differences(nav, made)} <= {"dataset.json", "trajectories", "frames"}
+    assert {each.table for each in differences(nav, made)} <= {"dataset.json", "trajectories", "frames"}
     assert made.info.counts.inertial == nav.info.counts.inertial
 
 
@@ -66,7 +66,7 @@ def test_packing_and_unpacking_keep_them(nav, tmp_path):
     pack(nav, tmp_path / "packed")
     unpack(open_dataset(tmp_path / "packed"), tmp_path / "files")
     made = open_dataset(tmp_path / "files")
-    assert {each.place for each in differences(nav, made)} <= {"dataset.json"}
+    assert {each.table for each in differences(nav, made)} <= {"dataset.json"}
     assert made.info.counts.inertial == nav.info.counts.inertial
 
 

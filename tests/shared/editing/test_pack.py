@@ -193,7 +193,7 @@ def test_diff_names_the_differences(drawn, tmp_path):
     assert differences(source, source) == []
     subset(source, tmp_path / "s", ["split != 'val'", "radius_px > 4"])
     split_dataset(open_dataset(tmp_path / "s"), tmp_path / "t", Split(by="frame"))
-    found = {(each.place, each.column): each for each in differences(source, open_dataset(tmp_path / "t"))}
+    found = {(each.table, each.column): each for each in differences(source, open_dataset(tmp_path / "t"))}
     assert found["scenes", ""].rows == 1 and found["scenes", ""].second == "-"
     n_small = source.table("labels", ["radius_px"], split="train").to_pandas()["radius_px"].le(4).sum()
     n_small += source.table("labels", ["radius_px"], split="test").to_pandas()["radius_px"].le(4).sum()
@@ -207,11 +207,11 @@ def test_repeated_rows_are_a_difference(little, tmp_path):
     twice = shutil.copytree(little, tmp_path / "twice")
     rewrite(twice, "labels", lambda rows: rows.append(dict(rows[2])))
     found = differences(open_dataset(little), open_dataset(twice))
-    assert [(each.place, each.rows, each.first, each.second) for each in found] == [("labels", 1, "-", "present")]
+    assert [(each.table, each.rows, each.first, each.second) for each in found] == [("labels", 1, "-", "present")]
     other = shutil.copytree(twice, tmp_path / "other")
     rewrite(other, "labels", lambda rows: rows[-1].update(radius_px=rows[-1]["radius_px"] + 1))
     found = differences(open_dataset(twice), open_dataset(other))
-    assert [(each.place, each.column, each.rows) for each in found] == [("labels", "radius_px", 1)]
+    assert [(each.table, each.column, each.rows) for each in found] == [("labels", "radius_px", 1)]
     assert differences(open_dataset(other), open_dataset(other)) == []
 
 

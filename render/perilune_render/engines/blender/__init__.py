@@ -1,4 +1,4 @@
-"""Rendering with Blender: the only folder that imports bpy."""
+"""Rendering with Blender. Only this folder imports bpy."""
 
 import contextlib
 import os
@@ -10,9 +10,9 @@ from pathlib import Path
 def _one_core() -> Iterator[None]:
     """Restrict this process to one core while the block runs (Linux).
 
-    Blender sizes its pool of threads by the cores that it may use when it starts. Each thread of the pool without work
-    spins while Cycles renders, so a rendering by one thread would occupy all cores. A pool for one core has no such
-    threads; Cycles still starts the number of threads in its settings.
+    When Blender starts, it creates a pool with one thread for each core that it may use. While Cycles renders, idle
+    threads of this pool spin, so even a rendering by one thread would occupy all cores. A pool for one core has no idle
+    threads. Cycles still starts the number of threads in its settings.
     """
     if not hasattr(os, "sched_setaffinity"):
         yield

@@ -1,7 +1,8 @@
 """Build shader nodes from Python arithmetic, so that one formula serves NumPy arrays and the shader.
 
-Operators and NumPy ufuncs applied to a `Symbol` add a Math node to the tree. A sum with a product becomes one node,
-since the run time of a shader grows with the number of nodes; unused nodes cost nothing.
+Each operator or NumPy ufunc applied to a `Symbol` adds a Math node to the tree. Adding to a product makes one node that
+multiplies and adds, since the run time of a shader grows with the number of nodes. Nodes without a link to the output
+cost nothing.
 """
 
 import numbers
@@ -30,7 +31,10 @@ _OPERATIONS = {
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
-    """A float value in a shader: the output socket of a node."""
+    """A float value in a shader: the output socket of a node.
+
+    `factors` holds the two factors if the value is a product, else it is empty.
+    """
 
     def __init__(self, tree: bpy.types.NodeTree, socket: bpy.types.NodeSocket, factors: tuple[Any, ...] = ()):
         self.tree = tree
@@ -58,7 +62,7 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 def at_least(value: Symbol, least: float) -> Symbol:
-    """The larger of a symbol and a number (np.maximum, whose type hints accept arrays only)."""
+    """The larger of a symbol and a number. The type hints of np.maximum accept only arrays."""
     return value.__array_ufunc__(np.maximum, "__call__", value, least)
 
 

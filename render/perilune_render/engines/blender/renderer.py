@@ -31,10 +31,10 @@ from perilune_shared.threads import usable_cores
 
 _FAR_M = 1e9
 BAND_PX = 0.2
-"""Largest image motion between two neighbouring bands of rows, which have one pose each, pixels."""
+"""Largest image motion between neighbouring bands of rows, pixels. All rows of a band are rendered from one pose."""
 _MIN_FREE_BYTES = 16_000_000
 _LIT = 1e-4
-"""Direct light above which a pixel counts as sunlit. In shadow, only earthshine is direct, and it is weaker."""
+"""Direct light above which a pixel counts as sunlit. Earthshine is also direct light, but it is weaker."""
 
 
 _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
@@ -42,16 +42,16 @@ _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 
 
 class Renderer:
-    """Renders frames of one scene.
+    """Renders frames of one scene with Cycles; an `Engine` of `perilune_render.engines.frame_source`.
 
-    Use as a context manager: it holds a temporary folder and Blender's only scene. If the ground is too large for one
-    mesh, each trajectory has several meshes, its levels (`perilune_render.terrain.levels`). The height of the camera
-    determines the level that a frame shows. Blender holds the mesh of one level at a time, so render frames in an order
-    with few changes of level.
+    Use a Renderer as a context manager: it holds a temporary folder and Blender's only scene. `camera` has no
+    distortion, `sun` (3,) is the unit vector towards the Sun, O_L.
 
-    It is an `Engine` of `perilune_render.engines.frame_source`: `camera` has no distortion, `sun` (3,) is the unit
-    vector towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only
-    one scene.
+    If the ground is too large for one mesh, each trajectory has several meshes, its levels
+    (`perilune_render.terrain.levels`). The height of the camera determines the level that a frame shows. Blender holds
+    the mesh of one level at a time, so render frames in an order with few changes of level.
+
+    Raises RuntimeError if another Renderer is open in this process, since Blender holds only one scene.
     """
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
@@ -106,7 +106,7 @@ class Renderer:
     def close(self) -> None:
         """Remove the temporary folder and release Blender for another Renderer.
 
-        `render` then raises RuntimeError.
+        After this, `render` raises RuntimeError.
         """
         self._folder.cleanup()
         _open.discard(self)
@@ -114,11 +114,11 @@ class Renderer:
     def render(
         self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0
     ) -> Radiance:
-        """Render one frame: radiance factor averaged over each pixel, and depth of the ray through its centre.
+        """Render one frame: mean radiance factor of each pixel, and depth of the ray through its centre.
 
-        With dataset.render.exr, this ray also gives the normal; otherwise the normal is the mean over the pixel's
-        samples. `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable frame, and
-        RuntimeError if the Renderer is closed.
+        With dataset.render.exr, the ray through the centre also gives the normal. Otherwise, the normal is the mean
+        over the pixel's samples. `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable
+        frame, and RuntimeError if the Renderer is closed.
         """
         with self._rendering(float(position_m[2]), approach_deg) as path:
             blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
@@ -127,8 +127,8 @@ class Renderer:
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
         """Render one frame with a rolling shutter, in bands of rows with one pose each.
 
-        Between neighbouring bands, the image moves by at most BAND_PX, unless there is already one band for each row.
-        Depth is along the camera's axis at the band's pose. Raises the errors of `render`.
+        There are enough bands that the image moves by at most BAND_PX between neighbouring bands, but no more bands
+        than rows. Depth is along the camera's axis at the band's pose. Raises the errors of `render`.
         """
         middle = poses.pose_at(0.0)
         with self._rendering(float(middle[0][2]), approach_deg) as path:
@@ -160,7 +160,10 @@ class Renderer:
 
     @contextlib.contextmanager
     def _rendering(self, z_m: float, approach_deg: int) -> Iterator[Path]:
-        """Show the level for a height, and yield the path of the EXR; a failed write becomes an OSError."""
+        """Show the level for a camera height, and yield the path of the EXR.
+
+        Raises OSError if Blender cannot write the EXR.
+        """
         if self not in _open:
             raise RuntimeError("this Renderer is closed")
         if self._in_levels and self._scene.view is not None:
@@ -200,11 +203,11 @@ def rows_only(stage: bpy.types.Scene, first: int, last: int, n_rows: int) -> Ite
 
 @contextlib.contextmanager
 def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
-    """Configure a stage to send one ray through each pixel's centre, to within 1e-5 px, until the block ends.
+    """Configure a stage for one ray through each pixel's centre, to within 1e-5 px, in the block.
 
-    Cycles puts the first sample of a pixel at the centre of its filter for any seed, but it reads this centre from a
-    table, which is off by 5e-4 px for the box filter of one pixel. Cycles ignores `filter_width` for the box
-    filter, so a narrow Gaussian is used instead.
+    For any seed, Cycles puts the first sample of a pixel at the centre of the pixel filter. It reads this position from
+    a table, which is off by 5e-4 px for a box filter one pixel wide. A narrower filter is more accurate. Cycles ignores
+    `filter_width` for the box filter, so a narrow Gaussian is used.
     """
     narrow = {"samples": 1, "pixel_filter_type": "GAUSSIAN", "filter_width": 0.01}
     before = {name: getattr(stage.cycles, name) for name in narrow}
@@ -220,8 +223,8 @@ def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
 def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, light: LightConfig) -> None:
     """Configure Cycles: direct light and at most one bounce, linear float32.
 
-    The acceleration structure is kept between frames. A bounce traces one random ray per sample: with few samples, the
-    light in shadows is noisy.
+    The acceleration structure is kept between frames. A bounce traces one random ray per sample, so the light in
+    shadows is noisy with few samples.
     """
     render, cycles = stage.render, stage.cycles
     render.engine = "CYCLES"
@@ -233,7 +236,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     render.pixel_aspect_x, render.pixel_aspect_y = _pixel_aspect(camera)
     render.use_persistent_data = True
     render.use_file_extension = False
-    # By default, Blender uses the cores that were available when bpy was imported; the package allows one core then.
+    # By default, Blender uses the cores that were available when bpy was imported: a single core (`_one_core`).
     render.threads_mode = "FIXED"
     render.threads = settings.threads or usable_cores()
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"

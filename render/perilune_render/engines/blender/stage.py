@@ -29,7 +29,7 @@ def clear() -> bpy.types.Scene:
 
 
 def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bpy.types.Scene:
-    """Build a scene with its Sun in the direction `sun` (3,) of O_L; the camera is placed by `aim`."""
+    """Build the stage of a scene lit from the direction `sun` (3,), O_L; `aim` places the camera."""
     stage = sunlit_stage(config.light, camera, sun)
     stage.camera.data.clip_end = scene.grid.farthest_m
     ground = ground_object(scene)
@@ -62,7 +62,7 @@ def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.ty
     """A mesh from vertices (V, 3) and faces (F, k)."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(points))
-    # Blender copies whole arrays into attributes; filling vertices and loops takes a hundred times longer.
+    # Fill the attributes: Blender copies whole arrays into them. Filling vertices and loops takes 100 times as long.
     mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(points, np.float32).ravel())
     mesh.loops.add(faces.size)
     mesh.attributes[".corner_vert"].data.foreach_set("value", np.ascontiguousarray(faces, np.int32).ravel())
@@ -90,7 +90,7 @@ def boulders_object(scene: Scene) -> bpy.types.Object:
 
 
 def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | None = None) -> bpy.types.Material:
-    """A material whose radiance under the lamp "Sun" is the radiance factor of a law.
+    """A material whose radiance under the lamp "Sun" equals the radiance factor of a reflectance law.
 
     Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi. The colour for the radiance I/F
     is therefore I/F divided by mu0, evaluated at the shading point. Approximation: the colour for the Sun's direction
@@ -117,7 +117,10 @@ def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | No
 
 
 def lamp_object(name: str, towards: Array, angular_diameter_deg: float, suns: float = 1.0) -> bpy.types.Object:
-    """A lamp at infinity of irradiance `suns` x pi; with irradiance pi, radiance equals the radiance factor."""
+    """A lamp at infinity of irradiance `suns` x pi.
+
+    With irradiance pi, the rendered radiance equals the radiance factor.
+    """
     lamp = bpy.data.lights.new(name, "SUN")
     lamp.energy = suns * np.pi
     lamp.angle = np.radians(angular_diameter_deg)

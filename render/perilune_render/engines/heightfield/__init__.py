@@ -1,4 +1,1 @@
-"""A second renderer: rays cast over the ground as a height field, without Blender.
-
-Plain NumPy and numba.
-"""
+"""The engine `heightfield`: casts rays at the ground with NumPy and numba, without Blender."""

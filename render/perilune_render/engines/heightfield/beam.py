@@ -1,9 +1,9 @@
-"""Find where the rays of a block of pixels may begin, and the part of the mesh below.
+"""Find where the rays of a block of pixels may begin, and the part of the mesh that they hit.
 
-A raster of squares stores the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays
-of a block of pixels fill a pyramid. The search follows it downwards, layer by layer: as long as the ground and the
-boulders below a layer do not reach into the layer, no ray ends in it. All rays of the block then begin below these
-layers.
+A raster of squares stores the largest height of the ground and its boulders in each square. The squares of the next
+coarser level of the raster are twice as wide. The search follows the rays of a block downwards, layer by layer. If the
+ground and the boulders under a layer do not reach up into it, no ray ends in it. All rays of the block can then begin
+below the layers in which no ray ends.
 """
 
 from typing import NamedTuple
@@ -16,15 +16,15 @@ from perilune_render.provenance.kernels import njit
 BLOCK_PX = 4
 """Width and height of the blocks of pixels."""
 _SQUARES = 1024
-"""Number of squares along an axis, a power of two."""
+"""Number of squares along an axis of the finest level, a power of two."""
 _LEVEL = 2
-"""Level of the ground's pyramid from which the raster is built."""
+"""Level of the pyramid `Ground.top_m` from which the raster is built."""
 _LAYERS = 16
-"""Largest number of layers that are tried."""
+"""Largest number of layers that the search tries."""
 _THINNEST_M = 0.5
-"""Thickness of a layer below which the search ends."""
+"""The search ends when a layer is thinner than this, metres."""
 _MIN_FALL = -1e-3
-"""Vertical component above which a ray, with component 1 along the camera's axis, may fail to fall."""
+"""A ray falls if its vertical component is at most this value, with component 1 along the camera's axis."""
 _MARGIN_M = 0.01
 """Margin of heights and positions for rounding errors of the rays, metres."""
 
@@ -33,7 +33,8 @@ class Tops(NamedTuple):
     """The raster, as an argument of compiled functions. Positions are relative to the grid's centre."""
 
     top_m: np.ndarray
-    """Largest height in each square, by y and x, metres, float32, level after level; -inf without ground."""
+    """Largest height in each square, metres, float32; -inf without ground. The levels follow each other from the
+    finest; the squares of a level are ordered by y, then x."""
     edge_m: float
     """Distance from the grid's centre to the raster's edges, metres."""
     per_m: float
@@ -41,7 +42,7 @@ class Tops(NamedTuple):
 
 
 def tops_of(ground: Ground) -> Tops:
-    """The raster of a ground; takes some hundredths of a second for ten million vertices."""
+    """The raster of a ground. Takes some hundredths of a second for ten million vertices."""
     edge_m = float(ground.half_widths_m[-1])
     level = np.full((_SQUARES, _SQUARES), -np.inf, np.float32)
     _fill(ground, level, edge_m, _SQUARES / (2 * edge_m))
@@ -108,8 +109,8 @@ def _highest(tops, x0, x1, y0, y1):
 def begin_m(tops, ground, origin, basis, rectangle):
     """Height at which the rays through a rectangle of the image may begin, metres.
 
-    Returns inf if not all rays fall. The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2]. Above
-    this height no ray through the rectangle (u0, u1, v0, v1), pixels, hits anything.
+    Above this height, no ray through the rectangle (u0, u1, v0, v1), pixels, hits anything. The height is inf if not
+    all rays fall. The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2].
     """
     u0, u1, v0, v1 = rectangle
     x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf
@@ -127,7 +128,7 @@ def begin_m(tops, ground, origin, basis, rectangle):
     for _ in range(_LAYERS):
         if layer < _THINNEST_M:
             break
-        # Heights relative to the origin are negative, so the largest ratio gives the smallest coordinate.
+        # top and bottom are negative, so the largest ratio gives the smallest coordinate.
         top, bottom = z - origin[2], z - layer - origin[2]
         x0, x1 = min(top * x_high, bottom * x_high), max(top * x_low, bottom * x_low)
         y0, y1 = min(top * y_high, bottom * y_high), max(top * y_low, bottom * y_low)
@@ -141,10 +142,11 @@ def begin_m(tops, ground, origin, basis, rectangle):
 
 @njit(**WITHOUT_COUNTS)
 def only_part(ground, origin, basis, rectangle, begin):
-    """The part of the mesh that contains all rays of `begin_m` from the height `begin` to below the ground.
+    """The part of the mesh in which all rays through a rectangle of the image stay.
 
-    0 is the inner square, 1 to 4 are the sectors; -1 if the rays cross several parts, or if not all rays fall. `begin`
-    is in metres.
+    The rays are followed from the height `begin`, metres, down to the lowest ground. 0 is the inner square, 1 to 4 are
+    the sectors. The result is -1 if the rays cross several parts, or if not all rays fall. The other arguments are as
+    in `begin_m`.
     """
     u0, u1, v0, v1 = rectangle
     if begin > min(ground.highest_m, origin[2]):

@@ -12,8 +12,8 @@ The mesh from above, with y upwards. Diagonals separate the sectors (`surface` h
 
 `first_hit` cuts a ray at the border of the inner square and at the diagonals, and walks through one part after another:
 
-1. `_walk_inner`, `_walk_sector`: write the ray in the part's coordinates, in which the borders of cells are straight
-   lines, so the walk is exact. Step from block to block of the pyramid of largest heights:
+1. `_walk_inner`, `_walk_sector`: convert the ray to the coordinates of the part. In them, the borders of cells are
+   straight lines, so the walk is exact. Step from block to block of the pyramid of largest heights:
 
        ray  \
              \  =======    the ray stays above the block: pass it, and try a block of twice the size
@@ -23,7 +23,7 @@ The mesh from above, with y upwards. Diagonals separate the sectors (`surface` h
 2. `first_rock` (`cell`): in a cell, intersect the boulders that touch it.
 3. `cross_inner`, `cross_sector` (`cell`): in a cell, intersect its two triangles.
 
-The kernels are compiled into one function. Numbers stay in registers if they are scalars, so vectors are written out.
+The kernels are compiled into one function. Vectors are written out as scalars, since only scalars stay in registers.
 """
 
 import numpy as np
@@ -104,7 +104,7 @@ def _walk_inner(ground, rocks, horizon, ray, span):
             i = min(max(int(p0 + t * dp), low), min(((bi + 1) << level), cells) - 1)
         if i < 0 or j < 0 or i >= cells or j >= cells:
             break
-        # A falling ray is lowest where it leaves a block. If the larger block stopped it before, it still does.
+        # A falling ray only gets lower: if it came below the top of the larger block before, it still does.
         if level < coarsest and (rises or i >> (level + 1) != bi >> 1 or j >> (level + 1) != bj >> 1):
             level += 1
     if best < np.inf:
@@ -183,7 +183,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             if slope != 0:
                 ts = (u * d0 - a0) / slope
                 if ts < t - _BEHIND * (abs(t) + 1):
-                    # The crossing lies behind the current point, so the ray does not cross this line in the sector.
+                    # The crossing lies behind the current point, so the ray does not cross this spoke in the sector.
                     ts = np.inf
         end = max(min(min(tr, ts), t1), t)
         if level > 0:
@@ -222,7 +222,7 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
             ring = _ring_at(half, d0 + t * dd, first_ring, last_ring - 1)
         if ring < 0 or spoke < 0 or ring >= n_rings or spoke >= spokes:
             break
-        # A falling ray is lowest where it leaves a block. If the larger block stopped it before, it still does.
+        # A falling ray only gets lower: if it came below the top of the larger block before, it still does.
         if level < coarsest and (rises or ring >> (level + 1) != br >> 1 or spoke >> (level + 1) != bs >> 1):
             level += 1
     if best < np.inf:
@@ -234,8 +234,8 @@ def _walk_sector(ground, rocks, horizon, side, ray, span):
 def first_hit(ground, rocks, horizon, ray, span):
     """The first hit of a ray within span, (t0, t1): its parameter t and the facet.
 
-    Returns inf and `NO_FACET` without a hit. For a ray to the Sun's disc, `horizon` may be the Sun's horizon: if
-    the ray reaches a point that is surely lit, no hit lies ahead, and t is -inf. For other rays, `horizon` is None.
+    Returns inf and `NO_FACET` without a hit. For a ray to the Sun's disc, `horizon` may be the Sun's horizon. If the
+    ray then reaches a point that is surely lit, no hit lies ahead, and t is -inf. For other rays, `horizon` is None.
     """
     (x, y, z, dx, dy, dz, _), (t0, t1) = ray, span
     half, outer = ground.half_widths_m[0], ground.half_widths_m[-1]
@@ -283,9 +283,10 @@ def first_hit(ground, rocks, horizon, ray, span):
 
 @njit(**INLINED)
 def first_hit_in_part(ground, rocks, part, ray, span):
-    """Like `first_hit` without horizon, for a ray that stays in one part of the mesh from t0 to the lowest ground.
+    """Like `first_hit` without horizon, for a ray that stays in one part of the mesh.
 
-    The borders of the parts are not tested. The ray must fall and begin below the highest ground.
+    The borders of the parts are not tested. From t0, the ray must fall, begin below the highest ground, and stay in the
+    part down to the lowest ground.
     """
     piece = span[0], min(span[1], (ground.lowest_m - ray.z) / ray.dz)
     if part == 0:

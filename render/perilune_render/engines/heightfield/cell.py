@@ -1,7 +1,7 @@
-"""Intersect a ray with the contents of one cell of the mesh: its two triangles and the boulders that touch it.
+"""Intersect a ray with the contents of a mesh cell: two triangles and the boulders that touch it.
 
-Over a triangle the ray's height above the ground is linear. The ray crosses the ground where this height changes
-sign, so no ray slips between two triangles. A boulder is convex: an intersection of half-spaces.
+Over a triangle, the ray's height above the ground is linear. The ray crosses the ground where this height changes
+sign, so no ray slips between two triangles. A boulder is convex, so it is an intersection of half-spaces.
 """
 
 from typing import NamedTuple
@@ -49,14 +49,14 @@ class Ray(NamedTuple):
     dy: float
     dz: float
     start: Facet
-    """Facet that the ray starts on, which it cannot hit; `NO_FACET` for a ray from above the surface."""
+    """Facet on which the ray starts and which it cannot hit; `NO_FACET` for a ray from above the surface."""
 
 
 @njit(**WITHOUT_COUNTS)
 def enters_rock(rows, planes, k, ray, span):
-    """Parameter at which a ray enters boulder k within span, (t0, t1), and the face there.
+    """Parameter within span, (t0, t1), at which a ray enters boulder k, and the face that it enters.
 
-    Returns inf and -1 if it does not. `rows` and `planes` are the fields of `Rocks`.
+    Returns inf and -1 if the ray does not enter it. `rows` and `planes` are the fields of `Rocks`.
     """
     dx, dy, dz = ray.dx, ray.dy, ray.dz
     # First test a sphere around the boulder: most rays miss it.
@@ -72,8 +72,7 @@ def enters_rock(rows, planes, k, ray, span):
     ex = rows[k, 3] * dx + rows[k, 4] * dy + rows[k, 5] * dz
     ey = rows[k, 6] * dx + rows[k, 7] * dy + rows[k, 8] * dz
     ez = rows[k, 9] * dx + rows[k, 10] * dy + rows[k, 11] * dz
-    # A convex solid is the intersection of half-spaces: the ray is
-    # inside from where it enters the last half-space to where it leaves the first.
+    # The ray is inside the boulder from where it enters the last half-space to where it leaves the first.
     enter, leave, face = -np.inf, np.inf, -1
     for f in range(int(rows[k, 13]), int(rows[k, 14])):
         nx, ny, nz = planes[f, 0], planes[f, 1], planes[f, 2]
@@ -96,15 +95,12 @@ def enters_rock(rows, planes, k, ray, span):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def first_rock(rocks, cell, ray, span):
-    """First boulder of a cell that a ray enters: parameter, boulder and face.
-
-    Returns inf, -1 and -1 if there is none.
-    """
+    """First boulder of a cell that a ray enters: parameter, boulder and face; inf, -1 and -1 without one."""
     best, rock, face = np.inf, -1, -1
     for index in range(rocks.cell_start[cell], rocks.cell_start[cell + 1]):
         k = rocks.cell_rock[index]
         if k != ray.start.rock:
-            # A boulder reaches into other cells: a ray may enter it outside this one.
+            # Use the whole span: a boulder extends into other cells, and the ray may enter it there.
             t, f = enters_rock(rocks.rows, rocks.planes, k, ray, span)
             if t < best:
                 best, rock, face = t, k, f
@@ -113,10 +109,7 @@ def first_rock(rocks, cell, ray, span):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def crossing(above_0, above_1, t0, t1):
-    """Parameter at which a height above a triangle, linear from t0 to t1, changes sign.
-
-    Returns inf if it does not.
-    """
+    """Parameter at which a height that is linear from t0 to t1 changes sign; inf if it keeps its sign."""
     if (above_0 > 0) == (above_1 > 0):
         return np.inf
     return t0 + (t1 - t0) * above_0 / (above_0 - above_1)
@@ -126,7 +119,7 @@ def crossing(above_0, above_1, t0, t1):
 def cross_inner(ground, row, column, ray, span):
     """Where a ray crosses the triangles of a cell of the inner square: parameter and triangle.
 
-    Returns inf and -1 if nowhere. `ray` is in cells: x is a column, y a row, z a height in metres.
+    Returns inf and -1 without a crossing. `ray` is in cells: x is a column, y a row, z a height in metres.
     """
     vertex, n, (t0, t1) = ground.vertex, ground.n_half, span
     p0, dp, q0, dq = ray.x, ray.dx, ray.y, ray.dy
@@ -165,9 +158,10 @@ def cross_inner(ground, row, column, ray, span):
 
 @njit(**INLINED)
 def cross_sector(ground, side, cell, ray, span):
-    """Where a ray crosses the triangles of a cell (ring, spoke) of a sector: parameter and triangle, or inf and -1.
+    """Where a ray crosses the triangles of a cell (ring, spoke) of a sector: parameter and triangle.
 
-    `ray` is in the sector's coordinates: x is `along`, y is d, z a height, metres.
+    Returns inf and -1 without a crossing. `ray` is in the sector's coordinates: x is `along`, y is d, z a height,
+    metres.
     """
     vertex, half_widths, n, (t0, t1) = ground.vertex, ground.half_widths_m, ground.n_half, span
     ring, spoke = cell

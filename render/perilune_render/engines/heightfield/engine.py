@@ -1,8 +1,8 @@
-"""The engine `heightfield`: casts rays at the height field of a scene, with the light of the stage in Blender.
+"""The engine `heightfield`: casts rays at the height field of a scene, lit as in Blender.
 
 Light, photometry, albedo, the Sun's disc and the pixel's box filter match `perilune_render.engines.blender`.
-Deviations: NumPy draws the sample points in the pixel and on the disc; earthshine and light scattered by other ground
-are not rendered.
+Deviations: the sample points in the pixel and on the disc are drawn by NumPy; earthshine and light scattered by other
+ground are not rendered.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -25,19 +25,19 @@ from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array
 
 _TILE_PX = 64
-"""Width of the tiles in which an image is rendered one after another, pixels."""
+"""Width of the tiles in which an image is rendered, pixels."""
 _RAYS_AT_ONCE = 8192
-"""Largest number of rays in a tile of several rows; their photometry fits the cache of a core."""
+"""Largest number of rays in a tile of several rows. The photometry of this many rays fits into the cache of a core."""
 _LIT = 1e-4
 """Radiance factor above which a pixel counts as sunlit."""
 _RAYS_PER_VERTEX = 0.3
-"""Rays per ground vertex after which the horizon is computed; for fewer it costs more time than it saves."""
+"""Rays per ground vertex after which the horizon is computed. For fewer rays, this would take longer than it saves."""
 
 
 class HeightfieldEngine:
-    """Renders frames of one scene; an `Engine` of `perilune_render.engines.frame_source`.
+    """Renders frames of one scene by casting rays; an `Engine` of `perilune_render.engines.frame_source`.
 
-    Several may be open. Raises UserError if the configuration asks for light that this engine does not render.
+    Several of these engines may be open. Raises UserError if the configuration has bounce or earthshine.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class HeightfieldEngine:
         self._disc_rad = np.float32(np.radians(config.light.sun_angular_diameter_deg) / 2)
         self._far_m = scene.grid.farthest_m
         self.horizon, self._n_rays = NOWHERE, 0
-        # A single thread is the caller's: handing tiles to another thread would cost more than it gains.
+        # With one thread, the caller renders: passing tiles to another thread would cost more than it gains.
         self._threads = ThreadPoolExecutor(n_threads, "rays") if n_threads > 1 else None
 
     def close(self) -> None:
@@ -78,9 +78,9 @@ class HeightfieldEngine:
     def render(
         self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0
     ) -> Radiance:
-        """Render one frame: radiance factor averaged over each pixel; depth and normal of the ray through its centre.
+        """Render one frame: mean radiance factor of each pixel, depth and normal of its central ray.
 
-        The first sample of a pixel is at its centre. `approach_deg` is not used, since the ground is one mesh.
+        `approach_deg` is not used, since the ground is one mesh.
         """
         shape = self.camera.height_px, self.camera.width_px
         image = Radiance.empty(shape)
@@ -91,7 +91,7 @@ class HeightfieldEngine:
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
         """Render one frame with a pose for each row of the sensor.
 
-        Depth is along the camera's axis at this pose.
+        The depth of a pixel is along the camera's axis at the pose of its row.
         """
         shape = self.camera.height_px, self.camera.width_px
         whole, band = Radiance.empty(shape), Radiance.empty(shape)
@@ -107,7 +107,10 @@ class HeightfieldEngine:
         return whole
 
     def _drawn(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions of the samples in their pixels, and uniform numbers for the Sun's disc: (samples, h, w, 2) each."""
+        """Offsets of the samples from the pixel centres, and uniform numbers for the Sun's disc.
+
+        Both are (samples, h, w, 2) float32. The first sample of a pixel is at its centre.
+        """
         rng, shape = stream(seed, "rays"), (self._samples, self.camera.height_px, self.camera.width_px, 2)
         moved = rng.random(shape, np.float32) - np.float32(0.5)
         moved[0] = 0.0
@@ -143,9 +146,9 @@ class HeightfieldEngine:
             cast(each)
 
     def _horizon_now(self) -> Horizon:
-        """The horizon for a frame; `NOWHERE` until computing it saves time.
+        """The horizon, or `NOWHERE` while computing it would not save time.
 
-        Frames do not depend on the choice.
+        Frames do not depend on the horizon.
         """
         self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
         if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
@@ -154,6 +157,9 @@ class HeightfieldEngine:
 
 
 def rays_of(camera: Camera) -> Array:
-    """Basis (3, 3) of the rays of a camera without distortion: change per pixel of u and of v, ray at u = v = 0."""
+    """Basis (3, 3) of the rays of a camera without distortion.
+
+    The rows are the change of the ray per pixel of u, the change per pixel of v, and the ray at u = v = 0.
+    """
     start, right, down = camera.rays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     return np.stack([right - start, down - start, start])

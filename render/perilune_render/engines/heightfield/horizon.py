@@ -1,10 +1,10 @@
 """Where the ground is surely lit: points from which no ray to the Sun's disc can hit anything.
 
 A raster lies along the Sun's azimuth. For each square, it stores the height above which a point of the ground is surely
-lit. Such a point needs no shadow ray; the image does not change. The test has two parts:
+lit. A surely lit point needs no shadow ray, and the image does not change. A point is surely lit if both hold:
 
-- near, in the square of the point and the next ones towards the Sun: no facet rises towards the Sun as steeply as the
-  lowest ray to the disc, and no boulder touches the cells, so that the ray's height above the ground never decreases;
+- near, in the square of the point and the next squares towards the Sun: no facet rises towards the Sun as steeply as
+  the lowest ray to the disc, and no boulder touches the cells, so the ray's height above the ground never decreases;
 - far, in the squares beyond: their highest points are below the lowest ray to the disc.
 """
 
@@ -21,10 +21,10 @@ _MAX_SQUARES = 2048
 _CELLS = 4
 """Smallest width of a square, in cells of the inner square of the ground."""
 _NEAR = 4
-"""Number of squares of the near part."""
+"""Number of squares that count as near."""
 _WIDEST = 0.2
-"""Largest tangent of half the disc's range of azimuths. Up to it, rays to the disc deviate by less than one square to
-each side over the near part."""
+"""Largest tangent of half the disc's range of azimuths. Up to this tangent, rays to the disc deviate by less than one
+square to each side over the near squares."""
 _MARGIN = 1e-3
 """Margin of slopes for rounding errors of the rays."""
 _MARGIN_M = 0.01
@@ -35,8 +35,8 @@ class Horizon(NamedTuple):
     """The raster, as an argument of compiled functions. Positions are relative to the grid's centre."""
 
     clear_m: np.ndarray
-    """Height above which ground is surely lit, metres, infinite where it may be dark (N, N) float32: by square towards
-    the Sun, then by square across this direction, to the left."""
+    """Height above which ground is surely lit, metres, infinite where it may be dark (N, N) float32. The first index
+    counts squares towards the Sun, the second counts squares to the left of this direction."""
     along_x: float
     """x of the horizontal unit vector towards the Sun."""
     along_y: float
@@ -98,7 +98,7 @@ def _widened(raster: np.ndarray) -> np.ndarray:
 
 @njit(**WITHOUT_COUNTS)
 def _fill(ground, raster, steepest, turned, steep):
-    """Write into `raster.clear_m` the highest point of each square, and into `steep` whether it is rough.
+    """Write the largest height of each square into `raster.clear_m`, and mark rough squares in `steep`.
 
     A square is rough if it touches a cell with a boulder or a steep facet. A facet is steep if its slope is larger than
     `steepest` along any direction near the Sun's azimuth; `turned` is the sine of the largest angle to the azimuth.
@@ -112,7 +112,10 @@ def _fill(ground, raster, steepest, turned, steep):
 
 @njit(**WITHOUT_COUNTS)
 def _add_cell(ground, raster, cell, steepest, turned, steep):
-    """Add one cell to all squares that its bounds along and across the Sun's azimuth touch; see `_fill`."""
+    """Add one cell to all squares that its bounding box touches; see `_fill`.
+
+    The sides of the box are along and across the Sun's azimuth.
+    """
     (part, row, column), n, half, highest = cell, ground.n_half, ground.half_widths_m, raster.clear_m
     v0, v1 = vertex_index(part, row, column, 0, n), vertex_index(part, row, column, 1, n)
     v2, v3 = vertex_index(part, row, column, 2, n), vertex_index(part, row, column, 3, n)
@@ -152,7 +155,7 @@ def _add_cell(ground, raster, cell, steepest, turned, steep):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _against(first, second, turned):
-    """Upper bound on a triangle's slope along directions near the axis a, from two of its edges (a, b, z)."""
+    """Upper bound on a triangle's slope along directions near the axis a, from two edges (a, b, z)."""
     (a1, b1, z1), (a2, b2, z2) = first, second
     area = a1 * b2 - a2 * b1
     slope_a, slope_b = (z1 * b2 - z2 * b1) / area, (a1 * z2 - a2 * z1) / area
@@ -161,7 +164,7 @@ def _against(first, second, turned):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def surely_lit(horizon, x, y, z):
-    """Whether surely no ray from a point of the ground to the Sun's disc hits anything; false if unknown."""
+    """Whether it is certain that no ray from a point of the ground to the Sun's disc hits anything."""
     i = int((x * horizon.along_x + y * horizon.along_y + horizon.edge_m) * horizon.per_m)
     j = int((y * horizon.along_x - x * horizon.along_y + horizon.edge_m) * horizon.per_m)
     n = horizon.clear_m.shape[0]

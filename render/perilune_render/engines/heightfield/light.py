@@ -1,4 +1,4 @@
-"""Light at the hits of rays: points on the Sun's disc, and photometry, compiled for speed.
+"""Light at the points that rays hit: points on the Sun's disc, and photometry, compiled for speed.
 
 The compiled Hapke law runs the operations of `perilune_render.imaging.photometry` in the same order, in float32, and
 calls the C library functions that NumPy calls, so the results are equal to the bit.
@@ -45,10 +45,7 @@ class _Factors(NamedTuple):
 
 
 def _factors(p: HapkeParameters) -> _Factors:
-    """The constants of a parameter set.
-
-    Each is computed in double precision and rounded once, as NumPy does.
-    """
+    """The constants of a parameter set, computed in double precision and rounded once, as in NumPy."""
     slope, chi, gamma = slope_of(p.theta_bar_deg), chi_of(p.theta_bar_deg), float(np.sqrt(1 - p.w))
     scale = (1 - p.b**2) / 2
     values = (
@@ -74,14 +71,17 @@ def _factors(p: HapkeParameters) -> _Factors:
 
 
 def disc_places(drawn: np.ndarray, radius_rad: np.float32) -> np.ndarray:
-    """Uniform points (..., 2) on the Sun's disc at unit distance, from uniform random numbers (..., 2), float32."""
+    """Uniform points (..., 2) on the Sun's disc at unit distance, float32.
+
+    `drawn` (..., 2) are uniform random numbers.
+    """
     points = np.empty(drawn.shape, np.float32)
     _fill_disc(drawn, radius_rad, points)
     return points
 
 
 def reflected(law: str, angles: np.ndarray) -> np.ndarray:
-    """Radiance factor (...) of a law for `angles` (5, ...) float32 as written by `see`."""
+    """Radiance factor (...) of a law for the `angles` (5, ...) float32 that `shade.see` writes."""
     mu0, mu, cos_phase, albedo, lit = angles
     if law not in HAPKE:
         return reflectance_factor(law, mu0, mu, cos_phase) * albedo * lit
@@ -113,7 +113,7 @@ def _slopes(f, cosine):
 def _hapke(f, angles, result):
     """Write the radiance factor of each sample to `result` (N,), given `angles` (5, N).
 
-    It is the product of `photometry.hapke`, albedo and cosine of incidence, which is 0 in shadow.
+    The radiance factor is the product of `photometry.hapke`, the albedo and the cosine of incidence (0 in shadow).
     """
     for k in range(len(result)):
         mu0, mu, cos_phase = angles[0, k], angles[1, k], angles[2, k]

@@ -1,4 +1,4 @@
-"""Prefetch memory, since the rays of an image spend most of their time waiting for memory."""
+"""Prefetch memory, since rays spend most of their time waiting for memory."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Prefetch the element of a contiguous array at an index into its flat form. Changes no value."""
+    """Prefetch an element of a contiguous array, given its index in the flat array. Changes no value."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data

@@ -1,4 +1,4 @@
-"""First hits of given rays: heights of the ground, ranges of a lidar, points in an image."""
+"""First hits of single rays, for heights of the ground, ranges of a lidar and shadows on maps."""
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from perilune_shared.geometry.frames import Array
 def first_hits(surface: Surface, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
     """First hits of rays from points (N, 3), O_L, metres, along directions (N, 3).
 
-    Returns the distances (N,) in lengths of the directions, infinite without a hit, and the unit normals of the facets
-    (N, 3), 0 without a hit. Start above the surface, since rays also hit its underside. Without `boulders`, rays hit
-    only the ground.
+    Returns the distances (N,) as multiples of the directions' lengths, infinite without a hit, and the unit normals of
+    the facets (N, 3), 0 without a hit. Rays must start above the surface, since they also hit its underside. Without
+    `boulders`, rays hit only the ground.
     """
     return first_returns(surface, origins_m, directions, boulders=boulders)[:2]
 
@@ -23,7 +23,7 @@ def first_hits(surface: Surface, origins_m: Array, directions: Array, *, boulder
 def first_returns(
     surface: Surface, origins_m: Array, directions: Array, *, boulders: bool = True
 ) -> tuple[Array, Array, Array]:
-    """Distances and normals as in `first_hits`, and albedo factors (N,): 1 on boulders, 0 without a hit."""
+    """Distances and normals of `first_hits`, and albedo factors (N,): 1 on boulders, 0 without a hit."""
     origins = np.ascontiguousarray(origins_m - np.array([*surface.centre_m, 0.0]), np.float64)
     rocks = surface.rocks if boulders else surface.rocks._replace(cell_start=np.zeros_like(surface.rocks.cell_start))
     return _hits(surface.ground, rocks, origins, np.ascontiguousarray(directions, np.float64))

@@ -1,4 +1,4 @@
-"""Boulders for casting rays: convex rocks as half-spaces, and the ground cells that each boulder touches."""
+"""Boulders for casting rays: convex rocks as half-spaces, and the boulders in each ground cell."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,8 @@ class Rocks(NamedTuple):
     """Outer unit normal and distance from the centre of each face, for a rock of diameter 1 (F, 4)."""
     cell_start: np.ndarray
     """Index in `cell_rock` of each cell's first boulder (C + 1,) int64; the last element is the length of `cell_rock`.
-    The cells of the inner square come first, by y and x, then the cells of the sectors, by side, ring and spoke."""
+    The cells of the inner square come first, ordered by y and x, then the cells of the sectors, ordered by side, ring
+    and spoke."""
     cell_rock: np.ndarray
     """Indices of the boulders in each cell (M,) int64."""
 
@@ -28,8 +29,8 @@ class Rocks(NamedTuple):
 def rocks_of(scene: Scene) -> tuple[Rocks, tuple[np.ndarray, np.ndarray]]:
     """The boulders of a scene, with the shapes of `perilune_render.terrain.boulders.boulder_mesh`.
 
-    Also returns the largest boulder height in each cell of the inner square (2 n, 2 n) and of the sectors (4, R, 2 n),
-    float32, -inf without boulders.
+    The second result is the height of the highest boulder in each cell of the inner square (2 n, 2 n) and of the
+    sectors (4, R, 2 n), metres, float32, -inf without boulders.
     """
     boulders, grid = scene.boulders, scene.grid
     local = grid.spacing_under(boulders.x_m, boulders.y_m)
@@ -57,9 +58,10 @@ def rocks_of(scene: Scene) -> tuple[Rocks, tuple[np.ndarray, np.ndarray]]:
 def cells_of_rocks(
     rows: Array, n_half: int, half_widths_m: Array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cells of the boulders with these `Rocks.rows`: `cell_start`, `cell_rock`, and the largest height in each cell.
+    """The boulders in each cell, for boulders with these `Rocks.rows`.
 
-    The heights are two arrays: inner square (2 n, 2 n) and sectors (4, R, 2 n), float32.
+    Returns `Rocks.cell_start`, `Rocks.cell_rock`, and the height of the highest boulder in each cell of the inner
+    square (2 n, 2 n) and of the sectors (4, R, 2 n), metres, float32.
     """
     n, n_rings = n_half, len(half_widths_m) - 1
     inner, sectors = np.full((2 * n, 2 * n), -np.inf, np.float32), np.full((4, n_rings, 2 * n), -np.inf, np.float32)
@@ -74,10 +76,11 @@ def cells_of_rocks(
 
 @njit()
 def _fill(rows, n, half_widths, tops, position, numbers):
-    """Write the boulders of each cell into `numbers`, starting at the cell's `position`, and advance this position.
+    """Write the boulders of each cell into `numbers`, or count them if `numbers` is empty.
 
-    If `numbers` is empty, only add the number of boulders of each cell to `position`. `tops` holds the largest heights
-    of the cells, for the inner square and the sectors; raise each to the highest boulder of the cell.
+    `position` is the index in `numbers` of the next boulder of each cell, and is advanced. Without `numbers`, it counts
+    the boulders of each cell. `tops`, the largest heights of the cells of the inner square and of the sectors, is
+    raised to the highest boulder of each cell.
     """
     (inner, sectors), write = tops, len(numbers) > 0
     step = half_widths[0] / n

@@ -11,8 +11,8 @@ r"""What each ray of an image sees: the hit, its shading, and whether the Sun re
 
 `see` renders a tile of the image, block by block of BLOCK_PX pixels:
 
-- `begin_m` and `only_part` find for all rays of a block where they may begin, and the part of the mesh below;
-- `_read_ahead` asks for the memory that the rays will need;
+- `begin_m` and `only_part` find the height at which all rays of a block may begin, and the part of the mesh below it;
+- `_read_ahead` prefetches the memory that the rays will need;
 - `_see` casts the ray of one sample (1), shades its hit by `ground_at` or `rock_normal` (2), moves the start of a
   grazing shadow ray by `lift_at` (3), and casts the shadow ray (4), unless the hit is surely lit.
 """
@@ -31,11 +31,11 @@ from perilune_render.provenance.kernels import njit
 from perilune_shared.geometry.frames import Array
 
 _LIFT = 1e-4
-"""Distance from the hit at which a shadow ray begins, metres. A shadow ray cannot hit its own triangle or boulder, but
-from an edge of the triangle it could hit the neighbour because of rounding."""
+"""Distance from the hit at which a shadow ray begins, metres. A shadow ray cannot hit its own triangle or boulder. From
+an edge of the triangle, it could hit the neighbouring triangle because of rounding."""
 _TERMINATOR = 0.1
-"""Cosine between ground and Sun below which Cycles moves the start of a shadow ray from the facet to the curved
-surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
+"""Cosine between ground and Sun below which Cycles moves the start of a shadow ray from the facet to the curved surface
+that the vertex normals describe: the default of Cycles' setting "shadow terminator geometry offset"."""
 
 
 class View(NamedTuple):
@@ -44,14 +44,14 @@ class View(NamedTuple):
     origin: Array
     """Position of the camera, metres (3,)."""
     basis: Array
-    """The ray at image coordinates (u, v), pixels, is u basis[0] + v basis[1] + basis[2], with z = 1 along the camera's
-    axis (3, 3)."""
+    """Basis of the rays (3, 3): the ray at image coordinates (u, v), pixels, is u basis[0] + v basis[1] + basis[2]. Its
+    component along the camera's axis is 1."""
     far_m: float
     """Depth along the camera's axis at which rays end, metres."""
     sun: Array
     """Unit vector to the centre of the Sun's disc (3,)."""
     plane: Array
-    """The ray to the point (p, q) of the disc is along sun + p plane[0] + q plane[1] (2, 3)."""
+    """Axes of the Sun's disc (2, 3): the ray to its point (p, q) is along sun + p plane[0] + q plane[1]."""
     horizon: Horizon
     """Where this Sun surely lights the ground."""
 
@@ -97,9 +97,9 @@ def _normal(vertices, k):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _corners(ground, facet, x, y):
-    """Vertices of a triangle, edges from its first vertex, z of their cross product, and weights at (x, y).
+    """Vertices of a triangle, edges from its first vertex, z of their cross product, two weights.
 
-    The weights belong to the second and third vertex.
+    The weights are those of the second and third vertex at (x, y).
     """
     n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
     part, row, column = facet.part, facet.row, facet.column
@@ -139,11 +139,11 @@ def ground_at(ground, facet, x, y):
 
 @njit(**INLINED)
 def lift_at(ground, facet, x, y):
-    """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle at (x, y), metres.
+    """The vector by which Cycles lifts the start of a grazing shadow ray from a triangle, metres.
 
-    It points along the interpolated normal. It reaches one of two heights, whichever is larger: the lowest of the
-    vertices' tangent planes, after each is shifted until the triangle is below it, or half the height of a quadratic
-    patch with these vertex normals.
+    The ray starts at (x, y). The vector points along the interpolated normal, and its length is the larger of two
+    heights. The first is the height of the lowest tangent plane of the vertices, each shifted until the triangle is
+    below it. The second is half the height of a quadratic patch with these vertex normals.
     """
     vertices = ground.vertex
     v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, facet, x, y)
@@ -186,7 +186,7 @@ def rock_normal(rocks, k, face):
 def _see(ground, rocks, view, tile, block, sample):
     """Cast the ray of one sample, (s, row, column) in the tile, and its shadow ray (module docstring).
 
-    Returns the height of the hit, metres, or without a hit the height at which the ray begins.
+    Returns the height of the hit, metres; without a hit, the height at which the ray begins.
     """
     (s, i, j), horizon, angles, sun, plane = sample, view.horizon, tile.angles, view.sun, view.plane
     u, v = _coordinates(tile, s, i, j)
@@ -246,7 +246,7 @@ def _see(ground, rocks, view, tile, block, sample):
 
 @njit(inline="always", **WITHOUT_COUNTS)
 def _coordinates(tile, s, i, j):
-    """Image coordinates u and v of sample s of a tile's pixel (i, j)."""
+    """Image coordinates u and v of sample s in pixel (i, j) of a tile."""
     u, v = tile.first[1] + j + 0.5 + tile.moved[s, i, j, 0], tile.first[0] + i + 0.5 + tile.moved[s, i, j, 1]
     return u, v
 
@@ -292,9 +292,9 @@ def _read_ahead(ground, horizon, x, y):
 
 @njit(**WITHOUT_COUNTS)
 def see(ground, rocks, tops, view, tile):
-    """Cast the rays of a tile of the image, and a shadow ray from each hit that may be dark, into the tile's arrays.
+    """Render a tile: cast its rays, and a shadow ray from each hit that may be dark.
 
-    `tops` gives where the rays of a block of pixels begin.
+    The results are written into the arrays of the tile. `tops` determines where the rays of a block of pixels begin.
     """
     n_samples, height, width, _ = tile.moved.shape
     origin, basis, (first_row, first_column) = view.origin, view.basis, tile.first

@@ -1,15 +1,15 @@
-"""The ground as arrays for casting rays: heights, vertex normals, albedo, and a pyramid of largest heights.
+"""The ground as arrays for casting rays: heights, normals, albedo, and a pyramid of largest heights.
 
-Blender renders the same mesh: `Grid.quads`, each quad split from its first to its third vertex. It has two kinds of
-parts:
+Blender renders the same mesh: `Grid.quads`, each quad split from its first to its third vertex. The mesh has two kinds
+of parts:
 
 - the inner square, a regular grid;
-- four sectors between the rings, one for each side (south y = -d, then x = d, y = d, x = -d). In a sector a point has
-  two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines d =
-  half_widths[r], spokes are the lines along / d = s / n_half - 1. They cross at the vertices.
+- four sectors around it, one for each side (y = -d, then x = d, y = d, x = -d). In a sector, a point has two
+  coordinates: d, its distance max(|x|, |y|) from the centre, and `along`, its coordinate along the side. Rings are the
+  lines d = half_widths[r], spokes are the lines along / d = s / n_half - 1. They cross at the vertices.
 
 A cell is a quad. Level L of the pyramid, from 1, stores the largest height in blocks of 2^L x 2^L cells, including the
-boulders that touch them. A ray spends most of its time reading memory, so the four numbers of a vertex are adjacent.
+boulders that touch them. The four numbers of a vertex are adjacent, since rays spend most of their time reading memory.
 """
 
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
 WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
-"""Options of kernels that create no arrays: they skip reference counts, which all threads would write."""
+"""Options of kernels that create no arrays. They skip reference counts, which all threads would have to write."""
 INLINED = WITHOUT_COUNTS | {"forceinline": True}
-"""Options of kernels that are compiled into their callers: a call would pass `Ground` and `Rocks` as about 70
+"""Options of kernels that are compiled into their callers, since a call would pass `Ground` and `Rocks` as about 70
 numbers."""
 _MAX_LEVELS = 16
 _MARGIN_M = 0.01
@@ -45,10 +45,10 @@ class Ground(NamedTuple):
     """For each vertex, in the grid's order (V, 4) float32: x and y of the unit normal, O_L; height, metres; albedo,
     negative if boulders touch the cell that has this vertex as its first."""
     top_m: np.ndarray
-    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and spoke, metres, float32: level
-    after level, from 1."""
+    """Pyramids of largest heights, metres, float32: first the inner square, ordered by y and x, then the sectors,
+    ordered by side, ring and spoke. Within each pyramid, the levels follow each other from level 1."""
     level: np.ndarray
-    """Index in `top_m` at which each level of the inner square and of the sectors begins (2, L + 1) int64; the last
+    """Index in `top_m` at which each level begins, for the inner square and the sectors (2, L + 1) int64. The last
     column holds the number of the coarsest level."""
     n_half: int
     """Vertex spacings from the centre of the inner square to its border."""
@@ -57,7 +57,7 @@ class Ground(NamedTuple):
     highest_m: float
     """Height above all ground and boulders, metres."""
     ring: np.ndarray
-    """Ring number at equal steps of the distance max(|x|, |y|), starting at the first ring (N,) int64."""
+    """Table of ring numbers at equal steps of the distance max(|x|, |y|), from the first ring (N,) int64."""
     rings_per_m: float
     """Number of elements of `ring` per metre."""
 
@@ -67,7 +67,7 @@ class Surface:
     """Ground and boulders of a scene."""
 
     ground: Ground
-    """Ground."""
+    """Arrays of the ground."""
     rocks: Rocks
     """Boulders, and the cells that each touches."""
     centre_m: tuple[float, float]
@@ -75,7 +75,7 @@ class Surface:
 
 
 def surface_of(scene: Scene) -> Surface:
-    """Build the surface of a scene; takes a few seconds for ten million vertices."""
+    """Build the surface of a scene. Takes a few seconds for ten million vertices."""
     grid, n = scene.grid, scene.grid.n_half
     half = np.ascontiguousarray(grid.half_widths_m, np.float64)
     height = np.ascontiguousarray(scene.height_m, np.float32)
@@ -99,7 +99,7 @@ def surface_of(scene: Scene) -> Surface:
 
 
 def _ring_table(half_widths: Array) -> tuple[np.ndarray, float]:
-    """`Ground.ring` and `Ground.rings_per_m`: four elements for each ring on average."""
+    """`Ground.ring` and `Ground.rings_per_m`, with four elements per ring on average."""
     n_rings = len(half_widths) - 1
     width, count = half_widths[-1] - half_widths[0], 4 * max(n_rings, 1)
     steps = half_widths[0] + width / count * np.arange(count)
@@ -184,9 +184,9 @@ def _raise_to_ground(height, n, inner_top, sector_top):
 
 @njit()
 def _add_face(cell, n, half_widths, height, points, total):
-    """For each vertex of a cell, add the face normal, weighted by the angle at the vertex, to `total` (V, 3).
+    """Add the normal of a cell to `total` (V, 3) at each vertex, weighted by the angle there.
 
-    `cell` is part, row and column; `points` (4, 3) is overwritten.
+    `cell` is (part, row, column); `points` (4, 3) is overwritten.
     """
     part, row, column = cell
     for k in range(4):
@@ -214,7 +214,7 @@ def _add_face(cell, n, half_widths, height, points, total):
 
 @njit()
 def _write_normals(n, half_widths, height, vertices):
-    """Write x and y of the unit vertex normals, computed as in Blender: means of face normals, weighted by angles."""
+    """Write x and y of the unit vertex normals: as in Blender, means of face normals, weighted by angles."""
     total, points = np.zeros((len(height), 3)), np.empty((4, 3))
     for j in range(2 * n):
         for i in range(2 * n):

@@ -1,1 +1,1 @@
-"""Our own interface: requests and answers, the clients, and the frames of ZeroMQ's protocol."""
+"""The native interface: requests and replies over ZeroMQ's wire protocol."""

@@ -37,13 +37,13 @@ class SceneRequest(Section):
 
 
 class HealthRequest(Section):
-    """Request: check that both interfaces answer."""
+    """Request: check that all interfaces answer."""
 
     request: Literal["health"]
 
 
 class GroundRequest(_OfScene):
-    """Request: describe a scene that is in memory, or start to generate the scene."""
+    """Request: describe a scene, or start to generate it if it is not in memory."""
 
     request: Literal["ground"]
 
@@ -69,7 +69,7 @@ class CratersRequest(_OfScene):
 
 
 class HeightsRequest(_OfScene):
-    """Request: heights of the surface at points."""
+    """Request: compute heights of the surface at points."""
 
     request: Literal["heights"]
     x_m: Annotated[tuple[_Number, ...], Field(max_length=100_000)]
@@ -87,13 +87,14 @@ _REQUESTS: dict[str, type[Section]] = {
 }
 _LENGTH_TOLERANCE = 0.01
 ANSWERED_BY_CONNECTIONS: list[bytes] = []
-"""Result of `answer` for a health request: the thread of the connections then sends the reply."""
+"""Returned by `answer` for a health request; the thread of the connections makes the reply."""
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
-    """The parts of the reply to a request. Errors are replies too. Called in the thread that renders.
+    """The parts of the reply to a request. Called in the thread that renders.
 
-    If the scene of the request is not in memory, the reply is `"ready": false` without arrays.
+    An invalid request gets a reply with an error message. If the scene of the request is not in memory, the reply is
+    `"ready": false` without arrays, and the scene is queued. `client` identifies the client in the queue.
     """
     try:
         request = _parsed(content)
@@ -110,13 +111,13 @@ def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
 
 
 def refusal(text: str, *, busy: bool = False) -> list[bytes]:
-    """A reply with an error message; with `busy`, the client may send the request again later."""
+    """A reply with an error message; `busy` tells the client to send the request again later."""
     head: dict[str, Any] = {"error": one_line(text)[:900]}
     return [json.dumps(head | {"busy": True} if busy else head).encode()]
 
 
 def _parsed(content: bytes) -> Section:
-    """A request. Raises UserError with the field that is wrong."""
+    """Parse a request. Raises UserError that names a wrong field."""
     try:
         plain = json.loads(content)
     except (ValueError, RecursionError):
@@ -155,7 +156,7 @@ def _answer(simulated: SimulatedScene, request: Section) -> list[bytes]:
 
 
 def _about(grounds: Grounds) -> dict[str, Any]:
-    """What the server renders."""
+    """The reply to a request `scene`: position and Sun of scene 0, camera, number of scenes."""
     config, scene = grounds.first.config, grounds.first.scene
     stated = config.scene or SceneConfig()
     about = {
@@ -169,7 +170,7 @@ def _about(grounds: Grounds) -> dict[str, Any]:
 
 
 def _frame(simulated: SimulatedScene, request: FrameRequest) -> dict[str, np.ndarray]:
-    """The arrays of a frame, which equals the frame of `perilune-render frames` for the same pose and index."""
+    """The arrays of a frame. `perilune-render frames` gives the same frame for the same pose and index."""
     quaternion = np.array(request.rotation_wxyz)
     length = np.linalg.norm(quaternion)
     if abs(length - 1) > _LENGTH_TOLERANCE:
@@ -191,7 +192,7 @@ def _frame(simulated: SimulatedScene, request: FrameRequest) -> dict[str, np.nda
 
 
 def _reply(head: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[bytes]:
-    """The parts of a reply: the head, which lists the arrays, then each array."""
+    """The parts of a reply: a head in JSON that lists the arrays, then the bytes of each array."""
     plain = {name: np.ascontiguousarray(value) for name, value in arrays.items()}
     listed = [{"name": name, "dtype": value.dtype.str, "shape": value.shape} for name, value in plain.items()]
     return [json.dumps({**head, "arrays": listed}).encode(), *(value.tobytes() for value in plain.values())]

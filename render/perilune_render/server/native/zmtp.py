@@ -1,7 +1,7 @@
 """Frames of ZeroMQ's wire protocol, ZMTP 3.0 without encryption (https://rfc.zeromq.org/spec/23).
 
-ZeroMQ's library collects any number of parts of a message before a program sees them, so one client can fill the
-memory. This module reads and discards all parts after the first two, and accepts no part above LARGEST_REQUEST_BYTES.
+ZeroMQ's library collects all parts of a message before it passes them to a program, so one client could fill the
+memory. This module keeps only the first two parts, and ends the connection if a part exceeds LARGEST_REQUEST_BYTES.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from perilune_render.server.connection import Connection, Dropped
 
 LARGEST_REQUEST_BYTES = 4_000_000
-"""Largest size of one part of a message, bytes."""
+"""Largest size of a part of a message, bytes."""
 _LARGEST_COMMAND_BYTES = 4096
 _MAX_KEPT = 2
 _CHUNK_BYTES = 65_536
@@ -19,24 +19,24 @@ _MORE, _LONG, _COMMAND = 1, 2, 4
 _SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
 _GREETING = _SIGNATURE + b"\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 _SOCKETS = (b"REQ", b"DEALER", b"ROUTER")
-"""Types of sockets that may connect to a ROUTER."""
+"""Types of ZeroMQ sockets that may connect to the server, which is a ROUTER."""
 
 
 class Message(NamedTuple):
     """A message of a client."""
 
     kept: list[bytes]
-    """The first two parts."""
+    """The first two parts, without those that `receive` discarded."""
     n_parts: int
     """Number of parts that were sent."""
     is_whole: bool
-    """Whether the first two parts were kept."""
+    """Whether `kept` holds all of the first two parts."""
 
 
 async def greet(connection: Connection) -> None:
     """Exchange greetings and the types of the sockets.
 
-    Raises Dropped for a client that does not speak ZMTP 3.
+    Raises Dropped if the client does not use ZMTP 3.
     """
     signature = await connection.hello(1)
     if signature != _SIGNATURE[:1]:
@@ -57,9 +57,10 @@ async def greet(connection: Connection) -> None:
 
 
 async def receive(connection: Connection, may_keep: Callable[[], bool]) -> Message:
-    """The next message. Raises Dropped if a part is too large; TimeoutError like `Connection.first` and `rest`.
+    """The next message of a client.
 
-    `may_keep` decides whether a part of more than 64 kB is kept.
+    `may_keep` decides whether a part of more than 64 KiB is kept or discarded. Raises Dropped if a part is too large,
+    and TimeoutError like `Connection.first` and `Connection.rest`.
     """
     kept: list[bytes] = []
     n_parts, is_whole = 0, True
@@ -94,7 +95,7 @@ async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 
 
 async def _head(connection: Connection, first: bytes) -> tuple[int, int]:
-    """Flags and size of a frame, whose first byte is given."""
+    """Flags and size of a frame. `first` is its first byte."""
     flags = first[0]
     size = int.from_bytes(await connection.rest(8 if flags & _LONG else 1), "big")
     if flags > _MORE + _LONG + _COMMAND or (flags & _COMMAND and (flags & _MORE or size > _LARGEST_COMMAND_BYTES)):
@@ -105,7 +106,10 @@ async def _head(connection: Connection, first: bytes) -> tuple[int, int]:
 
 
 async def _obey(connection: Connection, command: bytes) -> None:
-    """Answer a ping, which holds the client's time limit (2 bytes) and a text (at most 16 bytes) that is sent back."""
+    """Answer a PING command; ignore other commands.
+
+    A ping holds the client's time limit (2 bytes) and a text (at most 16 bytes), which is sent back.
+    """
     if command.startswith(b"\x04PING"):
         await connection.send(_frame(_COMMAND, b"\x04PONG" + command[7:23]))
 

@@ -1,1 +1,1 @@
-"""The server's interface with PANGU's wire protocol."""
+"""The interface that uses PANGU's wire protocol."""

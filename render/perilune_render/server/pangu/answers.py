@@ -1,7 +1,4 @@
-"""The answer to each message of PANGU's protocol.
-
-`answer` is called in the thread that renders. Errors are also returned as answers.
-"""
+"""Answer the messages of PANGU's protocol. Runs in the thread that renders."""
 
 from collections.abc import Callable
 
@@ -32,11 +29,11 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 
 _LARGEST = 1e16
-"""Largest number in a message: the Sun's distance may be 1e15 metres."""
+"""Largest accepted number in a message; the distance of the Sun may be 1e15 metres."""
 
 
 def answer(session: Session, message: m.Message, values: list, items: Array | bytes) -> bytes:
-    """The reply to a message with the values of its fields and its array."""
+    """The reply to a message, given the values of its fields and its array. Errors are replies too."""
     try:
         if message.effect == "refused":
             return error(REFUSED, f"{message.name}: {message.note}")
@@ -189,4 +186,4 @@ _ANSWERS: dict[int, Callable] = {
     296: _projection,
     299: _motion,
 }
-"""Function for each message that has an effect, by message number."""
+"""Function that answers each message of effect `answered`, by message number."""

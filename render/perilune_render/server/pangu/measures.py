@@ -1,4 +1,4 @@
-"""Measurements of PANGU's protocol: heights, points, ranges.
+"""Answer PANGU's messages that measure heights, points and ranges.
 
 A ray that begins below the surface or meets the back of a facet counts as a miss.
 """
@@ -13,7 +13,7 @@ from perilune_render.server.simulation import SimulatedScene
 from perilune_shared.geometry.frames import Array
 
 RANGE_WIDTH = 256
-"""Pixels of the range texture, which is a ramp of grey values."""
+"""Number of pixels of the range texture, one for each grey value."""
 _MAX_HEIGHTS = 1_000_000
 
 
@@ -22,14 +22,14 @@ def seen(
 ) -> tuple[Array, Array]:
     """Distances (N,) and cosines of incidence (N,) of rays from positions (1 or N, 3) along directions (N, 3).
 
-    Distances are in lengths of the directions; a miss has infinite distance and cosine 0. Raises ValueError for a
-    direction of length 0.
+    A distance is a multiple of its direction's length. A miss has infinite distance and cosine 0. Raises ValueError for
+    a direction of length 0.
     """
     length = np.linalg.norm(directions, axis=1)
     if (length == 0).any():
         raise ValueError("a direction of length 0")
     surface_m = simulated.heights_m(origins_m[:, 0], origins_m[:, 1], boulders=boulders)
-    under = origins_m[:, 2] < surface_m  # off the ground the surface is NaN, so not below it
+    under = origins_m[:, 2] < surface_m  # false beyond the edge of the ground, where the surface is NaN
     origins = np.broadcast_to(origins_m, directions.shape)
     distance, normal = simulated.hits(origins, directions, boulders=boulders)
     cosine = -np.einsum("ij,ij->i", normal, directions) / length
@@ -38,20 +38,23 @@ def seen(
 
 
 def elevations(session: Session, places_m: Array) -> Array:
-    """Heights (N,) of positions (N, 3) above the surface below them; infinite without a surface below."""
+    """Heights (N,) of positions (N, 3) above the surface, metres; infinite without a surface below a position."""
     distance, _ = seen(session.simulated, places_m, np.tile([0.0, 0.0, -1.0], (len(places_m), 1)))
     return distance
 
 
 def points(session: Session, directions: Array) -> Array:
-    """Points (N, 3) of the surface seen from the camera in directions (N, 3) of O_L; not finite without a hit."""
+    """Points (N, 3) of the surface that the camera sees in directions (N, 3), O_L; not finite without a hit."""
     distance, _ = seen(session.simulated, session.position_m[None], directions)
     with np.errstate(invalid="ignore"):
         return session.position_m + distance[:, None] * directions
 
 
 def looked_up(session: Session, places: Array) -> Array:
-    """Points (N, 3) seen at image positions (N, 2): (0, 0) is the bottom left corner, (1, 1) the top right corner."""
+    """Points (N, 3) of the surface seen at image positions (N, 2); not finite without a hit or outside the image.
+
+    Position (0, 0) is the bottom left corner of the image, (1, 1) the top right corner.
+    """
     view = session.view()
     pixels = np.stack([places[:, 0] * session.width_px, (1 - places[:, 1]) * session.height_px], axis=1)
     hits = points(session, view.camera.rays(pixels) @ view.rotation_camera_from_site)
@@ -68,7 +71,7 @@ def pulse(session: Session, values: list, items: object) -> bytes:
 
 
 def surface(session: Session, boulders: bool, places_m: Array) -> Array:
-    """Heights (N,) of the surface at positions (N, 2); NaN off the ground."""
+    """Heights (N,) of the surface at positions (N, 2); NaN beyond the edge of the ground."""
     return session.simulated.heights_m(places_m[:, 0], places_m[:, 1], boulders=boulders)
 
 
@@ -81,7 +84,7 @@ def _grid(nx: int, ny: int, dx: float, dy: float) -> tuple[Array, Array]:
 
 
 def patch(session: Session, values: list, items: object) -> bytes:
-    """Answer to GetSurfacePatch."""
+    """Answer to GetSurfacePatch: heights on a grid rotated about its centre."""
     boulders, cx, cy, nx, ny, spacing, angle = values
     x, y = _grid(nx, ny, spacing, spacing)
     c, s = np.cos(angle), np.sin(angle)
@@ -90,7 +93,7 @@ def patch(session: Session, values: list, items: object) -> bytes:
 
 
 def view_as_dem(session: Session, values: list, items: object) -> bytes:
-    """Answer to GetViewAsDEM: rays along the camera's axis, from a grid across it."""
+    """Answer to GetViewAsDEM: heights along the camera's axis, on a grid perpendicular to the axis."""
     camera, boulders, nx, ny, dx, dy, reference = values
     if camera != 1:
         raise ValueError(f"camera {camera}, expected 1")
@@ -102,7 +105,7 @@ def view_as_dem(session: Session, values: list, items: object) -> bytes:
 
 
 def range_image(session: Session, values: list, items: object) -> bytes:
-    """Answer to GetRangeImage."""
+    """Answer to GetRangeImage: an image whose grey values are scaled ranges."""
     offset, scale = values
     view = session.view()
     depth_m = session.simulated.radiance(view).depth_m
@@ -112,12 +115,15 @@ def range_image(session: Session, values: list, items: object) -> bytes:
 
 
 def range_texture(session: Session, values: list, items: object) -> bytes:
-    """Answer to GetRangeTexture: the column of a pixel is its grey value."""
+    """Answer to GetRangeTexture: one row of pixels with the grey values 0 to 255."""
     return picture(np.arange(RANGE_WIDTH, dtype=np.uint8)[None])
 
 
 def snapshot(session: Session, values: list, items: object) -> bytes:
-    """Answer to GetLidarSnapshot. Raises UserError if the camera is not above the surface."""
+    """Answer to GetLidarSnapshot: range, cosine of incidence and hit of each pixel.
+
+    Raises UserError if the camera is not above the surface.
+    """
     check_camera(values[0])
     position, rotation = np.array(values[1:4]), rotation_from_quaternion(np.array(values[4:]))
     session.simulated.check(position)

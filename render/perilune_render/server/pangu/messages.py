@@ -1,8 +1,8 @@
 """The messages of PANGU's wire protocol 1.20: number, name, layout of the payload, and this server's response.
 
-A layout has a letter for each field: u unsigned integer, b bool, f float, d double; a number before a letter repeats
-it. An array has the fields of one item; the item count is the last u of the fixed fields. Source: the facts listed in
-docs/reference/pangu.md.
+A layout has a letter for each field: u unsigned integer, b bool, f float, d double; a number repeats the letter after
+it. The layout of an array describes one item. The fixed fields contain the number of items (`count_of`). Source: the
+facts listed in docs/reference/pangu.md.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,12 @@ from typing import Literal
 VERSION = 0x0114
 """Version 1.20 as on the wire: major x 256 + minor."""
 PORT = 10363
-"""Port that clients of PANGU use."""
+"""Default port of PANGU's clients."""
 Effect = Literal["answered", "read", "refused"]
-"""answered: has an effect or returns a value; read: acknowledged without effect; refused: returns an error."""
+"""Response to a message.
+
+answered: it has an effect or returns a value; read: it is acknowledged without effect; refused: it returns an error.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,15 +131,13 @@ _ALL = (
     Message(299, "SetCameraMotion", "u18d", note="velocity up to 12 km/s blurs images; other motion has no effect"),
 )
 MESSAGES = {message.number: message for message in _ALL}
-"""All messages of a client, by number."""
-COUNTED_FIRST = (266, 272, 295, 298)
-"""Numbers of messages whose item count is not the last of their integers: reflectors, joints and scans."""
+"""All messages that a client may send, by number."""
+COUNTED_FIRST = (266, 295, 298)
+"""Numbers of the messages whose first field is the item count: reflectors and scans."""
 
 
 def count_of(message: Message, values: list) -> int:
-    """Number of items of a message's array, from the values of its fields."""
-    if message.number == 272:
-        return int(values[2])
+    """Number of items of a message's array, from the values of its fixed fields."""
     if message.number in COUNTED_FIRST:
         return int(values[0])
     return int(values[-1])

@@ -70,7 +70,7 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
 
 
 async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
-    """Whether the other end of a new connection sends the greeting of a server of this protocol."""
+    """Whether the other end of a new connection sends the greeting of a PANGU server."""
     writer.write(unsigned(m.VERSION))
     greeting = await reader.readexactly(4)
     writer.write(unsigned(m.GOODBYE))
@@ -78,7 +78,7 @@ async def greets(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 
 
 def items_of(message: m.Message, data: bytes) -> np.ndarray | bytes:
-    """The array of a message: numbers (N, k), or bytes if the items are bytes or the array is not used."""
+    """The array of a message: numbers (N, k) if all its fields are floats or all are doubles, otherwise bytes."""
     kinds = set(expanded(message.item))
     if kinds == {"f"}:
         return floats_from(data).reshape(-1, len(expanded(message.item)))

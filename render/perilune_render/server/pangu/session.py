@@ -17,10 +17,10 @@ _START_M = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Conventions:
-    """Conventions of PANGU that are not documented, with our defaults."""
+    """Options for PANGU's undocumented conventions, and whether a client may stop the server."""
 
     sun_zero: SunZero = "clockwise-from-y"
-    """Direction of the Sun's azimuth 0."""
+    """How the Sun's azimuth is counted."""
     roll_sense: RollSense = "left"
     """Side to which positive roll leans the top of the camera."""
     may_quit: bool = False
@@ -50,11 +50,11 @@ class Session:
     position_m: Array = field(default_factory=lambda: np.array([0.0, 0.0, _START_M]))
     """Position of the camera, O_L, metres (3,); at first above the site."""
     rotation_camera_from_site: Array = field(default_factory=lambda: rotation_from_angles(0.0, -np.pi / 2, 0.0))
-    """Attitude of the camera (3, 3); at first straight down."""
+    """Rotation matrix (3, 3); at first the camera looks straight down."""
     velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
     """Velocity of the camera, O_L, metres per second (3,); blurs images."""
     n_images: int = 0
-    """Number of images so far, which is the noise index of the next image."""
+    """Number of images so far. It selects the noise of the next image."""
     asked_us: float = 0.0
     """Time at which the current message arrived, microseconds since 1970."""
     time_tag_us: float | None = None
@@ -81,7 +81,7 @@ def check_camera(number: int) -> None:
 
 
 def picture(grey: np.ndarray) -> bytes:
-    """Grey values (h, w) uint8 as a message with a PPM file of three equal channels, as PANGU sends."""
+    """Encode grey values (h, w) uint8 as an image message: a PPM file with three equal channels, as PANGU sends."""
     height, width = grey.shape
     content = b"P6\n%d %d 255\n" % (width, height) + np.repeat(grey[..., None], 3, axis=2).tobytes()
     return unsigned(m.IMAGE, len(content)) + content

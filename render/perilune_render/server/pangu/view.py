@@ -1,8 +1,8 @@
-"""PANGU's conventions for viewpoints, with options for the unknown ones.
+"""PANGU's conventions for viewpoints, with options where the convention is unknown.
 
 The world is right-handed with z up; here it is O_L. The camera has x to the right, y down and z forward. Yaw 0 and
 pitch 0 look along +y; positive yaw turns to the left, negative pitch looks down. docs/reference/pangu.md states which
-of these were seen in a client and which are deduced.
+of these conventions were observed in a client and which are deduced.
 """
 
 from typing import Literal
@@ -13,7 +13,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 SunZero = Literal["clockwise-from-y", "anticlockwise-from-x"]
-"""Direction of the Sun's azimuth 0 in the world, and its sense seen from above; PANGU's convention is unknown."""
+"""How the Sun's azimuth is counted, seen from above: sense and zero direction. PANGU's convention is unknown."""
 RollSense = Literal["left", "right"]
 """Side to which positive roll leans the top of the camera; PANGU's convention is unknown."""
 
@@ -25,9 +25,9 @@ def rotation_from_angles(yaw_rad: float, pitch_rad: float, roll_rad: float, roll
 
 
 def rotation_from_quaternion(q: Array) -> Array:
-    """rotation_camera_from_site (3, 3) of a quaternion (4,), scalar first, that turns camera vectors to the world.
+    """rotation_camera_from_site (3, 3) of a quaternion (4,), scalar first, that rotates camera vectors to the world.
 
-    Raises ValueError if its length is 0; it need not be 1.
+    The quaternion may have any length but 0. Raises ValueError for length 0.
     """
     if np.linalg.norm(q) < 1e-6:
         raise ValueError("a quaternion of length 0")
@@ -44,10 +44,10 @@ def sun_from_angles(azimuth_rad: float, elevation_rad: float, zero: SunZero) -> 
 
 
 def camera_from_angles(width_px: int, height_px: int, field_of_view_rad: float, aspect: float) -> Camera:
-    """A pinhole with a horizontal field of view.
+    """A pinhole camera with a horizontal field of view.
 
-    `aspect` is a pixel's height over its width, both at depth 1. Raises ValueError if the field of view is not between
-    0.01 and 170 degrees, or the aspect not between 0.1 and 10.
+    `aspect` is the height of a pixel divided by its width, both at depth 1. Raises ValueError if the field of view is
+    not between 0.01 and 170 degrees, or if `aspect` is not between 0.1 and 10.
     """
     if not np.radians(0.01) <= field_of_view_rad <= np.radians(170):
         raise ValueError(f"a field of view of {np.degrees(field_of_view_rad):g} degrees")

@@ -1,8 +1,7 @@
-"""Bytes of PANGU's protocol 1.20: numbers, texts, errors, and numbers that may be invalid.
+"""Encode and decode the numbers, texts and errors of PANGU's protocol 1.20.
 
-The formats differ from IEEE 754 and from C. Integers have 32 bits, most significant byte first. A float is the IEEE 754
-word rotated left by 9 bits, so that the fraction is on top, followed by sign and exponent. A double is rotated by 12
-bits and sent with its low half first.
+Integers have 32 bits, most significant byte first. A float is an IEEE 754 word rotated left by 9 bits, so the fraction
+comes first, then sign and exponent. A double is rotated left by 12 bits and sent with its low half first.
 """
 
 import struct
@@ -18,9 +17,9 @@ SIZES = {"u": 4, "i": 4, "b": 1, "f": 4, "d": 8}
 
 
 def float_bytes(values: Sequence[float] | np.ndarray) -> bytes:
-    """Encode floats (N,). Values beyond the range of a float are clipped to its largest value.
+    """Encode floats (N,). Values beyond the range of a 32-bit float are clipped to its limits.
 
-    NaN is rejected.
+    Raises ValueError for NaN.
     """
     array = np.asarray(values, np.float64)
     if np.isnan(array).any():
@@ -42,14 +41,14 @@ def double_bytes(values: Sequence[float] | np.ndarray) -> bytes:
 
 
 def floats_from(data: bytes) -> np.ndarray:
-    """Decode floats (N,) to float64; they may be infinite or NaN."""
+    """Decode floats to float64 (N,), which may be infinite or NaN."""
     word = np.frombuffer(data, ">u4").astype(np.uint32)
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return ((word >> 9) | (word << 23)).view(np.float32).astype(np.float64)
 
 
 def doubles_from(data: bytes) -> np.ndarray:
-    """Decode doubles (N,); they may be infinite or NaN."""
+    """Decode doubles to float64 (N,), which may be infinite or NaN."""
     halves = np.frombuffer(data, ">u4").astype(np.uint64).reshape(-1, 2)
     word = (halves[:, 1] << np.uint64(32)) | halves[:, 0]
     return ((word >> np.uint64(12)) | (word << np.uint64(52))).view(np.float64)
@@ -61,14 +60,14 @@ def unsigned(*values: int) -> bytes:
 
 
 def text_bytes(text: str) -> bytes:
-    """Encode a text: length, bytes, a zero, and a second zero if the total would be odd."""
+    """Encode a text in ASCII: its length, the characters, and one or two zeros that make the length even."""
     data = text.encode("ascii", "replace") + b"\0"
     data += b"\0" * (len(data) % 2)
     return struct.pack(">H", len(data)) + data
 
 
 def read_fields(layout: str, data: bytes) -> list[float | int | bool]:
-    """Decode the values of a layout such as "u3f", in which a number before a type repeats it."""
+    """Decode the values of a layout such as "u3f", in which a number repeats the type after it."""
     values: list[float | int | bool] = []
     at = 0
     for kind in expanded(layout):
@@ -85,7 +84,7 @@ def read_fields(layout: str, data: bytes) -> list[float | int | bool]:
 
 
 def expanded(layout: str) -> str:
-    """A layout with each type written out: "u3f" becomes "ufff"."""
+    """A layout without numbers: "u3f" becomes "ufff"."""
     letters, digits = "", ""
     for letter in layout:
         if letter.isdigit():
@@ -101,34 +100,34 @@ def size_of(layout: str) -> int:
 
 
 REFUSED, FAULTY = 1, 2
-"""Error codes: a request that this server does not support, and a request with impossible values."""
+"""Error codes: the server does not support the request; the request has impossible values."""
 
 
 def error(code: int, text: str) -> bytes:
-    """An error as a message."""
+    """Encode a message of type ERROR; the text is cut to 900 characters."""
     return unsigned(m.ERROR, code) + text_bytes(text[:900] or "error")
 
 
 def valid_floats(values: Array) -> bytes:
-    """Floats, each with a bool that says whether it is valid (finite)."""
+    """Encode floats (N,), each followed by a bool: whether it is valid (finite)."""
     good = np.isfinite(values)
     words = float_bytes(np.where(good, values, 0.0))
     return b"".join(words[4 * k : 4 * k + 4] + (b"\1" if good[k] else b"\0") for k in range(len(values)))
 
 
 def valid_points(points: Array) -> bytes:
-    """Points (N, 3), each with a bool that says whether it is valid (finite)."""
+    """Encode points (N, 3), each followed by a bool: whether it is valid (finite)."""
     good = np.isfinite(points).all(axis=1)
     words = float_bytes(np.where(good[:, None], points, 0.0).ravel())
     return b"".join(words[12 * k : 12 * k + 12] + (b"\1" if good[k] else b"\0") for k in range(len(points)))
 
 
 def doubles(values: Array, *, valid: bool) -> bytes:
-    """Doubles (N,), each followed by the bool `valid`."""
+    """Encode doubles (N,), each followed by the bool `valid`."""
     words = double_bytes(values)
     return b"".join(words[8 * k : 8 * k + 8] + (b"\1" if valid else b"\0") for k in range(len(values)))
 
 
 def float_array(values: Array) -> bytes:
-    """Floats (N,) as a message; values that are not finite are marked invalid."""
+    """Encode floats (N,) as a message of type FLOAT_ARRAY; values that are not finite are marked invalid."""
     return unsigned(m.FLOAT_ARRAY, len(values)) + valid_floats(values)
