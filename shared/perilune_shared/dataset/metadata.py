@@ -11,6 +11,8 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
+    SerializerFunctionWrapHandler,
+    model_serializer,
     Field,
     SerializerFunctionWrapHandler,
     model_serializer,
@@ -97,6 +99,10 @@ class CameraRecord(_Info):
         return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
 
 
+_LATER_TABLES = ("star_tracker", "doppler_lidar")
+"""Tables that were added after version 0.1.0."""
+
+
 class Counts(_Info):
     """Number of rows of each table."""
 
@@ -116,6 +122,16 @@ class Counts(_Info):
     """Number of inertial measurements."""
     ranges: Annotated[int, Field(ge=0)] = 0
     """Number of altimeter measurements."""
+    star_tracker: Annotated[int, Field(ge=0)] = 0
+    """Number of attitudes of a star tracker."""
+    doppler_lidar: Annotated[int, Field(ge=0)] = 0
+    """Number of measurements of a Doppler lidar, one per beam and time."""
+
+    @model_serializer(mode="wrap")
+    def _without_later_tables(self, handler: SerializerFunctionWrapHandler) -> dict[str, int]:
+        """The counts without empty tables that older versions do not know, so that these versions can read the file."""
+        counts: dict[str, int] = handler(self)
+        return {name: count for name, count in counts.items() if count or name not in _LATER_TABLES}
 
 
 class Origin(_Info):

@@ -245,8 +245,31 @@ TABLES: dict[str, pa.Schema] = {
         _column("time_s", _REAL, "s", "since the first frame"),
         _column("range_m", _REAL, "m", "measured distance to ground along -Z_B; null without a return", nullable=True),
     ),
+    "star_tracker": _table(
+        "star_tracker",
+        _SCENE,
+        _TRAJECTORY,
+        _column("time_s", _REAL, "s", "since the first frame"),
+        _column("rotation_wxyz", _vector(4), "", "measured rotation_body_from_site, unit quaternion"),
+    ),
+    "doppler_lidar": _table(
+        "doppler_lidar",
+        _SCENE,
+        _TRAJECTORY,
+        _column("beam", _INTEGER, "", "number of the beam, from 0"),
+        _column("time_s", _REAL, "s", "since the first frame"),
+        _column("beam_in_body", _vector(3), "", "direction of the beam, unit vector, O_B"),
+        _column(
+            "speed_mps",
+            _REAL,
+            "m/s",
+            "measured speed over ground along the beam, positive towards the ground; null without a return",
+            nullable=True,
+        ),
+        _column("range_m", _REAL, "m", "measured distance to ground along the beam; null without a return", nullable=True),
+    ),
 }
-OPTIONAL_TABLES = ("inertial", "ranges")
+OPTIONAL_TABLES = ("inertial", "ranges", "star_tracker", "doppler_lidar")
 """Tables that are written only if they have rows. They were added without a new schema version."""
 _HAZARD = ("hazard_path", "hazard_sha256", "hazard_bytes")
 _LIDAR = ("lidar_path", "lidar_sha256", "lidar_bytes")
@@ -279,5 +302,7 @@ KEYS: dict[str, list[str]] = {
     "labels": ["frame_id", "crater_id"],
     "inertial": ["scene_id", "trajectory_id", "grade", "time_s"],
     "ranges": ["scene_id", "trajectory_id", "time_s"],
+    "star_tracker": ["scene_id", "trajectory_id", "time_s"],
+    "doppler_lidar": ["scene_id", "trajectory_id", "beam", "time_s"],
 }
 """Columns that identify a row, by table."""

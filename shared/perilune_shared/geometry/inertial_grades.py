@@ -7,7 +7,7 @@ misalignment and quantisation are not simulated.
 from dataclasses import dataclass
 from typing import Literal
 
-InertialGrade = Literal["tactical", "navigation"]
+InertialGrade = Literal["cubesat", "tactical", "navigation"]
 """Grade of an inertial measurement unit."""
 HOUR_S = 3600.0
 STANDARD_GRAVITY_MPS2 = 9.80665
@@ -29,9 +29,14 @@ class InertialErrors:
     """Random walk of the specific force's bias over one hour, thousandths of standard gravity."""
     velocity_random_walk_mps: float
     """White noise of the specific force: velocity after integration over one hour, metres per second."""
+    scale_ppm: float = 0.0
+    """Scale factor of each axis of gyroscope and accelerometer, millionths."""
+    misalignment_arcsec: float = 0.0
+    """Rotation of each axis of gyroscope and accelerometer towards each other axis, seconds of arc."""
 
 
 GRADES: dict[InertialGrade, InertialErrors] = {
+    "cubesat": InertialErrors(30.0, 30.0, 0.3, 3.0, 3.0, 0.1, scale_ppm=1000.0, misalignment_arcsec=200.0),
     "tactical": InertialErrors(10.0, 10.0, 0.1, 1.0, 1.0, 0.06),
     "navigation": InertialErrors(0.01, 0.01, 0.002, 0.05, 0.05, 0.01),
 }

@@ -55,7 +55,7 @@ _POSITIVE = (
     "interval_s",
     "range_m",
 )
-_NOT_NEGATIVE = ("crater_id", "boulder_id", "shape_id", "frame_index", "seed", "time_s", "n_craters_above_max_radius")
+_NOT_NEGATIVE = ("crater_id", "beam", "boulder_id", "shape_id", "frame_index", "seed", "time_s", "n_craters_above_max_radius")
 _RANGES = {
     "latitude_deg": (-90, 90),
     "longitude_deg": (-180, 180),
@@ -69,7 +69,7 @@ _RANGES = {
     "rim_axis_ratio": (0, 1),
     "ellipse_theta_rad": (0, np.pi),
 }
-_UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
+_UNIT_VECTORS = ("rotation_wxyz", "sun_direction", "beam_in_body")
 MAX_PER_COLUMN = 1000
 """Maximum number of listed faults of one column; further faults are only counted."""
 _MAX_PLAUSIBLE = 1e12

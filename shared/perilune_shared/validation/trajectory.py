@@ -214,26 +214,27 @@ def _vectors(column: pa.ChunkedArray) -> Array:
 
 
 def measurement_faults(table: str, rows: pa.Table, trajectory: dict) -> Iterator[Fault]:
-    """Yield the faults of a trajectory's rows of `inertial` or `ranges`.
+    """Yield the faults of a trajectory's rows of a table of measurements.
 
-    `trajectory` is the row of the trajectory. For each grade, times must increase and lie between 0 and the duration of
-    the trajectory. The intervals of inertial measurements must follow each other without gaps.
+    `trajectory` is the row of the trajectory. For each grade of an inertial unit and each beam of a lidar, times must
+    increase and lie between 0 and the duration of the trajectory. The intervals of inertial measurements must follow
+    each other without gaps.
     """
     where, key = f"manifest/{table}", f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
-    grades = rows["grade"].unique().to_pylist() if "grade" in rows.column_names else [None]
-    for grade in grades:
-        of_grade = rows if grade is None else rows.filter(pc.equal(rows["grade"], grade))
-        time = of_grade["time_s"].to_numpy()
+    series = next((name for name in ("grade", "beam") if name in rows.column_names), None)
+    for value in [None] if series is None else rows[series].unique().to_pylist():
+        of_series = rows if series is None else rows.filter(pc.equal(rows[series], value))
+        time = of_series["time_s"].to_numpy()
         if (np.diff(time) <= 0).any():
             yield Fault.of(where, None, "time_s", f"not increasing in {key}", "increasing times")
         last = float(time.max())
         if last > trajectory["duration_s"] + _TIME_TOLERANCE_S:
             expected = f"at most {trajectory['duration_s']}, the duration of {key}"
             yield Fault.of(where, None, "time_s", last, expected)
-        if grade is None:
+        if "interval_s" not in rows.column_names:
             continue
         begin = np.concatenate([[0.0], time[:-1]])
-        wrong = np.flatnonzero(np.abs(time - begin - of_grade["interval_s"].to_numpy()) > _TIME_TOLERANCE_S)
+        wrong = np.flatnonzero(np.abs(time - begin - of_series["interval_s"].to_numpy()) > _TIME_TOLERANCE_S)
         if len(wrong):
-            found = f"{of_grade['interval_s'][int(wrong[0])].as_py()} s before {time[wrong[0]]} s in {key}"
+            found = f"{of_series['interval_s'][int(wrong[0])].as_py()} s before {time[wrong[0]]} s in {key}"
             yield Fault.of(where, None, "interval_s", found, f"{time[wrong[0]] - begin[wrong[0]]}, without a gap")
