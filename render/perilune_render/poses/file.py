@@ -1,4 +1,6 @@
-"""Read poses from a file: CSV, Parquet, TUM (`timestamp tx ty tz qx qy qz qw`), EuRoC, or KITTI (3 x 4 matrices).
+"""Read poses from a file in the format CSV, Parquet, TUM, EuRoC or KITTI.
+
+The columns of TUM are `timestamp tx ty tz qx qy qz qw`; KITTI has 3 x 4 matrices.
 
 The frame of the positions is stated in the file: in text files by a comment line `# frame: O_L` above the first pose
 (in CSV above the column names), in Parquet by the key `frame` of the metadata.
@@ -46,7 +48,9 @@ _DIRECTIONS = ("camera_from_site", SITE_FROM_CAMERA)
 _LENGTH_TOLERANCE = 0.01
 """Largest deviation of a quaternion's length from 1 that rounded digits can explain."""
 _LARGEST_M = 1e6
+"""Largest distance of a camera from the site, metres."""
 _SAME_SITE_M = 0.1
+"""Smallest distance between the site in a file and the scene's site at which the file is rejected, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +158,10 @@ def _vectors(table: PoseTable, names: tuple[str, ...]) -> Array:
 
 
 def _axes(path: Path, stated: str | None, given: str | None) -> Array:
-    """The rotation (3, 3) to right, down, forward from the camera's axes. Raises UserError."""
+    """The rotation (3, 3) from the camera's axes to right, down, forward.
+
+    Raises UserError for invalid axes, or if file and option state different axes.
+    """
     known = [camera_axes(text, where) for text, where in ((stated, path), (given, "--camera-axes")) if text is not None]
     if len(known) == 2 and not np.array_equal(known[0], known[1]):
         raise UserError("--camera-axes", "", given, f"{stated}, as {path} states")
@@ -200,7 +207,7 @@ def _origin(path: Path, stated: dict[str, str]) -> Array:
 
 
 def _attitudes(table: PoseTable, axes: Array) -> Attitudes:
-    """The attitudes of a table. Raises UserError for a quaternion that is not of length 1."""
+    """The attitudes of a table. Raises UserError for a quaternion whose length is not 1."""
     direction = table.stated.get("rotation", _DIRECTIONS[0])
     if direction not in _DIRECTIONS:
         raise UserError(table.columns.path, "rotation", direction, " or ".join(_DIRECTIONS))
@@ -218,7 +225,10 @@ def _attitudes(table: PoseTable, axes: Array) -> Attitudes:
 
 
 def _trajectories(table: PoseTable) -> np.ndarray:
-    """Number of each pose's trajectory, from the column `trajectory`, in which equal values must be consecutive."""
+    """Number (N,) of each pose's trajectory, from the column `trajectory`.
+
+    Raises UserError if the poses of a trajectory are not consecutive.
+    """
     if TRAJECTORY not in table.columns:
         return np.zeros(table.columns.n_rows, int)
     names = table.columns.texts(TRAJECTORY)
