@@ -57,7 +57,7 @@ def part_of(plan: Plan, split: str, n_frames: int, sun_azimuth_offset_deg: float
         if len(trajectories) > first:
             ranges[scene.scene_id] = range(first, len(trajectories))
     if not ranges:
-        raise UserError("--split", "", f"none in {split}", "a split that has frames")
+        raise UserError("--split", "", f"no frame in {split}", "a split that has frames")
     scenes = tuple(
         replace(scene, sun_azimuth_deg=(scene.sun_azimuth_deg + sun_azimuth_offset_deg) % 360)
         for scene in plan.scenes
@@ -112,7 +112,7 @@ def _candidates(manifest: Dataset, plan: Plan) -> pd.DataFrame:
     labels = read_labels(manifest)
     if not len(labels):
         expected = "a rendered dataset or its manifest, or --craters-per-scene 0"
-        raise UserError(manifest.store, "labels", "none, as in a plan", expected)
+        raise UserError(manifest.store, "labels", "no labels, as in a plan", expected)
     planned = {each.frame_id(index) for each in plan.trajectories for index in range(len(each.splits))}
     labels = labels[selected(labels, SELECTIONS["visible"]) & labels["frame_id"].isin(planned)]
     keys = ["scene_id", "crater_id"]

@@ -59,8 +59,8 @@ class Motion:
     """Position and attitude of the lander as functions of time.
 
     Position and attitude deviate from the nominal motion by independent stationary Gaussian processes with the kernel
-    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper states "small perturbations with Gaussian distribution"
-    without sizes; white noise on each frame would not be a possible motion of a lander.
+    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper of Song et al. states "small perturbations with Gaussian
+    distribution" without sizes. White noise on each frame would not be a possible motion of a lander.
     """
 
     nominal: NominalTrajectory

@@ -2,7 +2,7 @@
 
 The plan depends on the configuration alone. A scene is planned as a seed, which determines its craters and boulders
 (`perilune_render.terrain.scene.grow_scene`). The trajectories of a scene are derived from its seed on demand, and a
-flight is drawn at its first use, so that a plan of many millions of frames is made in seconds.
+flight is drawn at its first use. A plan of many millions of frames is therefore made in seconds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -150,7 +150,10 @@ class _Drawn(Sequence[TrajectoryPlan]):
 
 
 def seen_by(body: TrajectoryPlan, name: str | None, rig: Rig) -> TrajectoryPlan:
-    """The trajectory of a camera on a body, given the body's; the same for a camera without a name."""
+    """The trajectory of a camera on a body.
+
+    A camera without a name has the trajectory of the body.
+    """
     if name is None:
         return body
     trajectory_id = trajectory_of_camera(name, body.trajectory_id)
@@ -193,7 +196,7 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
     """Splits as indices in SPLITS (n_scenes, trajectories_per_scene, n_frames) int8.
 
-    All frames of one scene, or of one trajectory, are in the same split if `split_by` says so.
+    `split_by` states whether all frames of a scene, or all frames of a trajectory, are in the same split.
     """
     shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
     n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1

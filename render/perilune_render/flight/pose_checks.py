@@ -26,6 +26,7 @@ LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
 _CHECKED_FRAMES = 20_000
 """Approximate number of frames that `check_plan` checks, which takes a few seconds."""
 _POINTS_PER_SIDE = 8
+"""Number of tested points along each side of the image."""
 _UNIT_TOLERANCE = 1e-6
 
 
@@ -59,9 +60,9 @@ def _named(trajectory: TrajectoryPlan, index: int) -> str:
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
     """Check a plan before the heights of the ground are known.
 
-    The Sun must be up, poses must be over the mesh, and ground must be in view.     Poses are checked in the first
-    scenes, up to about _CHECKED_FRAMES; `check_poses` checks the other scenes once their ground is known. Raises
-    UserError with `where` (the configuration or the manifest) and the first scene or frame that fails.
+    The Sun must be up, poses must be over the mesh, and ground must be in view. Poses are checked in the first scenes,
+    up to about _CHECKED_FRAMES; `check_poses` checks the other scenes once their ground is known. Raises UserError with
+    `where` (the configuration or the manifest) and the first scene or frame that fails.
     """
     for scene in plan.scenes:
         if not 0 < scene.sun_elevation_deg <= 90:
@@ -87,7 +88,7 @@ def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
     """Check poses against the ground of a scene.
 
-    Positions must be valid (`check_places`), and frames must show ground.     The ray through every tested point of the
+    Positions must be valid (`check_places`), and frames must show ground. The ray through every tested point of the
     image border must hit the mesh, unless the scene's views may show the sky. Seen from above, the mesh is a square. A
     ray that begins above the ground hits the mesh if and only if the ray is below the edge of the mesh where it leaves
     this square. Raises UserError with `where` and the first frame that fails.

@@ -1,7 +1,7 @@
 """The rig: the cameras on the body, and the poses of each camera along a trajectory of the body.
 
 The body's pose is given as the pose of a camera with the default mounting: at the body's origin, looking along -Z_B.
-The single camera of a `dataset.camera` has this mounting.
+The single camera of `dataset.camera` has this mounting.
 """
 
 from collections.abc import Mapping

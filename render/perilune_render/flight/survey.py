@@ -22,8 +22,8 @@ there may be no relief."""
 _TILE_PX = 32
 _LARGEST_SIDE_PX = 8192
 _BETWEEN_S = 100.0
-"""Time between the two images. It is so long that the camera is slow and moves far less than a pixel during an
-exposure; on a real orbiter, motion compensation has this effect."""
+"""Time between the two images, seconds. It is so long that the camera moves far less than a pixel during an exposure;
+on a real orbiter, motion compensation has this effect."""
 _CAMERA_FROM_SITE_LEVEL = np.diag([1.0, -1.0, -1.0])
 
 

@@ -14,6 +14,7 @@ from perilune_shared.geometry.frames import Array
 _N_ALTITUDES = 400
 _N_HEIGHTS = 100
 _WIDEST_RAD = np.radians(80)
+"""Largest angle from straight down at which frames may show ground, radians."""
 _N_DISTANCES, _N_PLACES = 200, 1000
 _HILL_M = 64.0
 """Height of the largest hills that the relief and the craters of default settings make, metres."""
@@ -43,9 +44,9 @@ def scene_view(scene: SceneConfig, *cameras: Camera) -> ViewEnvelope:
 def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
     """Smallest distance of a camera from the ground, by the ground's distance from the site.
 
-    Returns both distances, (M,) each, metres.     Cameras at the distance `reach_m[i]` from the site are at
-    `height_m[i]` or above, with linear interpolation. The ground extends beyond the horizon of the highest camera to
-    where a hill of height _HILL_M is hidden.
+    Returns both distances, (M,) each, metres. Cameras at the distance `reach_m[i]` from the site are at `height_m[i]`
+    or above, with linear interpolation. The ground extends beyond the horizon of the highest camera to where a hill of
+    height _HILL_M is hidden.
     """
     edge = reach_m[-1] + float(horizon_m(height_m[-1]) + horizon_m(_HILL_M))
     distance = np.union1d(np.geomspace(min(height_m[0], reach_m[0]), edge, _N_DISTANCES), reach_m)
@@ -57,8 +58,8 @@ def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
 def horizon_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
     """The views up to the horizon from all trajectories of a flight.
 
-    Trajectories are up to three standard deviations from the nominal trajectory.     Raises UserError if the
-    trajectories can begin above HIGHEST_M.
+    Trajectories are up to three standard deviations from the nominal trajectory. Raises UserError if the trajectories
+    can begin above HIGHEST_M.
     """
     altitude, spread = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, _N_ALTITUDES), _spread_m(flight)
     highest = flight.start_altitude_m + spread
@@ -102,8 +103,8 @@ def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
 def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
     """The views of a camera on all trajectories of a flight.
 
-    Trajectories are up to three standard deviations from the nominal trajectory.     Raises UserError if frames could
-    show the horizon.
+    Trajectories are up to three standard deviations from the nominal trajectory. Raises UserError if frames could show
+    the horizon.
     """
     angle = view_angle(camera, flight)
     if angle > _WIDEST_RAD:

@@ -131,7 +131,7 @@ def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: boo
                 else ("a view with the horizon", "a view of the ground alone", "; or dataset.scene.horizon=true")
             )
             found = f"{view}, as in {share}"
-            expected = f"{ground}, as in all frames by {', or by '.join(fitting)}{sky}"
+            expected = f"{ground}, which all frames show with {', or with '.join(fitting)}{sky}"
             raise UserError(where, f"{poses.origin(n)}: pose at {poses.time_s[n]:g} s", found, expected)
 
 

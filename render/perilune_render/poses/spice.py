@@ -2,8 +2,8 @@
 
 SPICE: Acton et al. 2018, doi 10.1016/j.pss.2017.02.013. O_L is taken as a rigid frame fixed to the Moon: its origin is
 the site, its axes point west, south and up at the site. Position, velocity and attitude are converted by the same
-rotation. Deviation: the rendered ground is a plane, and the Moon falls away from the plane by d^2 / 2R at a distance d
-from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
+rotation. Deviation: without `dataset.scene.horizon` the rendered ground is a plane, and the Moon falls away from it by
+d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
 
 Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are checked
 before SPICE opens them.
