@@ -6,7 +6,7 @@ The frame of the positions is stated in the file: in text files by a comment lin
 (in CSV above the column names), in Parquet by the key `frame` of the metadata.
 
 - `O_L`: x_m, y_m, z_m of the landing site's frame.
-- `O_W`: the same axes, with the origin at `# origin_m: x y z`, the lander's first position in O_L.
+- `O_W`: x_m, y_m, z_m along the axes of O_L. `# origin_m: x y z` states the origin, the lander's first position in O_L.
 - `selenographic`: latitude_deg, longitude_deg, and height_m above the plane of O_L.
 
 Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns qw, qx, qy, qz, like `rotation_wxyz` in
@@ -68,7 +68,7 @@ class GivenPoses:
     sun_deg: Array | None
     """Azimuth, clockwise from north, and elevation of the Sun, degrees (N, 2); None if the file has no Sun."""
     trajectory: np.ndarray
-    """Number of the trajectory of each frame, from 0, not descending (N,)."""
+    """Number of the trajectory of each frame, from 0, non-decreasing (N,)."""
     angular_velocity_radps: Array | None = None
     """Angular velocity of the camera, O_C, radians per second (N, 3); None if not in the file."""
 

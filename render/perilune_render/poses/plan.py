@@ -28,7 +28,7 @@ _MAX_SCENES = 1000
 _N_VIEWS = 24
 """Largest number of views that are made from poses."""
 _LOWER = 0.9
-"""Smallest height above the ground divided by the height above z = 0: the ground may rise towards the camera."""
+"""Smallest height of a camera above the ground, divided by its height above z = 0; the ground may be above z = 0."""
 _WIDER = 1.05
 """Factor on horizontal distances, a margin for relief."""
 _SPLIT = "test"

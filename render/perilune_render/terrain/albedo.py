@@ -21,7 +21,7 @@ _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03
 RAYS_REACH = 9.0
 """Length of the longest ray from the centre, crater radii."""
 RAYED_WEAR = 0.004
-"""Wear K/R^2 from which a crater has no rays: `Craters.wear_m2` divided by the squared radius."""
+"""Smallest wear K/R^2 of craters that cannot have rays; K is `Craters.wear_m2` and R the radius."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from perilune_shared.geometry.frames import Array
 class SeenGround:
     """The ground that frames show at each of N camera heights.
 
-    `perilune_render.terrain.levels` makes meshes for it.
+    `perilune_render.terrain.levels` makes meshes for this ground.
     """
 
     z_m: Array

@@ -67,7 +67,10 @@ class Grid:
 
     @property
     def spacings_m(self) -> Array:
-        """Larger of the spacings along and across, of the inner square and each ring, metres (n_rings + 1,)."""
+        """Vertex spacing of the inner square and each ring, metres (n_rings + 1,).
+
+        This is the larger of the spacings along and across a ring.
+        """
         across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
         return np.maximum(self.half_widths_m / self.n_half, across)
 

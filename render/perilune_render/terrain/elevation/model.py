@@ -1,4 +1,7 @@
-"""Use a real elevation model as the base of a scene: any projection and pixel size, holes allowed."""
+"""Use a real elevation model, with any projection and pixel size, as the base of a scene.
+
+The model may have holes.
+"""
 
 from __future__ import annotations
 
