@@ -12,9 +12,10 @@ _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
 
 def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
-    """Settings of a run, from its config.yaml only; a setting missing from the file has its default.
+    """Settings of a run, read from its config.yaml.
 
-    `settings` overrides single evaluation settings. Raises UserError if a setting would change the network.
+    Settings missing from the file have their defaults. `settings` ("detect.evaluation.nms_iou=0.4") overrides single
+    evaluation settings. Raises UserError if a setting would change the network.
     """
     path = run / "config.yaml"
     if not path.is_file():

@@ -16,7 +16,10 @@ _SELECTIONS = {
 
 
 def page_of(score: Score, about: Sequence[str]) -> str:
-    """The page as Markdown: headline, all scoring rules, regions, bins. `about` (Markdown) states what was scored."""
+    """The page as Markdown: headline, all scoring rules, regions, bins.
+
+    The Markdown lines `about` state what was scored.
+    """
     ap_selection, ap_rule, ap = score.least("ap50_paper")
     spread = score.evaluations[ap_selection].spreads[f"{SCORING_RULES[ap_rule]}ap50_paper"]
     f1_selection, f1_rule, f1 = score.least("f1")

@@ -1,8 +1,8 @@
 """Training frames and their assignments on the GPU, so that the CPU does not prepare batches.
 
 A GPU trains a detector faster than a process can prepare the batches. Without augmentation a frame does not change
-between epochs, so frames and assignments are moved to the GPU once, and batches are gathered there. All batches of one
-size have equal shapes, which a captured step needs (`detect/train/captured.py`).
+between epochs, so frames and assignments are moved to the GPU once, and batches are gathered there. The tensors of all
+batches of one size have equal shapes, so that a step can run as a CUDA graph (`detect/train/captured.py`).
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from perilune_train.detect.data.split import DetectSplit
 _UNCHANGED = AugmentSettings(
     flips_and_turns=False, scale=(1.0, 1.0), gain=0.0, gamma=0.0, stretch=0.0, blur_px=0.0, noise=0.0
 )
-_MAX_SHARE = 0.25
-"""Share of the memory of a GPU that resident frames may take."""
+_MAX_MEMORY_FRACTION = 0.25
+"""Largest fraction of a GPU's memory that resident frames may take."""
 _PORTION = 256
-"""Frames whose assignments are computed together."""
+"""Number of frames whose assignments are computed together."""
 
 
 @dataclass(frozen=True)
 class ResidentScale:
-    """Assignments of all F frames for one scale, K rows each; frames with fewer rows are padded."""
+    """Assignments of all F frames for one scale: K rows per frame, padded for frames with fewer positive predictors."""
 
     predictors: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
@@ -97,7 +97,7 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
         predictors += list(part.predictors[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
     counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
-    # Pad with a box that has an area, since the loss is computed for all rows.
+    # Pad with the box 0, 0, 1, 1: the loss is computed for all rows, so the padding needs an area.
     filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
     return ResidentScale(
         pad_sequence(predictors, batch_first=True).to(device),
@@ -116,7 +116,7 @@ def may_reside(config: DetectConfig) -> bool:
 
 def fits(split: DetectSplit, device: torch.device) -> bool:
     """Whether the frames of a split take at most a quarter of the memory of a GPU; assignments take far less."""
-    return split.frames.images.nbytes <= _MAX_SHARE * torch.cuda.get_device_properties(device).total_memory
+    return split.frames.images.nbytes <= _MAX_MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
 
 
 class _Numbers(torch_data.Dataset):

@@ -28,7 +28,7 @@ class StreamedSplit:
     """The training split as a stream; see FrameStream."""
 
     stream: FrameStream
-    """The share of this process."""
+    """Frames of this process's share."""
     radius_px: tuple[float, float]
     """Range of radii that are labelled and evaluated, pixels."""
     label_sizes_px: NDArray[np.float64]
@@ -104,7 +104,7 @@ class _Batches:
         return self.collate([self.sample(frame, epoch) for frame in frames])
 
     def sample(self, frame: StreamedFrame, epoch: int) -> Sample:
-        """Decode and augment a frame; as for frames in memory, augmentation depends on seed, epoch and frame only."""
+        """Decode and augment a frame; the augmentation depends on seed, epoch and frame only."""
         config, camera, labels = self.labels.config, self.labels.dataset.info.camera, self.labels(frame)
         name, size = frame.row["frame_id"], frame.row["png_bytes"]
         image = decode(frame.png, f"{self.labels.dataset.store}/{name}", camera.height_px, camera.width_px, size)
