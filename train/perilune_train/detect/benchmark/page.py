@@ -37,8 +37,9 @@ def page_of(score: Score, about: Sequence[str]) -> str:
         *_scoring_rules(score),
         "",
         *[f"- {text}" for text in _SELECTIONS.values()],
-        "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored",
-        f"- edge: detections down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater",
+        "- usual: unmatched detections on ignored craters, outside the range of radii, or centred off the image are "
+        "ignored",
+        f"- edge: as usual, but the range of radii of detections starts at {EDGE:g} of the smallest radius",
         "- strict: every unmatched detection is a false positive",
         f"- {spread_note(score.evaluations[SELECTIONS[0]].resamples)}; a match needs an IoU of {MATCH_IOU:g}",
         "",

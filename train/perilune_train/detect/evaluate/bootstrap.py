@@ -13,9 +13,9 @@ _GROUPS = 2000
 def average_precisions(matches: Matches, resamples: Resamples) -> Array:
     """The paper's AP (`Curve.ap_paper`) of every resample (R,); NaN without selected labels.
 
-    For speed, the sorted detections of each unit are counted in at most 2000 groups of neighbouring scores, and the
-    curve has one point per group. The result is exact for up to 2000 distinct scores; otherwise the error is a few
-    ten-thousandths.
+    For speed, the sorted detections of each scene (trajectory, image) are counted in at most 2000 groups of similar
+    scores, and the curve has one point per group. The result is exact for up to 2000 distinct scores. With more scores,
+    the error is a few ten-thousandths.
     """
     counted = np.flatnonzero(matches.outcome != IGNORED)
     order = counted[np.argsort(-matches.scores[counted], kind="stable")]
