@@ -51,7 +51,7 @@ class LabelSettings(Selection):
 
 
 class AugmentSettings(Section):
-    """Random augmentation of training frames; 0 disables an effect, and a scale of 1 to 1 disables zooming."""
+    """Random augmentation of training frames. 0 disables an effect; `scale` is disabled by 1 to 1."""
 
     flips_and_turns: bool = True
     """Apply one of the eight flips and quarter turns of a square frame, each equally likely."""

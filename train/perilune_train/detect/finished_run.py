@@ -38,7 +38,7 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
 
 
 def chosen_threshold(run: Path) -> float:
-    """Read the score threshold that a run chose on its validation split. Raises UserError if it is missing."""
+    """Score threshold that a run chose on its validation split. Raises UserError if it is missing."""
     threshold = read_metrics(run).get("test/threshold")
     if isinstance(threshold, bool) or not isinstance(threshold, float | int) or not math.isfinite(threshold):
         raise UserError(run / METRICS_FILE, "test/threshold", threshold, "a number; or give --threshold")

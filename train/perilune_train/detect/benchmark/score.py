@@ -30,7 +30,10 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Region:
-    """Figures of one region for one selection of labels, by the usual scoring rule unless a field states another."""
+    """Figures of one region for one selection of labels.
+
+    They follow the usual scoring rule unless the field states another rule.
+    """
 
     name: str
     """See `Part.region`."""

@@ -64,10 +64,11 @@ def augment(
     settings: AugmentSettings,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-    """Augment a frame; return grey levels (height, width) float32, boxes (M, 4) and whether each is selected (M,).
+    """Augment a frame and its boxes at random.
 
-    A crater is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is
-    removed if it becomes much smaller than that range or leaves the image.
+    Returns grey levels (height, width) float32, boxes (M, 4) in pixels, and whether each box is selected (M,). A crater
+    is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is removed
+    if it becomes much smaller than that range or leaves the image.
     """
     turned: NDArray = image
     if settings.flips_and_turns:

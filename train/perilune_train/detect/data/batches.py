@@ -65,7 +65,7 @@ class EvaluationFrames(torch_data.Dataset):
 
 
 def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
-    """Convert normalised frames (N, H, W) to the network's input (N, in_channels, H, W), channels last in memory."""
+    """Convert normalised frames (N, H, W) to the network's input (N, in_channels, H, W), channels last."""
     stacked = torch.as_tensor(images)[:, None].expand(-1, in_channels, -1, -1)
     return stacked.contiguous(memory_format=torch.channels_last)
 
@@ -99,11 +99,11 @@ class Collate:
 def training_loader(
     split: DetectSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> torch_data.DataLoader:
-    """Training batches of a share in the order of each epoch; the first epoch, `epoch`, starts at batch `start`.
+    """Training batches of a share, in the order of each epoch.
 
-    `anchors` (scales, 3, 2) are the anchors of the network. All processes have equally many batches, so up to
-    processes - 1 frames are left out of an epoch; these frames differ from epoch to epoch. All other frames are used
-    once.
+    The first epoch is `epoch`; it starts at batch `start`. `anchors` (scales, 3, 2) are the network's anchors. All
+    processes have equally many batches, so up to processes - 1 frames are left out of an epoch; these frames differ
+    from epoch to epoch. All other frames are used once.
     """
     frames = TrainingFrames(split, config)
     fewest = split.n_frames // split.share.processes

@@ -1,4 +1,4 @@
-"""Metadata of evaluated frames: scene, trajectory, altitude, Sun elevation. Real images may lack all of these."""
+"""Metadata of evaluated frames: scene, trajectory, altitude, Sun elevation; unknown for real images."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,7 +56,10 @@ def facts_of(frames: FrameStore) -> FrameFacts:
 
 
 def joined_facts(parts: Mapping[str, FrameFacts]) -> FrameFacts:
-    """Join the metadata of several parts; names of frames, scenes and trajectories begin with the part's name."""
+    """Join the metadata of several parts.
+
+    The names of frames, scenes and trajectories then begin with the part's name.
+    """
 
     def renamed(part: str, names: list[str]) -> list[str]:
         return [f"{part}/{name}" for name in names]

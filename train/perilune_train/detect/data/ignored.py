@@ -1,4 +1,4 @@
-"""Craters without a label that training and evaluation ignore, because they are just outside the labelled range."""
+"""Craters without a label that training and evaluation ignore: craters just outside the labelled range."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

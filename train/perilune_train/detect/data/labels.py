@@ -61,7 +61,10 @@ class LabelLimits:
 
 @dataclass(frozen=True)
 class SplitLabels(Sequence[FrameLabels]):
-    """Labels of N frames in joint arrays, which worker processes share without copies; an item is a view of them."""
+    """Labels of N frames in joint arrays; an item is a view of the arrays.
+
+    Worker processes share the arrays without copies.
+    """
 
     shape: Array
     """Box (4), radius and ellipse (5) of all labels, frame after frame (L, 10)."""
@@ -98,7 +101,7 @@ def read_split_labels(
     share: Share,
     limits: LabelLimits,
 ) -> tuple[SplitLabels, Array]:
-    """Labels and ignored craters of this process's share of the frames, and sizes (S, 2) of selected labels.
+    """Labels and ignored craters of this process's share, and sizes (S, 2) of the selected labels.
 
     The sizes are widths and heights in pixels, in all frames of the split, not only in the share. `table` has all
     frames of the split (`frame_table`). Memory holds the result and one scene's craters and labels at a time. Raises

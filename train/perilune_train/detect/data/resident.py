@@ -29,7 +29,10 @@ _PORTION = 256
 
 @dataclass(frozen=True)
 class ResidentScale:
-    """Assignments of all F frames for one scale: K rows per frame, padded for frames with fewer positive predictors."""
+    """Assignments of all F frames for one scale.
+
+    Each frame has K rows; the rows of frames with fewer positive predictors are padded.
+    """
 
     predictors: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
@@ -78,7 +81,7 @@ class ResidentFrames:
         return cls(torch.as_tensor(split.frames.images).to(device), scales)
 
     def batch(self, numbers: Tensor, in_channels: int) -> tuple[Tensor, Targets]:
-        """The network's input (B, in_channels, height, width) and the assignments of the frames `numbers` (B,).
+        """Network input (B, in_channels, height, width) and assignments of the frames `numbers` (B,).
 
         Frames are normalised as by `perilune_train.data.frames.normalised`.
         """
@@ -108,14 +111,17 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
 
 
 def may_reside(config: DetectConfig) -> bool:
-    """Whether the settings allow resident frames: one process, and no augmentation, teacher, guidance or stream."""
+    """Whether the settings allow resident frames.
+
+    They need a single process, and no augmentation, teacher, guidance loss or stream.
+    """
     alone = config.devices == config.num_nodes == 1
     plain = config.teacher is None and config.loss.lambda_guide == 0
     return alone and plain and not config.stream and config.augment == _UNCHANGED
 
 
 def fits(split: DetectSplit, device: torch.device) -> bool:
-    """Whether the frames of a split take at most a quarter of the memory of a GPU; assignments take far less."""
+    """Whether the frames of a split take at most a quarter of a GPU's memory; assignments take far less."""
     return split.frames.images.nbytes <= _MAX_MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
 
 

@@ -60,9 +60,9 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
 def streamed_loader(
     split: StreamedSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> StreamLoader:
-    """Training batches of a stream in the order of each epoch; the first epoch, `epoch`, starts at batch `start`.
+    """Training batches of a stream, in the order of each epoch.
 
-    `anchors` (scales, 3, 2) are the anchors of the network.
+    The first epoch is `epoch`; it starts at batch `start`. `anchors` (scales, 3, 2) are the network's anchors.
     """
     stream = split.stream
     stream.make = _Batches(_Labels(stream.dataset, config, split.radius_px), collate_of(config, anchors))

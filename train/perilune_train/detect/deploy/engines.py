@@ -39,7 +39,7 @@ def package(name: str) -> Any:
 
 
 def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engine:
-    """Engine of a torch network that returns boxes and scores; uses channels last and torch's thread count."""
+    """Engine of a torch network that returns boxes and scores, with torch's number of threads."""
     network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
     @torch.inference_mode()

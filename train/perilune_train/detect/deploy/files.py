@@ -1,4 +1,4 @@
-"""The detector for flight, with fewer and simpler operations, and its export to ONNX and OpenVINO files."""
+"""The detector in fewer and simpler operations, and its export to ONNX and OpenVINO files."""
 
 import copy
 import json

@@ -36,7 +36,7 @@ def average_precisions(matches: Matches, resamples: Resamples) -> Array:
 
 
 def at_threshold_resampled(matches: Matches, threshold: float, resamples: Resamples) -> dict[str, Array]:
-    """precision, recall and f1 of every resample (R,), at one score threshold; NaN without selected labels."""
+    """Precision, recall and F1 of every resample (R,) at one threshold; NaN without selected labels."""
     strong = matches.scores >= threshold
     hits, counted = (
         resamples.totals(matches.frame[strong & chosen])

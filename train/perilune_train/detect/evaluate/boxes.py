@@ -50,11 +50,12 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
 
 @compiled
 def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
-    """Indices of the boxes that suppression keeps, at most `max_count`; boxes (N, 4) are x, y, w, h, best first.
+    """Indices of the boxes that suppression keeps, at most `max_count`.
 
-    Each cell of a grid lists the kept boxes that touch it, so that a box is compared only with nearby boxes. Two boxes
-    that overlap touch a common cell; cells at the edge of the grid include everything beyond the grid. A box that
-    touches more than `max_cells` cells, or has no area, goes to a separate list and is compared with all boxes.
+    The boxes (N, 4) are x, y, width, height, best first. Each cell of a grid lists the kept boxes that touch it, so
+    that a box is compared only with nearby boxes. Two boxes that overlap touch a common cell; cells at the edge of the
+    grid include everything beyond the grid. A box that touches more than `max_cells` cells, or has no area, goes to a
+    separate list and is compared with all boxes.
     """
     side, max_cells = 32, 64
     n, low, high = len(boxes), np.empty(2), np.empty(2)

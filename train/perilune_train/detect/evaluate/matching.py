@@ -107,7 +107,7 @@ class Matches:
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Detections and labels of some frames, concatenated, and all pairs of a detection and a label that may match."""
+    """Detections and labels of some frames, concatenated, and their pairs that may match."""
 
     boxes: Array
     """Boxes of the detections, pixels, best first within a frame (D, 4)."""

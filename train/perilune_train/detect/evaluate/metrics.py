@@ -45,7 +45,7 @@ class Curve:
         return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
 
     def _thresholds(self) -> NDArray[np.bool_]:
-        """Which points are possible thresholds (K,): only the last of equal scores, as a threshold keeps them all."""
+        """Which points (K,) are possible thresholds: of equal scores the last, since all are kept together."""
         return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:
@@ -74,7 +74,7 @@ def f1_score(precision: Array, recall: Array) -> Array:
 
 
 def curve(matches: Matches) -> Curve:
-    """The precision-recall curve of all detections that are not ignored. Without selected labels recall is 0."""
+    """Precision-recall curve of all detections that are not ignored; recall is 0 without selected labels."""
     counted = matches.outcome != IGNORED
     order = np.argsort(-matches.scores[counted], kind="stable")
     hits = np.cumsum(matches.outcome[counted][order] == FOUND)
@@ -114,7 +114,7 @@ def figures_of_rule(matches: Matches, threshold: float, prefix: str) -> dict[str
 
 
 def figures_over_ious(by_iou: Sequence[Matches]) -> dict[str, float]:
-    """AP averaged over COCO_IOUS (ap50_95_...) and AP at an IoU of 0.75 (ap75_...), by three definitions of AP."""
+    """AP averaged over COCO_IOUS (ap50_95_...) and AP at an IoU of 0.75 (ap75_...), in three definitions."""
     curves = [curve(matches) for matches in by_iou]
     at_75 = curves[COCO_IOUS.index(0.75)]
     return {

@@ -1,4 +1,4 @@
-"""Output files of an evaluation: report.md, pictures, and the curve as a table. Works without a dataset."""
+"""Output files of an evaluation: report.md, pictures, and the precision-recall curve as a table."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -124,9 +124,9 @@ def spread_cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], ke
 def spread_note(resamples: Resamples) -> str:
     """Explanation of the brackets after a number, for reports."""
     count, unit = resamples.count, resamples.unit
-    if count < MIN_UNITS:
-        return f"in brackets: the value of each {unit}, because {count} of them are too few for an interval"
     plural = "trajectories" if unit == "trajectory" else f"{unit}s"
+    if count < MIN_UNITS:
+        return f"in brackets: the value of each {unit}; at least {MIN_UNITS} {plural} are needed for an interval"
     return (
         f"in brackets: 95 % bootstrap intervals ({RESAMPLES} resamples of {count} {plural}), or the value of each "
         f"{unit} if fewer than {MIN_UNITS} have labels"

@@ -40,7 +40,7 @@ def doubt_of(image: NDArray[np.uint8], detections: Detections) -> str | None:
 
 
 def agreement_of_light(image: NDArray[np.uint8], detections: Detections) -> tuple[float, int]:
-    """Return the agreement (0 to 1) of the light on the craters of highest score, and the number of craters."""
+    """Return the agreement (0 to 1) of the light on the craters of highest score, and their number."""
     height, width = image.shape
     best = np.argsort(-detections.scores, kind="stable")
     best = best[detections.scores[best] >= _MIN_SCORE]

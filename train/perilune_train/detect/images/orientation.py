@@ -1,4 +1,4 @@
-"""Orientation of a picture: the EXIF or TIFF tag 274, which states how to turn the stored picture upright.
+"""Orientation of a picture: the EXIF or TIFF tag 274 states how to turn the stored picture upright.
 
 The tag is applied in all formats, so pixels, labels and detections refer to the upright picture, which every viewer
 shows. Without it, the pixels of a rotated photograph would not match labels drawn on the upright picture.

@@ -45,7 +45,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, 
 
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
-    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) whose channels are blue, green, red."""
+    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3): blue, green, red."""
     # OpenCV takes integers, here sixteenths of a pixel, and counts from the centre of the first pixel.
     sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
     for x, y, a, b in sixteenths.astype(int).tolist():
@@ -62,7 +62,7 @@ def _colours(scores: NDArray[np.float64], threshold: float) -> list[tuple[int, i
 
 
 def _strip(width_px: int, side_px: int, threshold: float, count: str) -> NDArray[np.uint8]:
-    """A black strip (height, width, 3) with colour scale and text, which are cut off if the image is narrow."""
+    """A black strip (height, width, 3) with colour scale and text, cut off if the image is narrow."""
     height = max(round(_STRIP_FRACTION * side_px), 24)
     strip = np.zeros((height, max(width_px, 1), 3), np.uint8)
     scale, margin = height / 48, height // 4

@@ -45,7 +45,7 @@ def pictures_of(folder: Path, recursive: bool = False) -> list[Path]:
 
 
 def check_names(paths: list[Path], names: list[str]) -> None:
-    """Raise UserError if two pictures have equal names, because tables and overlays identify pictures by name."""
+    """Raise UserError if two pictures have equal names; tables and overlays identify pictures by name."""
     seen: set[str] = set()
     for path, name in zip(paths, names, strict=True):
         if name in seen:

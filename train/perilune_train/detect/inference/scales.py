@@ -1,4 +1,4 @@
-"""Detection on resized frames: enlargement brings small craters to the sizes that a network detects best."""
+"""Detection on resized frames: enlargement brings small craters to sizes that a network detects better."""
 
 import time
 

@@ -42,10 +42,10 @@ def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: Evaluatio
 
 @torch.no_grad()
 def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou: float) -> Tensor:
-    """Non-maximum suppression of N frames at once, on the tensors' device; keeps the boxes that `suppress` keeps.
+    """Non-maximum suppression of N frames at once, on the tensors' device.
 
-    Takes boxes (N, K, 4), scores (N, K) and a mask `allowed` (N, K) of the boxes to consider. Returns indices (N, M) of
-    the kept boxes of each frame, best first, padded with -1.
+    Keeps the boxes that `suppress` keeps. Takes boxes (N, K, 4), scores (N, K) and a mask `allowed` (N, K) of the boxes
+    to consider. Returns indices (N, M) of the kept boxes of each frame, best first, padded with -1.
 
     Boxes are processed in blocks by decreasing score. Within a block, the result of the greedy rule is a fixed point: a
     box is kept unless a kept box of a higher score overlaps it. An iteration converges to this fixed point, because the
@@ -92,7 +92,7 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
 
 
 def _overlap(first: Tensor, second: Tensor) -> Tensor:
-    """IoU (N, A, B) of boxes (N, A, 4) and (N, B, 4), rounded as OpenCV does; 1 for two boxes without area."""
+    """IoU (N, A, B) of boxes (N, A, 4) and (N, B, 4), rounded as in OpenCV; 1 for boxes without area."""
     a, b = first[:, :, None], second[:, None]
     # OpenCV computes 1 - IoU in float64, which is 0 for two boxes without area, and stores it as float32.
     empty = (a[..., 2:] == a[..., :2]).any(-1) & (b[..., 2:] == b[..., :2]).any(-1)

@@ -62,7 +62,7 @@ def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
 
 
 def guide_loss(masks: dict[str, Tensor], targets: Targets, size_px: tuple[int, int]) -> Tensor:
-    """Guidance loss: 1 - Pearson correlation of mask and craterness, averaged over frames and GUIDED gates.
+    """Guidance loss: 1 - Pearson correlation of mask and craterness, mean over frames and GUIDED gates.
 
     `masks` are the spatial masks (N, 1, h, w), by gate; `size_px` is the height and width of the images. The loss of a
     frame without craters is 1.

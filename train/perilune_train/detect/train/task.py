@@ -33,7 +33,7 @@ step; updating at every fourth step gives equal results."""
 
 
 def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> float:
-    """Factor on the learning rate: linear from nearly 0 to 1, then half a cosine to a hundredth at the last step."""
+    """Factor on the learning rate: rises linearly to 1, then falls as half a cosine to a hundredth."""
     warmup = min(warmup_steps, total_steps // 2)
     if step < warmup:
         return (step + 1) / warmup

@@ -1,6 +1,6 @@
-"""Choose the score threshold of a detector on validation frames, optionally also on varied copies of them.
+"""Choose the score threshold of a detector on validation frames.
 
-The copies have other contrast, blur and noise.
+Optionally also uses copies of the frames with other contrast, blur and noise.
 """
 
 from dataclasses import replace

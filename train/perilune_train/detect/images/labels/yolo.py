@@ -1,8 +1,8 @@
-"""YOLO labels: one text file per image, one line `class cx cy w h` per object, in fractions of the image size.
+"""YOLO labels: one text file per image, one line `class cx cy w h` per object.
 
-A line with a polygon (`class x1 y1 x2 y2 ...`) becomes the box around the polygon. In a line of six numbers, the last
-number (a score) is ignored. Numbers are separated by spaces, tabs or commas. An empty file means an image without
-objects.
+Coordinates are fractions of the image size. A line with a polygon (`class x1 y1 x2 y2 ...`) becomes the box around the
+polygon. In a line of six numbers, the last number (a score) is ignored. Numbers are separated by spaces, tabs or
+commas. An empty file means an image without objects.
 """
 
 from collections.abc import Mapping
