@@ -52,7 +52,7 @@ _COLUMNS = {
     "recall": "recall",
     "f1": "F1",
 }
-_LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
+_LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP of the {by} bins" for by in ("radius", "altitude", "sun")}
 
 
 def evaluate_again(
@@ -149,7 +149,8 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     write_markdown(
         out / "compare.md",
         "# Comparison of runs\n\n"
-        "In brackets: 95 % intervals, or the value of each unit if there are fewer than five.\n\n" + text,
+        "In brackets: 95 % intervals, or the value of each scene (trajectory, image) if there are fewer than five.\n\n"
+        + text,
     )
     draw_curves(curves, out / "precision_recall.png")
     mark_files(out, ("compare.md", "precision_recall.png"), "; ".join(marks))

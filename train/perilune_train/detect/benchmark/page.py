@@ -54,7 +54,7 @@ def page_of(score: Score, about: Sequence[str]) -> str:
 def _coverage(score: Score) -> list[str]:
     lines = []
     for part, (n_frames, n_locked) in score.frames_of.items():
-        whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
+        whole = "all frames" if n_frames == n_locked else f"**only {n_frames} of {n_locked} frames**"
         lines.append(f"`{part}`: {whole} of the shared manifest")
     return lines + [f"`{part}`: **not scored**" for part in part_names("detect") if part not in score.frames_of]
 

@@ -49,7 +49,7 @@ class FrameLabels:
 
 @dataclass(frozen=True, slots=True)
 class LabelLimits:
-    """Which craters are labels, which of them are selected, and which craters are ignored."""
+    """Limits that decide which craters are labels, which labels are selected, and which craters are ignored."""
 
     selection: Selection
     """Thresholds of the selected labels."""

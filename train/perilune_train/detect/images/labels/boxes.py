@@ -43,7 +43,7 @@ def around(points: Iterable[Any], path: Path, field: str) -> Box:
 
 
 def around_ellipse(centre: tuple[float, float], half: tuple[float, float], turn_deg: float = 0.0) -> Box:
-    """The box around an ellipse with semi-axes `half`; `turn_deg` is the angle of the first from x."""
+    """The box around an ellipse with semi-axes `half`, rotated about its centre by `turn_deg`."""
     cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     x, y = math.hypot(half[0] * cos, half[1] * sin), math.hypot(half[0] * sin, half[1] * cos)
     return centre[0] - x, centre[1] - y, centre[0] + x, centre[1] + y
