@@ -121,7 +121,6 @@ class _Bin(NamedTuple):
 
 
 def _of_matches(limits: _Bin, matches: Matches, threshold: float, resamples: Resamples) -> BinFigures:
-    """All metrics of the matches in a bin."""
     precision, recall, f1 = at_threshold(matches, threshold)
     spread = spreads(
         lambda drawn: {

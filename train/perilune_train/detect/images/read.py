@@ -329,7 +329,6 @@ def _check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> No
 
 
 def _nodata(tags: dict[int, Any]) -> float | None:
-    """The no-data value in GDAL's tag of a TIFF."""
     try:
         return float(str(tags.get(_NODATA_TAG)).strip("\0 "))
     except ValueError:
