@@ -1,7 +1,6 @@
-"""Plan of a counterfactual: some frames of a dataset, and the craters that are removed from its ground.
+"""Plan of a counterfactual: frames of a dataset, and the craters that are removed from its ground.
 
-The removed craters are so far apart that all can be removed in one rendering: each removal has the effect it would have
-alone.
+The removed craters are so far apart that one rendering without all of them shows the effect of each removal alone.
 """
 
 from dataclasses import replace
@@ -34,18 +33,21 @@ REMOVED_COLUMNS = {
     "reach_m": "float64",
     "n_frames": "int64",
 }
-"""Columns of the table of removed craters: scene and crater_id in the dataset, random seed of the scene, centre in O_L,
-diameter, ratio of depth to diameter, distance within which the removal changes the ground, and number of planned frames
-in which the crater is visible."""
+"""Columns of the table of removed craters, and their types.
+
+scene_id and crater_id are those of the dataset, and `seed` is the random seed of the scene. x_m and y_m are the centre
+in O_L, depth_ratio is the ratio of depth to diameter, and `reach_m` is the distance within which the removal changes
+the ground. n_frames counts the planned frames in which the crater is visible.
+"""
 _CRATER = ("scene_id", "crater_id", "x_m", "y_m", "age_myr", "origin")
 _N_SIZES, _N_DEPTHS = 3, 2
 
 
 def part_of(plan: Plan, split: str, n_frames: int, sun_azimuth_offset_deg: float = 0.0) -> Plan:
-    """At most `n_frames` frames of each trajectory, evenly spaced over one split, with the Sun's azimuth offset.
+    """At most `n_frames` frames of each trajectory, evenly spaced over its frames in one split.
 
-    Frames keep their ids, poses and random seeds. Trajectories and scenes without frames in the split are omitted.
-    Raises UserError if no frame is in the split.
+    The azimuth of the Sun is turned by `sun_azimuth_offset_deg`. Frames keep their ids, poses and random seeds.
+    Trajectories and scenes without frames in the split are omitted. Raises UserError if no frame is in the split.
     """
     trajectories: list[TrajectoryPlan] = []
     ranges: dict[str, range] = {}
@@ -55,7 +57,7 @@ def part_of(plan: Plan, split: str, n_frames: int, sun_azimuth_offset_deg: float
         if len(trajectories) > first:
             ranges[scene.scene_id] = range(first, len(trajectories))
     if not ranges:
-        raise UserError("--split", "", f"none in {split}", "a split that has frames")
+        raise UserError("--split", "", f"no frame in {split}", "a split that has frames")
     scenes = tuple(
         replace(scene, sun_azimuth_deg=(scene.sun_azimuth_deg + sun_azimuth_offset_deg) % 360)
         for scene in plan.scenes
@@ -88,12 +90,12 @@ def _flight(trajectory: TrajectoryPlan, indices: np.ndarray) -> Flight:
 
 
 def craters_to_remove(manifest: Dataset, plan: Plan, per_scene: int, seed: int) -> pd.DataFrame:
-    """The craters to remove from each scene of a plan, with REMOVED_COLUMNS; fewer than `per_scene` if not all fit.
+    """At most `per_scene` craters to remove from each scene of a plan, with REMOVED_COLUMNS.
 
     Each crater has a label in the selection `visible` in at least one planned frame of the manifest. The random draw by
-    `seed` takes about equal numbers from each class of diameter (three per scene) and of depth over diameter (two). The
-    reaches of two craters do not overlap. Craters of an elevation model are never removed. Raises UserError if the
-    manifest has no labels.
+    `seed` takes about equal numbers from each class: three classes of diameter per scene, each with two classes of
+    depth over diameter. The areas that two removals change do not overlap, so there may be fewer craters. Craters of an
+    elevation model are never removed. Raises UserError if the manifest has no labels.
     """
     removed = [pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in REMOVED_COLUMNS.items()})]
     if per_scene > 0:
@@ -110,7 +112,7 @@ def _candidates(manifest: Dataset, plan: Plan) -> pd.DataFrame:
     labels = read_labels(manifest)
     if not len(labels):
         expected = "a rendered dataset or its manifest, or --craters-per-scene 0"
-        raise UserError(manifest.store, "labels", "none, as in a plan", expected)
+        raise UserError(manifest.store, "labels", "no labels, as in a plan", expected)
     planned = {each.frame_id(index) for each in plan.trajectories for index in range(len(each.splits))}
     labels = labels[selected(labels, SELECTIONS["visible"]) & labels["frame_id"].isin(planned)]
     keys = ["scene_id", "crater_id"]
@@ -131,7 +133,9 @@ def _candidates(manifest: Dataset, plan: Plan) -> pd.DataFrame:
 
 
 def choose_apart(candidates: pd.DataFrame, n: int, rng: np.random.Generator) -> list[int]:
-    """Positions of at most `n` candidates whose reaches do not overlap, drawn from each class in turn.
+    """Row numbers of at most `n` candidates, drawn from each class in turn.
+
+    The circles with radius reach_m around the chosen craters do not overlap.
 
     Needs the columns x_m, y_m, reach_m, diameter_m and depth_ratio.
     """
@@ -152,7 +156,7 @@ def choose_apart(candidates: pd.DataFrame, n: int, rng: np.random.Generator) -> 
 
 
 def _classes(diameter_m: np.ndarray, depth_ratio: np.ndarray) -> np.ndarray:
-    """Class (N,) of each crater: equal numbers in each class of diameter and, within it, of depth ratio."""
+    """Class (N,) of each crater, by diameter and then by depth ratio, with equal numbers in each class."""
     classes = _N_DEPTHS * _ranked(diameter_m, _N_SIZES)
     for size in np.unique(classes):
         in_class = classes == size

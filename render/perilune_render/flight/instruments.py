@@ -30,7 +30,7 @@ _TOLERANCE_M = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """Mean angular rates and specific forces over consecutive intervals, from time 0 to the end of a trajectory."""
+    """Mean angular rates and specific forces over consecutive intervals of a trajectory, from time 0."""
 
     time_s: Array
     """End of each interval, seconds since the first frame (N,)."""
@@ -43,7 +43,7 @@ class Increments:
 
 
 def true_increments(motion: Motion, rate_hz: float) -> Increments:
-    """Increments without errors at a rate of `rate_hz` per second; the last interval may be shorter.
+    """Increments without errors, `rate_hz` per second; the last interval may be shorter.
 
     Rotating the attitude at the start of an interval by the angular rate times the interval gives exactly the attitude
     at its end. The specific force is integrated by Simpson's rule.
@@ -63,7 +63,7 @@ def true_increments(motion: Motion, rate_hz: float) -> Increments:
 
 
 def measured(true: Increments, grade: InertialGrade, seed: int) -> Increments:
-    """The increments as measured by an inertial unit of this grade, with the random seed of a trajectory."""
+    """The increments that an inertial unit of a grade measures; `seed` is the trajectory's random seed."""
     gyro, accelerometer = drawn_errors(GRADES[grade], true.interval_s, stream(seed, "inertial", grade))
     rate, force = true.angular_rate_radps + gyro, true.specific_force_mps2 + accelerometer
     return Increments(true.time_s, true.interval_s, rate, force)
@@ -80,7 +80,10 @@ class Ranges:
 
 
 def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, duration_s: float, seed: int) -> Ranges:
-    """Simulate the ranges along a trajectory with this random seed. The beam ignores boulders."""
+    """Simulate the altimeter's ranges along a trajectory; `seed` is its random seed.
+
+    The beam passes through boulders.
+    """
     time = np.arange(int(np.floor(duration_s * config.range_rate_hz + 1e-9)) + 1) / config.range_rate_hz
     beam = -motion.rotation_site_from_body_at(time)[:, :, 2]
     true_m = range_to_ground_m(scene, motion.path_at(time)[0], beam)
@@ -91,7 +94,7 @@ def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, dura
 def measure_ranges_of_frames(
     flight: Flight, frame_index: Sequence[int], scene: Scene, config: InstrumentsConfig, seed: int
 ) -> Ranges:
-    """Simulate one range at each frame of a flight, with its random seed.
+    """Simulate one range at each frame of a flight; `seed` is the random seed of its trajectory.
 
     The beam is along the axis of the camera.
     """
@@ -105,8 +108,9 @@ def measure_ranges_of_frames(
 def range_to_ground_m(scene: Scene, position_m: Array, direction: Array) -> Array:
     """Distances (N,) from positions (N, 3) along unit vectors (N, 3), O_L, to the ground, metres.
 
-    Each iteration computes the distance from the height of the ground below the last point of the ray. It converges
-    where the ground is less steep than the ray; elsewhere, and beyond the terrain, the distance is NaN.
+    Each iteration computes the distance from the height of the ground below the last point of the ray. The iteration
+    converges where the ground is less steep than the ray. The distance is NaN elsewhere, beyond the terrain, and for
+    rays that do not point downwards.
     """
     x, y, z = position_m.T
     dx, dy, dz = direction.T

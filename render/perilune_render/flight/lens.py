@@ -13,8 +13,8 @@ _LARGEST_COVER = 9
 def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
     """The camera of a configuration's section. Raises UserError if its distortion is too strong.
 
-    It is too strong if the distorted image folds back on itself, or if the pinhole camera that covers the view has more
-    than _LARGEST_COVER times the camera's pixels.
+    The distortion is too strong if the distorted image folds back on itself, or if the pinhole camera that covers the
+    view has more than _LARGEST_COVER times the camera's pixels.
     """
     width, height, lens = config.width_px, config.height_px, config.distortion
     focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)

@@ -15,17 +15,18 @@ from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 _N_WAVES = 256
 """Number of random waves in each smooth process."""
 _MAX_DRAWS = 1000
+"""Largest number of draws to find a motion within `flight.max_perturbation_mps2`."""
 _STEP = 2 * np.pi / 20
-"""Time step of the check of a draw's acceleration, radians of its fastest wave."""
+"""Time step for checking the acceleration of a draw, as phase of its fastest wave, radians."""
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothProcess:
-    """A draw of K independent stationary processes of unit variance with the kernel exp(-dt^2 / (2 tau^2)).
+    """A draw of K independent stationary processes of unit variance.
 
-    It is a sum of random waves (random Fourier features, Rahimi & Recht 2007), 256 for each process. Unlike samples
-    from a Cholesky factor, the sum is smooth at any frame rate, and its derivatives are exact. Since the number of
-    waves is finite, the variance of one draw deviates from the kernel's by up to about 5 %.
+    The kernel is exp(-dt^2 / (2 tau^2)). Each process is a sum of 256 random waves (random Fourier features, Rahimi &
+    Recht 2007). Unlike samples from a Cholesky factor, the sum is smooth at any frame rate, and its derivatives are
+    exact. Since the number of waves is finite, the variance of one draw deviates from the kernel's by up to about 5 %.
     """
 
     omega_radps: Array
@@ -45,7 +46,7 @@ class SmoothProcess:
         return SmoothProcess(self.omega_radps[axes], self.amplitude[:, axes])
 
     def at(self, time_s: Array) -> tuple[Array, Array, Array]:
-        """Values (N, K), first derivatives (per second) and second derivatives (per second squared) at times (N,)."""
+        """Values, first and second time derivatives, (N, K) each, at times (N,), seconds."""
         angle = np.asarray(time_s)[:, None, None] * self.omega_radps
         cos, sin = np.cos(angle), np.sin(angle)
         waves = self.amplitude[0] * cos + self.amplitude[1] * sin
@@ -58,8 +59,8 @@ class Motion:
     """Position and attitude of the lander as functions of time.
 
     Position and attitude deviate from the nominal motion by independent stationary Gaussian processes with the kernel
-    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper states "small perturbations with Gaussian distribution"
-    without sizes; white noise on each frame would not be a possible motion of a lander.
+    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper of Song et al. states "small perturbations with Gaussian
+    distribution" without sizes. White noise on each frame would not be a possible motion of a lander.
     """
 
     nominal: NominalTrajectory
@@ -86,7 +87,7 @@ class Motion:
         )
 
     def largest_perturbation_mps2(self) -> float:
-        """Largest acceleration of the perturbation between the first and the last frame, metres per second squared.
+        """Largest acceleration of the perturbation during the trajectory, metres per second squared.
 
         Evaluated at 20 or more steps in the period of each wave.
         """
@@ -105,7 +106,7 @@ class Motion:
 
 
 def draw_motion(config: FlightConfig, seed: int) -> Motion:
-    """Draw the motion of a random seed.
+    """Draw the motion of a lander from a random seed.
 
     With `max_perturbation_mps2`, motions are drawn until the acceleration of the perturbation never exceeds this limit.
     Raises UserError if all of a thousand draws exceed it.

@@ -2,7 +2,7 @@
 
 The plan depends on the configuration alone. A scene is planned as a seed, which determines its craters and boulders
 (`perilune_render.terrain.scene.grow_scene`). The trajectories of a scene are derived from its seed on demand, and a
-flight is drawn at its first use, so that a plan of many millions of frames is made in seconds.
+flight is drawn at its first use. A plan of many millions of frames is therefore made in seconds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ class ScenePlan:
     """A scene: one terrain with one direction of the Sun."""
 
     scene_id: str
-    """Unique in the dataset."""
+    """Id, unique in the dataset."""
     seed: int
     """Random seed of the scene."""
     sun_azimuth_deg: float
@@ -47,9 +47,9 @@ class TrajectoryPlan:
     """One trajectory."""
 
     scene_id: str
-    """Id of its scene."""
+    """Id of the trajectory's scene."""
     trajectory_id: str
-    """Unique in its scene."""
+    """Id, unique in the scene."""
     seed: int
     """Random seed of the trajectory."""
     frame_index: Sequence[int]
@@ -59,7 +59,7 @@ class TrajectoryPlan:
     draw_flight: Callable[[], Flight]
     """Draws and returns the flight."""
     is_drawn: bool = True
-    """Whether the flight follows from the seed; otherwise it is read from a manifest."""
+    """Whether the flight follows from the seed; False for flights from a manifest or a pose file, and for surveys."""
     camera: str | None = None
     """Name of the camera if the body has several; None for a single camera without a name."""
     origin: Callable[[int], str] | None = None
@@ -118,7 +118,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class _Drawn(Sequence[TrajectoryPlan]):
-    """The trajectories of a configuration."""
+    """The trajectories of a configuration, each of which is built when it is accessed."""
 
     settings: KindConfig
     """Settings of the dataset."""
@@ -127,7 +127,7 @@ class _Drawn(Sequence[TrajectoryPlan]):
     scenes: tuple[ScenePlan, ...]
     """All scenes."""
     rig: Rig
-    """Cameras; each sees every descent."""
+    """Cameras by name; each camera sees every descent."""
     splits: np.ndarray
     """Index in SPLITS of each frame's split (n_scenes, trajectories_per_scene, n_frames) int8."""
 
@@ -150,7 +150,10 @@ class _Drawn(Sequence[TrajectoryPlan]):
 
 
 def seen_by(body: TrajectoryPlan, name: str | None, rig: Rig) -> TrajectoryPlan:
-    """The trajectory of a camera on a body; unchanged for a camera without a name."""
+    """The trajectory of a camera on a body.
+
+    A camera without a name has the trajectory of the body.
+    """
     if name is None:
         return body
     trajectory_id = trajectory_of_camera(name, body.trajectory_id)
@@ -162,7 +165,10 @@ def _seen(body: TrajectoryPlan, camera: MountedCamera) -> Flight:
 
 
 def drawn_scene(config: DatasetConfig, sun: SunConfig, ground: str, number: int) -> ScenePlan:
-    """The plan of a scene: its seed is derived from the configuration's seed and name, `ground` and the number."""
+    """The plan of a scene.
+
+    Its seed is derived from the seed and name of the configuration, from `ground`, and from the scene's `number`.
+    """
     seed = derived_seed(config.seed, config.name, ground, "scene", number)
     drawn = stream(seed, "sun")
     azimuth = drawn.uniform(sun.azimuth_deg.low, sun.azimuth_deg.high)
@@ -190,7 +196,7 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
     """Splits as indices in SPLITS (n_scenes, trajectories_per_scene, n_frames) int8.
 
-    A unit of `split_by` is never divided.
+    `split_by` states whether all frames of a scene, or all frames of a trajectory, are in the same split.
     """
     shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
     n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1

@@ -1,6 +1,7 @@
-"""Check the poses of a plan against the ground: the camera must be above it, and frames must show only ground.
+"""Check the poses of a plan against the ground.
 
-If the ground extends to the horizon, frames may show the sky, but must also show ground.
+The camera must be above the ground, and frames must show only ground. If the ground extends to the horizon, frames may
+show the sky, but must also show ground.
 """
 
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
 _CHECKED_FRAMES = 20_000
 """Approximate number of frames that `check_plan` checks, which takes a few seconds."""
 _POINTS_PER_SIDE = 8
+"""Number of tested points along each side of the image."""
 _UNIT_TOLERANCE = 1e-6
 
 
@@ -33,7 +35,7 @@ class Poses:
     """Poses of the camera in N frames of one scene."""
 
     frame_id: Sequence[str]
-    """Ids of the frames (N,), for messages; with the line or row in the user's file, if any."""
+    """Names of the frames (N,) for messages: the id, with the line or row in the user's pose file if there is one."""
     position_m: Array
     """Position of the camera, O_L, metres (N, 3)."""
     rotation_wxyz: Array
@@ -56,11 +58,11 @@ def _named(trajectory: TrajectoryPlan, index: int) -> str:
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
-    """Check without terrain heights that the Sun is up, that poses are over the mesh, and that ground is in view.
+    """Check a plan before the heights of the ground are known.
 
-    Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks the other scenes once their
-    ground is known. Raises UserError with `where` (the configuration or the manifest) and the first scene or frame that
-    fails.
+    The Sun must be up, poses must be over the mesh, and ground must be in view. Poses are checked in the first scenes,
+    up to about _CHECKED_FRAMES; `check_poses` checks the other scenes once their ground is known. Raises UserError with
+    `where` (the configuration or the manifest) and the first scene or frame that fails.
     """
     for scene in plan.scenes:
         if not 0 < scene.sun_elevation_deg <= 90:
@@ -84,12 +86,12 @@ def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene
 
 
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
-    """Check poses against the ground of a scene: valid positions (`check_places`), and ground in the frames.
+    """Check poses against the ground of a scene.
 
-    The ray through every tested point of the image border must hit the mesh, unless the scene's views may show the sky.
-    From above, the mesh is a square. A ray that begins above the ground hits the mesh if and only if the ray is below
-    the mesh's edge at the point where it leaves this square. Raises UserError with `where` and the first frame that
-    fails.
+    Positions must be valid (`check_places`), and frames must show ground. The ray through every tested point of the
+    image border must hit the mesh, unless the scene's views may show the sky. Seen from above, the mesh is a square. A
+    ray that begins above the ground hits the mesh if and only if the ray is below the edge of the mesh where it leaves
+    this square. Raises UserError with `where` and the first frame that fails.
     """
     horizon = scene.view is not None and scene.view.horizon
     rays = _check_mesh(poses, camera, scene.grid, where, horizon=horizon)
@@ -108,7 +110,7 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
 
 
 def check_places(poses: Poses, scene: Scene, where: object) -> None:
-    """Check that cameras are over the mesh of a scene, and MIN_CLEARANCE_M above its ground and its boulders.
+    """Check that cameras are over a scene's mesh, and MIN_CLEARANCE_M above its ground and boulders.
 
     In scenes with horizon, cameras must be low enough for the horizon to lie within the mesh. Raises UserError with
     `where` and the first frame that fails.
@@ -158,7 +160,7 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, hori
 
 
 def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> None:
-    """Check that poses are finite and over the mesh, and with `horizon` that the mesh extends to their horizon."""
+    """Check that poses are finite and over the mesh, and with `horizon` that it extends to the horizon."""
     position, rotation = poses.position_m, poses.rotation_wxyz
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= _UNIT_TOLERANCE
     _refuse(
@@ -213,7 +215,7 @@ def _edge_points(camera: Camera) -> Array:
 
 
 def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Array, Array]:
-    """Height, x and y (N, S) where downward rays (N, S, 3) leave the square of half side `half_m`, metres."""
+    """Height, x and y (N, S) where downward rays (N, S, 3) leave the square of half-width `half_m`."""
     start = position_m[:, None, :2]
     with np.errstate(divide="ignore"):
         distance = np.where(
@@ -225,7 +227,10 @@ def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Arra
 
 
 def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, expected) -> None:
-    """Raise UserError for the first true value of `faulty` (N,); `found` and `expected` return texts for its index."""
+    """Raise UserError for the first true value of `faulty` (N,).
+
+    `found` and `expected` are functions from its index to texts of the message.
+    """
     if faulty.any():
         n = int(np.argmax(faulty))
         raise UserError(where, f"frame {poses.frame_id[n]}", found(n), expected(n))

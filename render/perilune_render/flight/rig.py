@@ -1,7 +1,7 @@
-"""The rig: the cameras on the body, and the poses of each along a trajectory of the body.
+"""The rig: the cameras on the body, and the poses of each camera along a trajectory of the body.
 
-The body's pose is given as the pose of a camera with the default mounting: at the body's origin, looking along -Z_B. A
-lander with a single camera has this camera.
+The body's pose is given as the pose of a camera with the default mounting: at the body's origin, looking along -Z_B.
+The single camera of `dataset.camera` has this mounting.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,8 @@ from perilune_shared.geometry.frames import (
 )
 
 _LOWEST_RAY = 0.01
-"""Smallest component along -Z_B of a unit ray through a corner of the image; below it, the image shows the horizon."""
+"""Smallest component along -Z_B of a unit ray through a corner of the image. With a smaller component, the image counts
+as showing the horizon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +32,9 @@ class MountedCamera:
     """A camera on the body."""
 
     camera: Camera
-    """Camera of its frames."""
+    """Camera of the frames."""
     exr_camera: Camera
-    """Camera of its renderings and EXRs: a pinhole that covers the view of `camera`."""
+    """Camera of the renderings and EXRs: a pinhole that covers the view of `camera`."""
     rotation_camera_from_body: Array
     """Rotation matrix (3, 3)."""
     position_in_body_m: Array
@@ -69,10 +70,10 @@ class MountedCamera:
         return replace(seen, velocity_mps=velocity, angular_velocity_radps=turn)
 
     def levelled(self) -> Camera:
-        """A pinhole at the body's origin, with the default attitude, that sees all ground that this camera sees.
+        """A pinhole with the default mounting that sees all ground that this camera sees.
 
         Its focal length is so large that its pixels cover no more ground than the smallest pixel of this camera. Raises
-        UserError if the camera could see the horizon of a level body.
+        UserError if this camera could see the horizon while the body is level.
         """
         if np.array_equal(self.rotation_camera_from_body, ROTATION_CAMERA_FROM_BODY):
             return self.exr_camera

@@ -1,7 +1,7 @@
-"""Poses of the camera during one frame: during the readout of its rows and during the exposure.
+"""Poses of the camera during one frame, for the readout of the rows and for the exposure.
 
-The camera keeps its velocity in O_L and its angular velocity in O_C. Times are seconds from the middle of the exposure
-of the middle row, to which the pose of a frame refers.
+The velocity in O_L and the angular velocity in O_C are constant during a frame. Times are seconds from the middle of
+the exposure of the middle row, to which the pose of a frame refers.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 Pose = tuple[Array, Array]
 """Position of the camera, O_L, metres (3,), and rotation_camera_from_site (3, 3)."""
 _SKY_M = 1e9
+"""Depth assumed for pixels that show the sky, metres."""
 
 
 def moved(pose: Pose, velocity_mps: Array, angular_velocity_radps: Array, time_s: float) -> Pose:
@@ -36,7 +37,7 @@ class RowPoses:
     """Function from a time, seconds, to the pose."""
 
     def bands(self, n_bands: int) -> list[tuple[np.ndarray, Pose]]:
-        """Pixels (h, w) bool of each of `n_bands` bands of neighbouring rows, with the pose in the middle of each."""
+        """Pixels (h, w) bool of `n_bands` bands of neighbouring rows, and the pose at each band's mean time."""
         band = np.arange(len(self.time_s)) * n_bands // len(self.time_s)
         of_pixel = band[self.row]
         return [(of_pixel == k, self.pose_at(float(self.time_s[band == k].mean()))) for k in range(n_bands)]
@@ -61,7 +62,10 @@ def row_times_s(n_rows: int, row_time_s: float) -> Array:
 
 
 def sensor_rows(camera: Camera, exr_camera: Camera) -> np.ndarray:
-    """Row of `camera` that sees each pixel of `exr_camera` (h, w) int64; outside its image, the nearest row."""
+    """Row of `camera` that sees each pixel of `exr_camera` (h, w) int64.
+
+    Pixels outside the image of `camera` get the nearest row.
+    """
     row = camera.project(exr_camera.rays(exr_camera.pixel_centres()))[..., 1]
     # Far outside the image the distortion may fold back; those pixels are not used.
     return np.clip(np.floor(np.nan_to_num(row)), 0, camera.height_px - 1).astype(np.int64)

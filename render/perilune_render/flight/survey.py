@@ -1,4 +1,4 @@
-"""Plan of a survey: a stereo pair of images from orbit of every scene of another plan, with another Sun."""
+"""Plan of a survey: a stereo pair of images from orbit of every scene of a plan, with another Sun."""
 
 from dataclasses import replace
 from functools import partial
@@ -22,17 +22,17 @@ there may be no relief."""
 _TILE_PX = 32
 _LARGEST_SIDE_PX = 8192
 _BETWEEN_S = 100.0
-"""Time between the two images. It is so long that the camera is slow and moves far less than a pixel during an
-exposure; on a real orbiter, motion compensation has this effect."""
+"""Time between the two images, seconds. It is so long that the camera moves far less than a pixel during an exposure;
+on a real orbiter, motion compensation has this effect."""
 _CAMERA_FROM_SITE_LEVEL = np.diag([1.0, -1.0, -1.0])
 
 
 def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
-    """The survey of the scenes of a plan, by `config.survey`: one trajectory with two frames for each scene.
+    """The survey of the scenes of a plan: one trajectory with two frames for each scene.
 
-    The ground equals the ground of the descents byte for byte. The camera is at y = 0, first at negative x (east) and
-    then at positive x (west), and looks towards the site. Raises UserError if the ground is made of several meshes, or
-    if the camera would be too large or not above the ground.
+    `config.survey` states camera and Sun. The ground equals the ground of the descents byte for byte. The camera is at
+    y = 0, first at negative x (east) and then at positive x (west), and looks towards the site. Raises UserError if the
+    ground is made of several meshes, or if the camera would be too large or not above the ground.
     """
     survey = config.survey
     if survey is None:
@@ -50,9 +50,10 @@ def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
 
 
 def survey_camera(survey: SurveyConfig, reach_m: float) -> Camera:
-    """A square pinhole that shows the ground up to a share of `reach_m` on the far side of the site.
+    """A square pinhole that shows the ground up to _SHARE_OF_GROUND of `reach_m` beyond the site.
 
-    Raises UserError if it would have more than _LARGEST_SIDE_PX on a side.
+    Raises UserError if the camera would not be over the ground, or if a side of the image would have fewer than
+    _TILE_PX or more than _LARGEST_SIDE_PX pixels.
     """
     tilt = np.radians(survey.convergence_deg / 2)
     beside_m = survey.altitude_m * np.tan(tilt)
@@ -74,7 +75,7 @@ def _lit(scene: ScenePlan, survey: SurveyConfig) -> ScenePlan:
 
 
 def _pair(descents: Plan, scene_id: str, survey: SurveyConfig) -> TrajectoryPlan:
-    """The two images of a scene; they take the split of its first descent."""
+    """The two images of a scene, in the split of the scene's first descent."""
     first = descents.of_scene(scene_id)[0]
     splits = (first.splits[0],) * 2
     return TrajectoryPlan(scene_id, "survey", first.seed, range(2), splits, partial(_flight, survey), is_drawn=False)
@@ -92,6 +93,9 @@ def _flight(survey: SurveyConfig) -> Flight:
 
 
 def _turned(angle_rad: float) -> Array:
-    """Rotation (3, 3) about the camera's y; a positive angle moves the optical axis from straight down towards -x."""
+    """Rotation (3, 3) about the camera's y.
+
+    A positive angle moves the optical axis from straight down towards -x.
+    """
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])

@@ -31,7 +31,7 @@ class Flight:
 
     @property
     def rotation_camera_from_site(self) -> Array:
-        """Matrices (N, 3, 3), computed from the quaternions, so that the manifest holds exactly the rendered pose."""
+        """Matrices (N, 3, 3). They are computed from the quaternions, so a manifest has the rendered poses."""
         return matrix_from_quaternion(self.rotation_wxyz)
 
 

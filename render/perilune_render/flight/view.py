@@ -14,6 +14,7 @@ from perilune_shared.geometry.frames import Array
 _N_ALTITUDES = 400
 _N_HEIGHTS = 100
 _WIDEST_RAD = np.radians(80)
+"""Largest angle from straight down at which frames may show ground, radians."""
 _N_DISTANCES, _N_PLACES = 200, 1000
 _HILL_M = 64.0
 """Height of the largest hills that the relief and the craters of default settings make, metres."""
@@ -30,7 +31,7 @@ def view_of(config: DatasetConfig, rig: Rig, kind: str) -> ViewEnvelope:
 
 
 def scene_view(scene: SceneConfig, *cameras: Camera) -> ViewEnvelope:
-    """The views of a given scene, for pinhole cameras. Raises UserError if it has none."""
+    """The views of a given scene, for pinhole cameras. Raises UserError if the scene has no views."""
     if not scene.views:
         raise UserError("configuration", "dataset.scene.views", "none", "at least one height_m with its reach_m")
     height, reach = (np.array([getattr(view, name) for view in scene.views]) for name in ("height_m", "reach_m"))
@@ -41,10 +42,11 @@ def scene_view(scene: SceneConfig, *cameras: Camera) -> ViewEnvelope:
 
 
 def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
-    """Smallest distance from any camera to the ground, and the ground's distance from the site: both (M,), metres.
+    """Smallest distance of a camera from the ground, by the ground's distance from the site.
 
-    Cameras at the distance `reach_m[i]` from the site are at `height_m[i]` or above, with linear interpolation.
-    The ground extends beyond the horizon of the highest camera to where a hill of height _HILL_M is hidden.
+    Returns both distances, (M,) each, metres. Cameras at the distance `reach_m[i]` from the site are at `height_m[i]`
+    or above, with linear interpolation. The ground extends beyond the horizon of the highest camera to where a hill of
+    height _HILL_M is hidden.
     """
     edge = reach_m[-1] + float(horizon_m(height_m[-1]) + horizon_m(_HILL_M))
     distance = np.union1d(np.geomspace(min(height_m[0], reach_m[0]), edge, _N_DISTANCES), reach_m)
@@ -54,9 +56,10 @@ def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
 
 
 def horizon_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
-    """The views up to the horizon from all trajectories of a flight, up to three standard deviations from the nominal.
+    """The views up to the horizon from all trajectories of a flight.
 
-    Raises UserError if the trajectories can begin above HIGHEST_M.
+    Trajectories are up to three standard deviations from the nominal trajectory. Raises UserError if the trajectories
+    can begin above HIGHEST_M.
     """
     altitude, spread = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, _N_ALTITUDES), _spread_m(flight)
     highest = flight.start_altitude_m + spread
@@ -80,10 +83,7 @@ def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
 
 
 def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
-    """The envelope of several views, with the largest focal length.
-
-    Heights are scaled to this focal length.
-    """
+    """The envelope of several views, with their largest focal length, to which heights are scaled."""
     focal = max(view.focal_px for view in views)
     reach = np.unique(np.concatenate([view.reach_m for view in views]))
     heights = []
@@ -101,9 +101,10 @@ def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
 
 
 def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
-    """The views of a camera on all trajectories of a flight, up to three standard deviations from the nominal one.
+    """The views of a camera on all trajectories of a flight.
 
-    Raises UserError if frames could show the horizon.
+    Trajectories are up to three standard deviations from the nominal trajectory. Raises UserError if frames could show
+    the horizon.
     """
     angle = view_angle(camera, flight)
     if angle > _WIDEST_RAD:
@@ -124,13 +125,13 @@ def _spread_m(flight: FlightConfig) -> float:
 def _lowest_m(flight: FlightConfig, altitude_m: Array) -> Array:
     """Lowest height above the ground at nominal altitudes (N,).
 
-    The ground may rise by a twentieth of the altitude.
+    The ground may rise by a twentieth of the altitude. The result is at least a fifth of the altitude.
     """
     return np.maximum(0.95 * altitude_m - _spread_m(flight), 0.2 * altitude_m)
 
 
 def view_angle(camera: Camera, flight: FlightConfig) -> float:
-    """Largest angle from straight down, along either image axis, at which a frame shows the ground, radians."""
+    """Largest angle from straight down, along either image axis, at which a frame shows ground, radians."""
     half_view = max(
         max(camera.cx_px, camera.width_px - camera.cx_px) / camera.fx_px,
         max(camera.cy_px, camera.height_px - camera.cy_px) / camera.fy_px,
@@ -154,7 +155,7 @@ def nominal_distance_m(flight: FlightConfig, altitude_m: Array) -> Array:
 
 
 def half_view_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
-    """Largest |dx| or |dy| between the point below the camera and level ground in a frame at this altitude, metres.
+    """Largest |dx| or |dy| from the point below the camera to level ground in view, metres.
 
     The camera's axes are parallel to the axes of O_L except for small rotations, so a frame covers a square along the
     axes. Includes three standard deviations of tilt and rotation.

@@ -30,7 +30,10 @@ class Attitudes:
         return np.where(q[:, :1] < 0, -q, q) + 0.0
 
     def alternatives(self) -> list[list[tuple[str, "Attitudes"]]]:
-        """Other interpretations of the numbers, with hints: first those that differ in one way, then in two ways."""
+        """Other interpretations of the numbers, each with a hint for the user.
+
+        The first list differs from this interpretation in one way, the second list in two ways.
+        """
         shift, order = (-1, "w first (qw qx qy qz)") if self.scalar_last else (1, "w last (qx qy qz qw)")
         reordered = replace(self, quaternion_wxyz=np.roll(self.quaternion_wxyz, shift, axis=1))
         is_default = np.array_equal(self.axes, np.eye(3))

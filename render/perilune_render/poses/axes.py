@@ -13,9 +13,9 @@ NAMED_AXES = {"opencv": "x,y,z", "blender": "x,-y,-z"}
 
 
 def camera_axes(text: str, where: object) -> Array:
-    """The rotation (3, 3) from a camera's frame to right, down, forward, from a text such as `x,y,z` or `blender`.
+    """The rotation (3, 3) from a camera's axes to right, down, forward.
 
-    Raises UserError that names `where`.
+    `text` is a convention such as `blender`, or three axes such as `x,y,z`. Raises UserError that names `where`.
     """
     stated = text.strip().lower()
     names = [name.strip() for name in NAMED_AXES.get(stated, stated).split(",")]

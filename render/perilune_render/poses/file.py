@@ -1,10 +1,12 @@
-"""Read poses from a file: CSV, Parquet, TUM (`timestamp tx ty tz qx qy qz qw`), EuRoC, or KITTI (3 x 4 matrices).
+"""Read poses from a file in the format CSV, Parquet, TUM, EuRoC or KITTI.
+
+The columns of TUM are `timestamp tx ty tz qx qy qz qw`; KITTI has 3 x 4 matrices.
 
 The frame of the positions is stated in the file: in text files by a comment line `# frame: O_L` above the first pose
 (in CSV above the column names), in Parquet by the key `frame` of the metadata.
 
 - `O_L`: x_m, y_m, z_m of the landing site's frame.
-- `O_W`: the same axes, with the origin at `# origin_m: x y z`, the lander's first position in O_L.
+- `O_W`: x_m, y_m, z_m along the axes of O_L. `# origin_m: x y z` states the origin, the lander's first position in O_L.
 - `selenographic`: latitude_deg, longitude_deg, and height_m above the plane of O_L.
 
 Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns qw, qx, qy, qz, like `rotation_wxyz` in
@@ -46,7 +48,9 @@ _DIRECTIONS = ("camera_from_site", SITE_FROM_CAMERA)
 _LENGTH_TOLERANCE = 0.01
 """Largest deviation of a quaternion's length from 1 that rounded digits can explain."""
 _LARGEST_M = 1e6
+"""Largest distance of a camera from the site, metres."""
 _SAME_SITE_M = 0.1
+"""Smallest distance between the site in a file and the scene's site at which the file is rejected, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +68,7 @@ class GivenPoses:
     sun_deg: Array | None
     """Azimuth, clockwise from north, and elevation of the Sun, degrees (N, 2); None if the file has no Sun."""
     trajectory: np.ndarray
-    """Number of the trajectory of each frame, from 0, not descending (N,)."""
+    """Number of the trajectory of each frame, from 0, non-decreasing (N,)."""
     angular_velocity_radps: Array | None = None
     """Angular velocity of the camera, O_C, radians per second (N, 3); None if not in the file."""
 
@@ -154,7 +158,10 @@ def _vectors(table: PoseTable, names: tuple[str, ...]) -> Array:
 
 
 def _axes(path: Path, stated: str | None, given: str | None) -> Array:
-    """The rotation (3, 3) to right, down, forward from the camera's axes. Raises UserError."""
+    """The rotation (3, 3) from the camera's axes to right, down, forward.
+
+    Raises UserError for invalid axes, or if file and option state different axes.
+    """
     known = [camera_axes(text, where) for text, where in ((stated, path), (given, "--camera-axes")) if text is not None]
     if len(known) == 2 and not np.array_equal(known[0], known[1]):
         raise UserError("--camera-axes", "", given, f"{stated}, as {path} states")
@@ -200,7 +207,7 @@ def _origin(path: Path, stated: dict[str, str]) -> Array:
 
 
 def _attitudes(table: PoseTable, axes: Array) -> Attitudes:
-    """The attitudes of a table. Raises UserError for a quaternion that is not of length 1."""
+    """The attitudes of a table. Raises UserError for a quaternion whose length is not 1."""
     direction = table.stated.get("rotation", _DIRECTIONS[0])
     if direction not in _DIRECTIONS:
         raise UserError(table.columns.path, "rotation", direction, " or ".join(_DIRECTIONS))
@@ -218,7 +225,10 @@ def _attitudes(table: PoseTable, axes: Array) -> Attitudes:
 
 
 def _trajectories(table: PoseTable) -> np.ndarray:
-    """Number of each pose's trajectory, from the column `trajectory`, in which equal values must be consecutive."""
+    """Number (N,) of each pose's trajectory, from the column `trajectory`.
+
+    Raises UserError if the poses of a trajectory are not consecutive.
+    """
     if TRAJECTORY not in table.columns:
         return np.zeros(table.columns.n_rows, int)
     names = table.columns.texts(TRAJECTORY)

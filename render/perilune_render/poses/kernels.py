@@ -1,4 +1,4 @@
-"""Load SPICE kernels. A meta-kernel names further files, and all are checked before SPICE opens any."""
+"""Load SPICE kernels, after checking them and all files that meta-kernels name."""
 
 import contextlib
 import stat
@@ -11,6 +11,7 @@ from perilune_shared.errors import UserError
 _LISTED = "KERNELS_TO_LOAD"
 _VALUES, _SYMBOLS = "PATH_VALUES", "PATH_SYMBOLS"
 _MAX_LISTED = 1000
+"""Largest number of texts in a variable of a meta-kernel."""
 _MAX_CHARACTERS = 1000
 """Maximum length of a path in a meta-kernel; SPICE itself allows 255."""
 
@@ -26,10 +27,10 @@ def library() -> Any:
 
 @contextlib.contextmanager
 def loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
-    """Load kernels, and the kernels that meta-kernels name, into an empty pool; clear the pool at the end.
+    """Load kernels, and the kernels that meta-kernels name, into a pool that is cleared before and after.
 
-    Raises UserError for a file that is missing or is not a regular file, and for a meta-kernel within a meta-kernel,
-    before SPICE opens it: opening a pipe or a device can block for ever.
+    Each file is checked before SPICE opens it, since opening a pipe or a device can block for ever. Raises UserError
+    for a file that is missing or is not a regular file, and for a meta-kernel within a meta-kernel.
     """
     spice.kclear()
     try:

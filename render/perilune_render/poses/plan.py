@@ -1,4 +1,4 @@
-"""The plan of given poses: one ground, the user's trajectories, and the views for which the ground is made."""
+"""The plan of given poses: the user's trajectories over one ground, and the views that it must cover."""
 
 from dataclasses import replace
 from functools import partial
@@ -22,13 +22,15 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 SAME_SUN_DEG = 0.05
-"""Frames whose Suns differ by less than this share the Sun of the first such frame; a tenth of the Sun's diameter,
-degrees."""
+"""Angle, degrees, a tenth of the Sun's diameter. Frames whose Suns differ by a smaller angle share the Sun of the first
+of these frames."""
 _MAX_SCENES = 1000
 _N_VIEWS = 24
+"""Largest number of views that are made from poses."""
 _LOWER = 0.9
-"""Smallest height above the ground divided by the height above z = 0: the ground may rise towards the camera."""
+"""Smallest height of a camera above the ground, divided by its height above z = 0; the ground may be above z = 0."""
 _WIDER = 1.05
+"""Factor on horizontal distances, a margin for relief."""
 _SPLIT = "test"
 _N_CHECKED = 1000
 """Number of evenly spaced poses whose attitudes are checked for other interpretations of the file."""
@@ -45,10 +47,10 @@ def trajectory_seed(seed: int, number: int) -> int:
 
 
 def views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
-    """Views that contain all ground seen by any camera from any pose, with margins for relief, to three digits.
+    """Views that contain all ground seen by any camera from any pose, with margins for relief.
 
-    The ground is taken to be at most a tenth of a camera's height above or below the plane z = 0. Raises UserError for
-    a pose that is not above the plane or that shows the horizon.
+    Heights and reaches are rounded to three digits. The ground is taken to be at most a tenth of a camera's height
+    above or below the plane z = 0. Raises UserError for a pose that is not above the plane or that shows the horizon.
     """
     seen = [_reach(poses, mounted, name, where) for name, mounted in rig.items()]
     height, reach = (np.concatenate(each) for each in zip(*seen, strict=True))
@@ -102,8 +104,8 @@ def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tu
 def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: bool) -> None:
     """Raise UserError if attitudes miss the ground and another interpretation shows it in all frames.
 
-    The error names that interpretation. Checks up to _N_CHECKED poses; other poses that miss the ground are rejected
-    later.
+    The error names the other interpretation. Checks up to _N_CHECKED poses; other poses that miss the ground are
+    rejected later.
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _N_CHECKED)).round().astype(int))
     position = poses.position_m[chosen]
@@ -129,12 +131,12 @@ def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: boo
                 else ("a view with the horizon", "a view of the ground alone", "; or dataset.scene.horizon=true")
             )
             found = f"{view}, as in {share}"
-            expected = f"{ground}, as in all frames by {', or by '.join(fitting)}{sky}"
+            expected = f"{ground}, which all frames show with {', or with '.join(fitting)}{sky}"
             raise UserError(where, f"{poses.origin(n)}: pose at {poses.time_s[n]:g} s", found, expected)
 
 
 def _is_ground_shown(position_m: Array, rotation_wxyz: Array, rig: Rig, *, horizon: bool) -> np.ndarray:
-    """Whether each pose of the body (N,) shows nothing but ground in all cameras, or with `horizon` some ground."""
+    """Whether all cameras at a pose of the body (N,) show only ground, or with `horizon` some ground."""
     shown = np.ones(len(position_m), bool)
     for name, mounted in rig.items():
         seen = (position_m, rotation_wxyz) if name is None else mounted.poses(position_m, rotation_wxyz)
@@ -156,7 +158,7 @@ def _corner_rays(camera: Camera, matrices: Array) -> Array:
 
 
 def _reach(poses: GivenPoses, mounted: MountedCamera, name: str | None, where: object) -> tuple[Array, Array]:
-    """Height of a camera and largest |x| or |y| of the ground that it sees, metres, (N,) each, for poses of the body.
+    """Height of a camera, and largest |x| or |y| of the ground that it sees, metres, (N,) each.
 
     Raises the errors of `views_of`.
     """
@@ -187,7 +189,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     """The plan of given poses, and the configuration with the views and the hash of the poses.
 
     Frames whose Suns differ by SAME_SUN_DEG or more are in different scenes over the same ground. A trajectory under
-    several Suns has a part in the scene of each, with the indices and the times of the whole trajectory. Raises
+    several Suns is divided among their scenes; the parts keep the indices and times of the whole trajectory. Raises
     UserError if the poses fit no ground, or for more than _MAX_SCENES Suns.
     """
     scene = config.scene or SceneConfig()
@@ -260,8 +262,8 @@ def _origin(poses: GivenPoses, rows: np.ndarray, index: int) -> str:
 def _flight(poses: GivenPoses, rows: np.ndarray, whole: np.ndarray) -> Flight:
     """The flight through the poses `rows` of a trajectory.
 
-    The first pose of the trajectory's poses `whole` has time 0. The nominal trajectory is a straight line from the
-    first to the last pose of the whole trajectory.
+    `whole` are all poses of the trajectory, and the first of them has time 0. The nominal trajectory is a straight line
+    from the first to the last pose of the whole trajectory.
     """
     first, last = whole[0], whole[-1]
     duration = float(poses.time_s[last] - poses.time_s[first])

@@ -1,11 +1,12 @@
-"""Poses and Sun from SPICE kernels, in O_L of a site (Acton et al. 2018, doi 10.1016/j.pss.2017.02.013).
+"""Poses and Sun from SPICE kernels, in O_L of a site.
 
-O_L is taken as a rigid frame fixed to the Moon: its origin is the site, its axes point west, south and up at the site.
-Position, velocity and attitude are converted by the same rotation. Deviation: the rendered ground is a plane, and the
-Moon falls away from the plane by d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
+SPICE: Acton et al. 2018, doi 10.1016/j.pss.2017.02.013. O_L is taken as a rigid frame fixed to the Moon: its origin is
+the site, its axes point west, south and up at the site. Position, velocity and attitude are converted by the same
+rotation. Deviation: without `dataset.scene.horizon` the rendered ground is a plane, and the Moon falls away from it by
+d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
 
-Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are also
-read; they are checked before SPICE opens them.
+Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are checked
+before SPICE opens them.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class SpicePoses:
 
 
 def rotation_site_from_fixed(latitude_deg: float, longitude_deg: float) -> Array:
-    """The rotation (3, 3) from axes fixed to the Moon (x to 0 N 0 E, z north) to the axes of O_L at a site."""
+    """Rotation (3, 3) from Moon-fixed axes (x towards 0 N 0 E, z north) to the axes of O_L at a site."""
     (sin_lat, cos_lat), (sin_lon, cos_lon) = ((np.sin(a), np.cos(a)) for a in np.radians([latitude_deg, longitude_deg]))
     west = [sin_lon, -cos_lon, 0.0]
     south = [sin_lat * cos_lon, sin_lat * sin_lon, -cos_lat]
@@ -93,7 +94,7 @@ def rotation_site_from_fixed(latitude_deg: float, longitude_deg: float) -> Array
 def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_height_m: float) -> SpicePoses:
     """Poses and velocities of a spacecraft, and the Sun's direction, at a site.
 
-    The site is `site_height_m` above the sphere of 1737.4 km.
+    The site is `site_height_m` above the sphere of radius 1737.4 km.
 
     Camera poses are geometric, without light time. The Sun is apparent (light time and stellar aberration, "LT+S") and
     seen from the site. SPICE runs in a separate process, since damaged kernels can crash it. Raises UserError if

@@ -56,7 +56,7 @@ class PoseTable:
     format: str
     """Name of the format: CSV, Parquet, TUM, EuRoC or KITTI."""
     time_ns: np.ndarray | None = None
-    """Times in the file (N,), if the file has nanoseconds; `time_s` then starts from 0."""
+    """Times in the file (N,), if they are in nanoseconds; the column `time_s` then starts from 0."""
 
     def time_text(self, row: int) -> str:
         """The time of a row as in the file."""
@@ -68,7 +68,7 @@ class PoseTable:
 def read_pose_table(path: Path) -> PoseTable:
     """Read the table of a file.
 
-    Raises UserError if it is unreadable, of another format or has an unknown column.
+    Raises UserError if the file is unreadable, has another format, or has an unknown column.
     """
     suffix = path.suffix.lower()
     if path.exists() and suffix not in _SUFFIXES:
@@ -126,7 +126,7 @@ def _euroc_header(comments: Sequence[str], n_columns: int) -> list[str] | None:
 
 
 def _check_columns(path: Path, found: Sequence[str], position: tuple[str, ...]) -> None:
-    """Raise UserError for a column that is missing, unknown, given twice, or without the other columns of its group."""
+    """Raise UserError for a column that is missing, unknown, repeated, or without the rest of its group."""
     needed = (TIME, *position, *ROTATION)
     known = (*needed, *VELOCITY, *TURN, *SUN, TRAJECTORY)
     if ROTATION[0] not in found:
@@ -159,7 +159,10 @@ def _renamed(columns: Columns, names: Mapping[str, str]) -> Columns:
 
 
 def _fixed_direction(path: Path, stated: dict[str, str], name: str) -> dict[str, str]:
-    """The header's statements with the format's direction of rotation. Raises UserError if the two differ."""
+    """The header's statements, with the format's direction of rotation.
+
+    Raises UserError if the header contradicts the format.
+    """
     if stated.get("rotation", SITE_FROM_CAMERA) != SITE_FROM_CAMERA:
         raise UserError(path, "rotation", stated["rotation"], f"{SITE_FROM_CAMERA}, as in every {name} file")
     if stated.get("frame") == "selenographic":
@@ -181,7 +184,10 @@ def _without_header(path: Path, stated: dict[str, str], line: int, words: Sequen
 
 
 def _euroc(path: Path, names: Sequence[str], header: Sequence[str] | None, stated: dict[str, str]) -> PoseTable:
-    """The table of an EuRoC or TUM-VI file: times in nanoseconds, and names with units, such as `q_RS_w []`."""
+    """The table of an EuRoC or TUM-VI file.
+
+    Times are in nanoseconds, and the names of columns have units, such as `q_RS_w []`.
+    """
     plain = {name: re.sub(r"\s*\[.*$", "", name) for name in names}
     known = {"timestamp": TIME, **_EUROC}
     for name in plain.values():
@@ -204,7 +210,7 @@ def _euroc(path: Path, names: Sequence[str], header: Sequence[str] | None, state
 
 
 def _kitti(path: Path, columns: Columns) -> Columns:
-    """Columns of matrices (3, 4) from the camera to the site, with the times of a second file."""
+    """Columns of a KITTI file: matrices (3, 4) from the camera to the site, and times from a second file."""
     poses = np.stack([columns.finite(name) for name in _KITTI], axis=1).reshape(-1, 3, 4)
     rotation: Array = poses[:, :, :3]
     off = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0)

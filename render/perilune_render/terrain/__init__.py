@@ -1,4 +1,4 @@
-"""The ground as plain data, independent of Blender: laws, populations, heights.
+"""The ground of a scene as plain data, without Blender: size laws, craters, boulders and heights.
 
-Sources: docs/reference/sources.md.
+The published sources are listed in docs/reference/sources.md.
 """

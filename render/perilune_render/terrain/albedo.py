@@ -1,7 +1,7 @@
 """Albedo of the ground: patches, bright young craters with their ejecta, and rays.
 
-Fresh material is brighter than the mature soil around it and darkens with age. We chose the amount and extent by eye,
-in comparison with NAC images, since published maturity trends apply to much larger craters.
+Fresh material is brighter than the mature soil around it and darkens with age. We chose brightness and extent by eye,
+in comparison with images of the Narrow Angle Camera, since published maturity trends apply to much larger craters.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from perilune_render.terrain.noise import add_waves
 from perilune_shared.geometry.frames import Array
 
 _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
-"""Wavelengths, metres, and relative amplitudes of the patches."""
+"""Wavelength, metres, and relative amplitude of each layer of patches."""
 RAYS_REACH = 9.0
 """Length of the longest ray from the centre, crater radii."""
 RAYED_WEAR = 0.004
-"""Wear K/R^2 above which a crater has no rays."""
+"""Smallest wear K/R^2 of craters that cannot have rays; K is `Craters.wear_m2` and R the radius."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class RayLaw:
     """Which craters of a scene have rays, and how bright the rays are."""
 
     n_rayed: int
-    """Number of craters with rays; the largest fresh craters have them."""
+    """Largest number of craters with rays. The largest fresh craters get them."""
     strength: float
     """Factor on the brightening: `light.albedo_variation`."""
 
@@ -46,24 +46,24 @@ class _Rays(NamedTuple):
     direction: Array
     """Directions of the rays, counter-clockwise from x, rad (N,)."""
     width: Array
-    """Standard deviation of each ray's brightness across it, rad (N,)."""
+    """Angular standard deviation of the brightness across each ray, rad (N,)."""
     length: Array
-    """Lengths from the centre, crater radii (N,)."""
+    """Lengths of the rays from the crater's centre, crater radii (N,)."""
     fresh: float
-    """Relative brightening at the rim."""
+    """Relative brightening of the rays at the crater's rim."""
 
 
 def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
-    """Add smooth patches to albedo (n_vertices,), in place."""
+    """Add smooth patches to albedo (n_vertices,), in place; `strength` scales their amplitudes."""
     for length, amplitude in _PATCHES:
         if length >= 3 * grid.spacings_m.min():
             add_waves(albedo, grid, length, amplitude * strength, stream(seed, "albedo", length))
 
 
 def brightness(craters: Craters) -> Array:
-    """Relative brightening (N,) of craters and their ejecta; it falls with wear K/R^2.
+    """Relative brightening (N,) of N craters and their ejecta, which decreases with wear K/R^2.
 
-    Craters of a catalogue get 0.
+    It is 0 for craters of a catalogue.
     """
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     return 0.5 * np.exp(-wear / 0.004) * (craters.origin != 2)
@@ -74,13 +74,14 @@ def add_rays(
 ) -> None:
     """Brighten albedo (n_vertices,) along the rays of craters, in place.
 
-    Random numbers are also drawn for the rays of `removed` craters (indices), so that all other rays stay unchanged.
+    `removed` craters (indices) get no rays. Their random numbers are drawn nevertheless, so that all other rays stay
+    unchanged.
     """
     rng = stream(seed, "rays")
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
     able = np.flatnonzero((wear < RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
-    # Only the largest: the rays of a small crater would be only a few pixels long.
+    # Only the largest craters get rays: the rays of a small crater would be only a few pixels long.
     for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][: law.n_rayed]:
         n_rays = int(rng.integers(7, 15))
         direction = rng.uniform(0, 2 * np.pi, n_rays)

@@ -37,18 +37,24 @@ class Base:
 
     @property
     def largest_m(self) -> float | None:
-        """Largest diameter of generated craters, metres; None to use the configured value."""
+        """Largest diameter of generated craters, metres; None to use the configured value.
+
+        If the whole ground is in the model, the model already shows the larger craters.
+        """
         return None if self.model is None or self.surroundings is not None else resolved_m(self.model)
 
     def add_waves(self, grid: Grid, relief: ReliefConfig, seed: int, shortest_m: float, longest_m: float) -> None:
-        """Add relief: on the model only the wavelengths that it does not resolve, around it all wavelengths."""
+        """Add relief with wavelengths of at least `shortest_m` and less than `longest_m`, metres.
+
+        On the elevation model only wavelengths that it does not resolve are added.
+        """
         resolved = np.inf if self.model is None else resolved_m(self.model)
         add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
         if self.surroundings is not None:
             add_fitted_relief(self.height_m, grid, self.surroundings, self.beyond_m, seed, (shortest_m, longest_m))
 
     def permitted(self, craters: Craters) -> Craters:
-        """The craters to add: those too small for the model to resolve, and those that do not overlap the model."""
+        """The craters to stamp: those too small for the model to resolve, and larger ones beyond the model."""
         if self.model is None or self.surroundings is None:
             return craters
         large = craters.diameter_m > resolved_m(self.model)

@@ -1,9 +1,10 @@
 """The boulder population and the rock shapes.
 
-Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758);
-some are cut by planes, like fractured rocks. Deviation: near fresh craters, observed counts fall more steeply above 4.4
-m (exponent -4). Here one exponent applies everywhere, and no boulder in a crater's field is larger than a twentieth of
-the crater's diameter.
+Shapes are convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (short to
+intermediate axis 0.770, intermediate to long axis 0.758). Some are cut by planes, like fractured rocks.
+
+Deviation: near fresh craters, observed counts fall more steeply above 4.4 m (exponent -4). Here one exponent applies
+everywhere, and no boulder in the field around a crater is larger than a twentieth of the crater's diameter.
 """
 
 from __future__ import annotations
@@ -28,17 +29,18 @@ if TYPE_CHECKING:
     import trimesh
 
 MAX_BOULDERS = 3_000_000
-"""Largest mean number of boulders in a scene, on the plain or in all fields; each needs about 1 kB in a renderer."""
+"""Largest expected number of boulders on the plain, and also of boulders in all fields around craters. A boulder needs
+about 1 kB in a renderer."""
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
 _FIELD_DECAY = 0.7
 """Decay length of a boulder field's density beyond the crater's rim, crater radii."""
 FULL_SPACINGS = 5.0
-"""Smallest diameter of a boulder that gets the finer mesh, vertex spacings."""
+"""Smallest diameter of a boulder with the finer mesh, local vertex spacings."""
 _FARTHEST = 0.9
 """Largest distance of a rock's surface from its centre, mean diameters; reached by the flattest, longest rock."""
 N_POINTS, N_FEW_POINTS = 60, 14
-"""Numbers of points of the finer and the coarser mesh of a rock."""
+"""Numbers of points from which the finer and the coarser mesh of a rock are made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class Boulders:
         return Boulders(*(getattr(self, field.name)[selection] for field in dataclasses.fields(self)))
 
     def centre_height_m(self, ground_m: Array) -> Array:
-        """Height (N,) of the centres above O_L's plane, metres, from the ground's height (N,) below each."""
+        """Heights (N,) of the centres above O_L's plane, metres, given the ground's heights (N,) there."""
         return ground_m + (0.5 - _BURIED_SHARE) * self.diameter_m
 
 
@@ -99,7 +101,10 @@ def draw_boulders(
 
 
 def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]:
-    """The size law, the bins' edges (B + 1,), and half-widths (B,) of the ground fine enough for each bin, metres."""
+    """The size law, the edges of the size bins (B + 1,), and a half-width for each bin (B,), metres.
+
+    Within this half-width, the ground is fine enough for the bin.
+    """
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
     edges = log_bins(smallest, config.max_diameter_m, 20)
     half = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
@@ -107,7 +112,7 @@ def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]
 
 
 def check_boulders(config: BouldersConfig, grid: Grid) -> None:
-    """Raise UserError if the boulders of the plain would not fit in memory, before any is drawn."""
+    """Raise UserError, before drawing, if the boulders of the plain would not fit in memory."""
     if config.density > 0 and config.min_diameter_spacings * float(grid.spacings_m.min()) < config.max_diameter_m:
         law, edges, half = _bins(config, grid)
         _check_number(float(expected_numbers(law, edges, np.square(2 * half)).sum()), "density")
@@ -151,7 +156,7 @@ def _fields(
 
 
 def rock(shape_id: int, seed: int, n_points: int = N_POINTS) -> trimesh.Trimesh:
-    """A convex rock of mean diameter 1 centred on the origin; every third one has fracture faces.
+    """A convex rock of mean diameter 1, centred on the origin; every third shape has fracture faces.
 
     With fewer points the rock has a similar shape and fewer faces, for boulders only a few pixels wide.
     """
@@ -178,7 +183,7 @@ def rock(shape_id: int, seed: int, n_points: int = N_POINTS) -> trimesh.Trimesh:
 
 
 def highest_points(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> Array:
-    """The highest vertex of each boulder (N, 3), O_L, metres; takes the arguments of `boulder_mesh`."""
+    """The highest vertex of each boulder (N, 3), O_L, metres; for the arguments see `boulder_mesh`."""
     full = boulders.diameter_m >= FULL_SPACINGS * grid.spacing_under(boulders.x_m, boulders.y_m)
     kinds = list(zip(boulders.shape_id.tolist(), np.where(full, N_POINTS, N_FEW_POINTS).tolist(), strict=True))
     solids = {kind: rock(kind[0], seed, kind[1]).vertices for kind in set(kinds)}
@@ -195,9 +200,9 @@ def largest_height_m(boulders: Boulders) -> float:
 
 
 def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_m: Array) -> Array:
-    """Heights (M,) of the highest boulder at positions (M,), O_L, metres; -inf without one.
+    """Height of the highest boulder surface at each position (M,), O_L, metres; -inf without a boulder.
 
-    See `boulder_mesh`.
+    For the first four arguments see `boulder_mesh`.
     """
     tops = np.full(len(x_m), -np.inf)
     widest = _FARTHEST * boulders.diameter_m.max(initial=0.0)
@@ -224,7 +229,7 @@ def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_
 
 
 def _top(solid: trimesh.Trimesh, origin: Array, direction: Array) -> float:
-    """Distance from `origin` to the point where a line leaves a convex solid; -inf if it misses the solid."""
+    """Distance from `origin` to where a line leaves a convex solid; -inf if it misses the solid."""
     normal, corner = solid.face_normals, solid.triangles[:, 0]
     gap, slope = np.einsum("fi,fi->f", normal, corner - origin), normal @ direction
     out, into = slope > 1e-9, slope < -1e-9
@@ -235,9 +240,9 @@ def _top(solid: trimesh.Trimesh, origin: Array, direction: Array) -> float:
 def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
 
-    Every boulder is a copy of one of the rocks drawn from `seed`. Boulders smaller than FULL_SPACINGS local vertex
-    spacings use the mesh with fewer faces. They form one mesh, since each object in Cycles adds render time to every
-    frame.
+    `z_m` (N,) holds the heights of the centres. Every boulder is a copy of one of the rocks drawn from `seed`. Boulders
+    smaller than FULL_SPACINGS local vertex spacings use the mesh with fewer faces. All boulders form one mesh, since
+    each object in Cycles adds render time to every frame.
     """
     local = grid.spacing_under(boulders.x_m, boulders.y_m)
     full = boulders.diameter_m >= FULL_SPACINGS * local

@@ -1,4 +1,4 @@
-"""Cache of generated scenes, so that another run over the same ground starts immediately.
+"""Cache of generated scenes, with which another run over the same ground starts immediately.
 
 A scene's file is named by the hash of everything that determines it. The folder is `$PERILUNE_CACHE`, or
 `perilune/scenes` in the user's cache folder. Above the size limit the least recently used files are removed. If the
@@ -40,7 +40,7 @@ def cache_folder() -> Path:
 
 
 def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
-    """Hash of all that determines a scene: code, libraries, terrain settings, views, seed, input files."""
+    """Hash of all inputs of a scene: code, libraries, terrain settings, views, seed and files."""
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
@@ -65,7 +65,8 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
 def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int, shared: Store | None = None) -> Scene:
     """The scene of a seed, read from the cache, or generated and stored there.
 
-    The files of the cache are also read from and written to `shared`, which other machines use too.
+    `shared` is a second cache, which other machines use too. A scene that is not in the local cache is read from it,
+    and a new scene is also stored in it.
     """
     if config.render.cache_gib == 0:
         return grow_scene(config, view, seed)
@@ -123,6 +124,6 @@ def _make_room(folder: Path, most_bytes: float) -> None:
     total = 0
     for index, path in enumerate(files):
         total += path.stat().st_size
-        # Keep the newest file, however large.
+        # The newest file is kept, however large it is.
         if total > most_bytes and index > 0:
             path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The view envelope: the lowest height from which the camera sees ground at each distance from the site."""
+"""The view envelope: the lowest height from which ground is seen, by distance from the site."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,10 @@ from perilune_shared.geometry.frames import Array
 
 @dataclass(frozen=True, slots=True)
 class SeenGround:
-    """The ground that frames show, by the camera's height above the site; see `perilune_render.terrain.levels`."""
+    """The ground that frames show at each of N camera heights.
+
+    `perilune_render.terrain.levels` makes meshes for this ground.
+    """
 
     z_m: Array
     """Height of the camera above O_L's plane, ascending, metres (N,)."""
@@ -25,7 +28,7 @@ class SeenGround:
     def box_m(self, approach_deg: int) -> tuple[Array, Array]:
         """Smallest and largest x and y, (N, 2) each, metres, of the ground that a trajectory's frames show.
 
-        The trajectory comes from the direction `approach_deg`, to within half a degree.
+        The trajectory comes from the direction `approach_deg`, clockwise from north, to within half a degree.
         """
         azimuth = np.radians(approach_deg + np.array([-0.5, 0.0, 0.5]))
         towards = -np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
@@ -36,15 +39,18 @@ class SeenGround:
 
 @dataclass(frozen=True, slots=True)
 class ViewEnvelope:
-    """The views that a scene's mesh is made for: they determine its extent and vertex spacing.
+    """The views for which a scene's mesh is made. They determine its extent and vertex spacing.
 
     Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` away; between the
     reaches, the height is interpolated linearly. Ground beyond the last reach is never seen. For a flight, use
-    `perilune_render.flight.view.view_envelope`. Raises ValueError if a column is not finite, positive and ascending.
+    `perilune_render.flight.view.view_envelope`.
+
+    Raises ValueError unless `height_m` and `reach_m` are finite, positive and non-decreasing.
     """
 
     height_m: Array
-    """Smallest distance of the camera from the ground in view, usually its height, ascending, metres (N,)."""
+    """Smallest distance of the camera from the ground in view, non-decreasing, metres (N,); usually the camera's
+    height."""
     reach_m: Array
     """Distance max(|x|, |y|) of that ground from the site, non-decreasing, metres (N,)."""
     focal_px: float

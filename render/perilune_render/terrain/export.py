@@ -30,7 +30,7 @@ def vertices(grid: Grid, height_m: np.ndarray) -> np.ndarray:
 
 
 def coarser(grid: Grid, step: int) -> Grid:
-    """A grid over the same ground with every `step`-th ring and about 1 / step of the vertices in each ring."""
+    """A grid of the same ground, with every `step`-th ring and about 1 / step of each ring's vertices."""
     n_half = max(grid.n_half // step, 1)
     rings = grid.half_widths_m[::-step][::-1] if len(grid.half_widths_m) > 1 else grid.half_widths_m
     return Grid(n_half, np.unique(np.concatenate([grid.half_widths_m[:1], rings])))
@@ -60,7 +60,10 @@ def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = Tru
 
 
 def site_profile(latitude_deg: float, longitude_deg: float, n: int, pixel_m: float, n_bands: int) -> dict[str, Any]:
-    """Options of rasterio for a float32 GeoTIFF of n x n pixels centred on a site: north up, azimuthal equidistant."""
+    """Options of rasterio for a float32 GeoTIFF of n x n pixels centred on a site.
+
+    North is up, and the projection is azimuthal equidistant around the site.
+    """
     import rasterio
 
     centre = f"+lat_0={latitude_deg!r} +lon_0={longitude_deg!r}"
@@ -78,9 +81,10 @@ def site_profile(latitude_deg: float, longitude_deg: float, n: int, pixel_m: flo
 
 
 def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
-    """Write heights, metres, as a float32 GeoTIFF: square pixels, north up, azimuthal equidistant around the site.
+    """Write heights above the site, metres, as a float32 GeoTIFF.
 
-    The site is at height 0. Raises UserError unless each side has 1 to 20,000 pixels.
+    Pixels are square, north is up, and the projection is azimuthal equidistant around the site. Raises UserError unless
+    each side has 1 to 20,000 pixels.
     """
     import rasterio
 

@@ -1,8 +1,9 @@
-"""The graded grid: a square of uniform spacing around the site, and square rings whose spacing grows with distance.
+"""The graded grid: a square of uniform spacing around the site, and square rings around it.
 
-Every ring has as many vertices as the inner square's border, so a ring of twice the half-width has twice the spacing;
-the distance between rings grows in the same proportion. Neighbouring rings are joined vertex to vertex, so the mesh has
-no hanging vertices and no gaps. The spacing at each place is set by the lowest height from which a camera can see it.
+The spacing of the rings grows with distance. Every ring has as many vertices as the inner square's border, so a ring of
+twice the half-width has twice the spacing; the distance between rings grows in the same proportion. Neighbouring rings
+are joined vertex to vertex, so the mesh has no hanging vertices and no gaps. The lowest height from which a camera can
+see a place determines its spacing.
 
 Vertices are stored in one list: first the inner square row by row (y, then x), then the rings, each counter-clockwise
 from its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices;
@@ -22,8 +23,8 @@ from perilune_shared.geometry.frames import Array
 _MAX_RINGS = 1_000_000
 """Largest number of rings; even the finest ground that fits in memory has fewer."""
 FAR_GROWTH = 0.07
-"""Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: ground at a
-distance d casts a shadow into the view only if its height and width are about d tan(elevation of the Sun)."""
+"""Growth of the vertex spacing beyond the ground in view, metres per metre. That ground only casts shadows, and a hill
+at a distance d casts a shadow into the view only if its height and width are about d tan(elevation of the Sun)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,10 @@ class Grid:
 
     @property
     def spacings_m(self) -> Array:
-        """Spacing of the inner square and each ring, the larger of the two directions, metres (n_rings + 1,)."""
+        """Vertex spacing of the inner square and each ring, metres (n_rings + 1,).
+
+        This is the larger of the spacings along and across a ring.
+        """
         across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
         return np.maximum(self.half_widths_m / self.n_half, across)
 
@@ -121,9 +125,10 @@ class Grid:
 
 
 def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
-    """The grid for all views of a camera: spacing at most `terrain.spacing_px` times the smallest ground pixel.
+    """The grid for all views of an envelope.
 
-    The grid may have more vertices than `terrain.max_vertices` (see `perilune_render.terrain.levels`).
+    Its spacing is at most `terrain.spacing_px` times the smallest ground pixel. The grid may have more vertices than
+    `terrain.max_vertices` (see `perilune_render.terrain.levels`).
     """
     return grid_of(view.reach_m, terrain.spacing_px * view.height_m / view.focal_px, far=view.horizon)
 
@@ -136,10 +141,11 @@ def grid_of(
     *,
     far: bool = False,
 ) -> Grid:
-    """The grid with spacings, metres, of at most `spacing_m` (N,) within the distances `reach_m` (N,) of its centre.
+    """The grid with a spacing of at most `spacing_m` (N,) within `reach_m` (N,) of its centre.
 
-    Both are ascending. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to `edge_m`. With `far`, the
-    reach may be thousands of times the inner square, so distances are spaced evenly in their logarithm.
+    Both arrays are ascending, in metres. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to
+    `edge_m`. `far` is for a reach of thousands of times the inner square: intermediate distances are then spaced evenly
+    in their logarithm.
     """
     n_half = int(np.ceil((reach_m / spacing_m).max()))
     inner = min(n_half * spacing_m[0], reach_m[-1])
@@ -161,7 +167,7 @@ def grid_of(
 
 @njit(inline="always")
 def _put(lines, row, start, step, vertices, ring):
-    """Write a line: (x, y) of its start, its step (dx, dy), its vertices (first index and number) and its ring."""
+    """Write a line of vertices into `lines`, in the format of `lines_in`."""
     lines[row, 0], lines[row, 1], lines[row, 2], lines[row, 3] = start[0], start[1], step[0], step[1]
     lines[row, 4], lines[row, 5], lines[row, 6] = vertices[0], vertices[1], ring
 
@@ -231,7 +237,10 @@ def place_in_ring(x, y, n_half):
 
 @njit()
 def vertex_of_ring(ring, position, n_half):
-    """Index of a vertex from its ring (0 is the inner square's border) and its position after the corner at -x, -y."""
+    """Index of a vertex, from its ring and its position after the corner at -x, -y.
+
+    Ring 0 is the border of the inner square.
+    """
     n = n_half
     position %= 8 * n
     if ring > 0:

@@ -8,7 +8,10 @@ from perilune_shared.geometry.frames import Array
 
 
 def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -> Array:
-    """Bilinear values of a field (n_vertices,) at positions of any shape; the border value outside the grid."""
+    """Bilinear values of a field (n_vertices,) at positions in O_L, metres, of any shape.
+
+    Outside the grid, positions get the value of the border.
+    """
     x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
     relative = np.ravel(x) - grid.centre_x_m, np.ravel(y) - grid.centre_y_m
     return _values_at(field, grid.n_half, grid.half_widths_m, *relative).reshape(x.shape)
@@ -27,7 +30,11 @@ def _values_at(field, n_half, half_widths, x, y):
 
 @njit(inline="always")
 def corners(x, y, n_half, half_widths):
-    """Vertices around a position relative to the centre, lower two first; weights of the second and the upper ones."""
+    """The four vertices around a position, lower two first, and two interpolation weights.
+
+    The position is relative to the grid's centre. The first weight belongs to the second vertex of each pair, the
+    second weight to the upper pair.
+    """
     n = n_half
     distance = max(abs(x), abs(y))
     if distance < half_widths[0]:

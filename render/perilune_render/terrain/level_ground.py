@@ -1,4 +1,7 @@
-"""The ground of a level: the ground of a scene, averaged over the cells around the vertices of a level."""
+"""The ground of a level: a scene's ground, averaged over the cell around each vertex of the level.
+
+A level is one of several meshes of the same ground (`perilune_render.terrain.levels`).
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -13,16 +16,16 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
 _MAX_SAMPLES = 8
-"""Largest number of points along one side of a cell; more would be needed only out of view."""
+"""Largest number of sample points along one side of a cell; only cells out of view would need more."""
 
 
 class _Mesh(NamedTuple):
     """The grid on whose vertices the field is given."""
 
     centre_x: float
-    """x of its centre, O_L, metres."""
+    """x of the grid's centre, O_L, metres."""
     centre_y: float
-    """y of its centre, O_L, metres."""
+    """y of the grid's centre, O_L, metres."""
     n_half: int
     """`Grid.n_half`."""
     half_widths: Array
@@ -39,9 +42,9 @@ class _Cells(NamedTuple):
     centre_y: float
     """y of the level's centre, O_L, metres."""
     n_inner: int
-    """Number of vertices in its inner square, which come first."""
+    """Number of vertices in the level's inner square, which come first."""
     n_ring: int
-    """Number of vertices in each of its rings."""
+    """Number of vertices in each ring of the level."""
     around: Array
     """Sides of the cells along the ring, metres, for the inner square and each ring (R + 1,)."""
     across: Array
@@ -53,7 +56,7 @@ class _Cells(NamedTuple):
 
 
 def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
-    """The scene with only the ground of a level, and the boulders that are large enough for its mesh."""
+    """The scene with the ground of a level, and only the boulders that are large enough for its mesh."""
     height, albedo = (averaged(field, scene.grid, grid) for field in (scene.height_m, scene.albedo))
     real = averaged(scene.real, scene.grid, grid) > 0.5 if scene.real.any() else np.zeros(grid.n_vertices, bool)
     is_large = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
@@ -71,10 +74,11 @@ def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
 
 
 def averaged(field: np.ndarray, whole: Grid, grid: Grid) -> np.ndarray:
-    """A field on the vertices of `whole`, averaged over the cell of each vertex of `grid`: (n_vertices,) float32.
+    """Means (n_vertices,) float32 of a field over the cell around each vertex of `grid`.
 
-    The field is interpolated at evenly spaced points of a cell: as many as `whole` has vertices in the cell, and at
-    least one. Outside `whole` the field has the values of its border.
+    The field is given on the vertices of `whole` and interpolated at evenly spaced points of a cell. Along each side of
+    a cell there are about as many points as `whole` has vertices, from 1 to _MAX_SAMPLES. Outside `whole` the field has
+    the values of its border.
     """
     n_inner, n_ring = (2 * grid.n_half + 1) ** 2, 8 * grid.n_half
     mesh = _Mesh(whole.centre_x_m, whole.centre_y_m, whole.n_half, whole.half_widths_m, whole.spacings_m)

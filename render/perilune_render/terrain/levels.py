@@ -1,9 +1,9 @@
-"""Levels: meshes of the ground below one trajectory, each for a band of heights, used if one mesh would be too large.
+"""Levels: several meshes of the ground below one trajectory, used if one mesh would be too large.
 
-One mesh for a whole descent would combine the finest detail of the last frames with the wide ground of the first. A
-level is a mesh for the frames of one band of heights: its spacing follows the smallest ground pixel of the band, and it
-is centred on the ground that the trajectory shows within the band. All levels are sampled from the ground of the scene
-(`perilune_render.terrain.level_ground`), so craters, rims and labels do not depend on them.
+One mesh for a whole descent would combine the finest detail of the last frames with the wide ground of the first
+frames. A level is a mesh for the frames of one band of camera heights. Its spacing follows the smallest ground pixel of
+the band, and it is centred on the ground that the trajectory shows within the band. All levels are sampled from the
+ground of the scene (`perilune_render.terrain.level_ground`), so craters, rims and labels do not depend on levels.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from perilune_render.terrain.grid import Grid, graded_grid, grid_of
 from perilune_shared.errors import UserError
 
 _WIDEST_BAND = 1.25
-"""Largest ratio of the highest to the lowest height in the band of a level. In a wider band, the spacing and with it
-the smallest craters would change visibly between two frames."""
+"""Largest ratio of the highest to the lowest height in the band of a level. With wider bands, the spacing and the
+smallest craters would change visibly from one level to the next."""
 _GROUND_PER_MESH = 10
-"""Largest number of vertices of a scene's ground, divided by the largest number of a mesh. During generation, a vertex
-needs about a sixth of the memory that it needs in Blender."""
+"""Largest number of vertices of a scene's ground, divided by `terrain.max_vertices`, which limits each mesh. During
+generation, a vertex needs about a sixth of the memory that it needs in Blender."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) ->
 
     There is one level if the whole ground has at most `terrain.max_vertices`. The trajectory comes from the direction
     `approach_deg` (clockwise from north) to within half a degree. From the lowest upwards, each band of heights is as
-    wide as this limit and _WIDEST_BAND allow. Spacing is at most `terrain.spacing_px` times the smallest ground pixel
-    of the band. Raises UserError if no level fits.
+    wide as `terrain.max_vertices` and _WIDEST_BAND allow. Spacing is at most `terrain.spacing_px` times the smallest
+    ground pixel of the band. Raises UserError if no level fits.
     """
     whole = checked_grid(terrain, view)
     if view.seen is None or whole.n_vertices <= terrain.max_vertices:
@@ -58,8 +58,8 @@ def cut_levels(terrain: TerrainConfig, view: ViewEnvelope, approach_deg: int) ->
 def checked_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
     """The grid of the ground for all views (`graded_grid`).
 
-    Raises UserError if a mesh needs more than `terrain.max_vertices`, or if the ground needs _GROUND_PER_MESH times as
-    many.
+    Raises UserError if a mesh needs more vertices than `terrain.max_vertices`, or if the ground needs more than
+    _GROUND_PER_MESH times this number.
     """
     grid = graded_grid(terrain, view)
     if grid.n_vertices > terrain.max_vertices:
@@ -70,14 +70,14 @@ def checked_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
 
 
 def level_index(levels: tuple[Level, ...], z_m: float) -> int:
-    """Index of the level that a frame with the camera at z_m shows."""
+    """Index of the level for a frame whose camera is `z_m` above O_L's plane, metres."""
     return int(np.searchsorted([level.highest_m for level in levels[:-1]], z_m, side="right"))
 
 
 def _band(
     terrain: TerrainConfig, view: ViewEnvelope, seen: SeenGround, approach_deg: int, first: int
 ) -> Callable[[int], Grid]:
-    """Function from an index to the grid of the band of `seen` from index `first` to this index, both included."""
+    """Function from a last index to the grid of a band: from index `first` of `seen` to the last index."""
     all_low, all_high = seen.box_m(approach_deg)
     edge_m = float(view.reach_m[-1])
 
@@ -95,7 +95,8 @@ def _needed(terrain: TerrainConfig, view: ViewEnvelope) -> int:
     """Smallest limit of vertices per mesh with which the ground can be rendered.
 
     The limit must allow the mesh of every band between two neighbouring heights of `view.seen`, and the number of
-    vertices of the whole ground divided by _GROUND_PER_MESH. A limit that allows the whole ground also suffices.
+    vertices of the whole ground divided by _GROUND_PER_MESH. A limit that allows the whole ground as one mesh also
+    suffices.
     """
     whole = graded_grid(terrain, view).n_vertices
     if view.seen is None:

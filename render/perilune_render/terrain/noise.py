@@ -9,7 +9,7 @@ from perilune_render.terrain.grid import Grid, lines_in
 from perilune_shared.geometry.frames import Array
 
 RMS_SLOPE = 0.87
-"""RMS slope times wavelength of `add_waves` with amplitude 1, measured at 4 million points."""
+"""RMS slope of the noise of `add_waves` with amplitude 1, times the wavelength; measured at 4 million points."""
 
 
 class _Waves(NamedTuple):
@@ -30,10 +30,10 @@ class _Waves(NamedTuple):
 
 
 def add_waves(field: Array, grid: Grid, wavelength_m: float, amplitude: float, rng: np.random.Generator) -> None:
-    """Add amplitude times gradient noise of a wavelength to field (n_vertices,), in place.
+    """Add gradient noise of one wavelength, times `amplitude`, to field (n_vertices,), in place.
 
-    The wave fades where the grid is too coarse for it: full amplitude up to a spacing of 1/6 of the
-    wavelength, half the amplitude at 1/3, none from 1/2.
+    The noise fades where the grid is too coarse: it has full amplitude up to a spacing of 1/6 of the wavelength, half
+    the amplitude at 1/3, and amplitude 0 from 1/2.
     """
     shares = np.clip(1.5 - 3 * grid.spacings_m / wavelength_m, 0, 1)
     if not shares.any():

@@ -1,9 +1,9 @@
 """Self-affine relief, in addition to the craters.
 
-The slopes of a self-affine surface with Hurst exponent H vary with wavelength as L^(H-1); Cai & Fa 2020
-(doi 10.1029/2020JE006429) find H about 0.9 down to metres on the Moon. The relief is a sum of octaves of gradient noise
-with amplitudes proportional to L^H, from the longest wavelength down to the shortest that the grid resolves at each
-place.
+The slopes of a self-affine surface with Hurst exponent H vary with wavelength as L^(H-1); Cai & Fa 2020 (doi
+10.1029/2020JE006429) find H about 0.9 down to metres on the Moon. The relief is a sum of octaves of gradient noise with
+amplitudes proportional to L^H. The longest wavelength is configured; the shortest is the shortest that the grid
+resolves at each place.
 """
 
 import numpy as np
@@ -22,7 +22,10 @@ def finest_wave_m(grid: Grid) -> float:
 
 
 def check_waves(config: ReliefConfig, grid: Grid) -> None:
-    """Raise UserError if the longest wavelength is too short for the grid, or below 1 m (see `add_relief`)."""
+    """Raise UserError if the longest wavelength is too short for the grid, or below 1 m.
+
+    The configured slope refers to waves down to 1 m (see `add_relief`).
+    """
     least_m = max(finest_wave_m(grid), 1.0)
     if config.longest_wavelength_m < least_m:
         raise UserError(

@@ -44,7 +44,7 @@ from perilune_shared.geometry.frames import Array
 _ROUGHNESS_M = 100.0
 """Wavelength below which relief is added on top of the craters, metres."""
 _MIN_RIM = 0.3
-"""Share of a crater's rim that must remain; below it, the crater is no longer counted."""
+"""Smallest remaining share of the rim with which a crater counts as visible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +66,9 @@ class Scene:
     craters: Craters
     """Visible craters without removed ones: first the craters of a catalogue, then generated craters, oldest first."""
     rims: Rims
-    """Rims of the same craters, measured on the finished ground."""
+    """Rims of `craters`, measured on the finished ground."""
     boulders: Boulders
-    """Boulders; boulder_id is the index."""
+    """Boulders on the ground; the index of a boulder is its boulder_id."""
     boulder_z_m: Array
     """Heights of the boulders' centres, metres."""
     dem_source: str
@@ -82,7 +82,7 @@ class Scene:
 
     @property
     def crater_id(self) -> np.ndarray:
-        """Ids of `craters`: their indices in the same scene without removals."""
+        """Ids (N,) of `craters`: their indices in the same scene without removals."""
         everything = np.arange(len(self.craters) + len(self.removed))
         return np.delete(everything, self.removed)
 
@@ -104,9 +104,9 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     """Generate the scene of a seed: base, relief, craters from oldest to youngest, boulders.
 
     Craters that the configuration removes are omitted, with their rays and boulders. All random numbers are drawn as if
-    these craters were present, and the zero of the heights does not change. Farther than `craters.removal.REACH_RADII`
-    from the removed craters, the heights equal the heights with all craters. Raises UserError if frames of `view` need
-    too many vertices, or if a crater to remove does not exist.
+    these craters were present, and height 0 does not move. The heights change only within `craters.removal.REACH_RADII`
+    crater radii of the removed craters. Raises UserError if frames of `view` need too many vertices, or if a crater to
+    remove does not exist.
     """
     terrain = config.terrain
     grid = checked_grid(terrain, view)
@@ -193,9 +193,9 @@ def _at_site(height_m: Array, grid: Grid) -> Array:
 
 
 def check_ground(config: DatasetConfig, view: ViewEnvelope) -> Grid:
-    """Check grid, relief and input files before the ground is generated; return the grid.
+    """Check the settings and input files of the ground before it is generated; return its grid.
 
-    Raises UserError. Prints remarks on the elevation model.
+    Raises UserError if the ground cannot be generated. Prints remarks on the elevation model and its catalogue.
     """
     grid = checked_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)
@@ -214,14 +214,17 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> Grid:
 
 
 def site_of(config: DatasetConfig) -> tuple[float, float]:
-    """Latitude and longitude of the site, degrees. Raises UserError if the elevation model cannot be read."""
+    """Latitude and longitude of the site, degrees.
+
+    Raises UserError if the elevation model cannot be read.
+    """
     return _site_deg(config, model_of(config.terrain))
 
 
 def model_of(terrain: TerrainConfig, ground_m: float | None = None) -> ElevationModel | None:
-    """The elevation model of a configuration for ground of side `ground_m`, metres (`read_elevation`), or None.
+    """The elevation model of a configuration, or None without one.
 
-    Raises UserError if it cannot be read.
+    `ground_m` is the side of the ground, metres (see `read_elevation`). Raises UserError if the model cannot be read.
     """
     return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation, ground_m)
 

@@ -1,7 +1,7 @@
 """Size-frequency laws of craters and boulders: one class for each published law.
 
-A law gives `csfd`, the cumulative number per square metre of objects with at least a given diameter, and its support,
-`min_diameter_m` to `max_diameter_m`. `draw_diameters` draws a population.
+A law gives `csfd`, the cumulative number per square metre of objects with at least a given diameter. Its support is the
+range of diameters for which it is used, `min_diameter_m` to `max_diameter_m`. `draw_diameters` draws a population.
 """
 
 from abc import ABC, abstractmethod
@@ -25,7 +25,7 @@ _NEUKUM_2001 = (
     8.25e-4,
     5.54e-5,
 )
-"""Coefficients of log10(D / 1 km)^1 to ^11 in the logarithm of the cumulative number."""
+"""Coefficients of the powers 1 to 11 of log10(D / 1 km), in the decimal logarithm of the cumulative number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,10 @@ class SizeFrequency(ABC):
 
     @abstractmethod
     def csfd(self, diameter_m: ArrayLike) -> Array:
-        """Number per square metre of objects with at least this diameter (metres); also defined outside the support."""
+        """Number per square metre of objects with at least this diameter, metres.
+
+        Also defined outside the support.
+        """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,9 +72,10 @@ def _neukum_exponent(log_d_km: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TraskEquilibrium(SizeFrequency):
-    """Empirical equilibrium of small craters, N(>D) = 10^-1.1 D^-2 per square metre: Trask 1966 (JPL TR 32-800).
+    """Empirical equilibrium of small craters, N(>D) = 10^-1.1 D^-2 per square metre.
 
-    Observed on mare surfaces from some metres to some hundreds of metres; the support is 1 m to 1 km (our extension).
+    Trask 1966 (JPL TR 32-800). Observed on mare surfaces from some metres to some hundreds of metres; the support is 1
+    m to 1 km (our extension).
     """
 
     share: float = 1.0
@@ -87,7 +91,7 @@ class TraskEquilibrium(SizeFrequency):
 class MintonEquilibrium(SizeFrequency):
     """Equilibrium of small craters on a mare, N(>D) = 0.0336 D^-2 per square metre.
 
-    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support is the support of Trask's law.
+    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support is taken from Trask's law.
     """
 
     share: float = 1.0
@@ -103,7 +107,7 @@ class MintonEquilibrium(SizeFrequency):
 class ViperEquilibrium(SizeFrequency):
     """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per km^2 up to 80 m.
 
-    Above 80 m the law is extrapolated (our extension); there, production is lower than the law for most ages.
+    Above 80 m the law is extrapolated (our extension); there, production is lower than this law for most surface ages.
     """
 
     share: float = 1.0
@@ -151,7 +155,7 @@ class BoulderLaw(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, init=False)
 class Minimum(SizeFrequency):
-    """The smaller of two laws at each diameter, over their common support, such as production and equilibrium."""
+    """The smaller of two laws, such as production and equilibrium, over their common support."""
 
     first: SizeFrequency
     """First law."""
@@ -184,7 +188,7 @@ def log_bins(min_diameter_m: float, max_diameter_m: float, per_decade: int = 50)
 
 
 def expected_numbers(law: SizeFrequency, edges_m: Array, areas_m2: Array) -> Array:
-    """Mean number (B,) in each bin of edges_m (B + 1,), with the area of each bin in areas_m2 (B,)."""
+    """Expected number of objects (B,) in size bins with edges_m (B + 1,), on the areas areas_m2 (B,)."""
     cumulative = law.csfd(edges_m)
     return np.maximum(cumulative[:-1] - cumulative[1:], 0) * areas_m2
 

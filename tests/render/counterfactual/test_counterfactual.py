@@ -189,7 +189,7 @@ def test_options_that_cannot_be(quick, tmp_path, arguments, words):
 
 def test_sources_that_cannot_be(quick_survey, made, tmp_path):
     plan = Path(__file__).parents[3] / "data_manifests" / "small-detect"
-    for source, words in ((quick_survey, "a survey"), (made, "a counterfactual"), (plan, "none, as in a plan")):
+    for source, words in ((quick_survey, "a survey"), (made, "a counterfactual"), (plan, "no labels, as in a plan")):
         done = counterfactual("--manifest", source, "--out", tmp_path / "out", "--workers", 0)
         assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
         assert words in done.stderr

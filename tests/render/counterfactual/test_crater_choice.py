@@ -41,7 +41,7 @@ def test_the_sun_turns_clockwise():
 
 def test_a_split_without_frames_is_an_error():
     kind = KindConfig(n_scenes=1, trajectories_per_scene=1, n_frames=2, split_by="scene", val_share=0.0)
-    with pytest.raises(UserError, match="none in val"):
+    with pytest.raises(UserError, match="no frame in val"):
         part_of(make_plan(config_with(detect=kind), "detect"), "val", 2)
 
 

@@ -15,13 +15,16 @@ COARSEST_STRIDE = 32
 
 
 class LabelSettings(Selection):
-    """Selection of the craters to find. All other labels are ignored: neither ground truth nor false positives.
+    """Selection of the craters to find.
 
-    The name of a selection sets all thresholds. Thresholds given in addition override these. A run stores all values.
+    Labels that are not selected are ignored: they need not be found, and detections on them are not false positives.
+
+    `selection` sets all thresholds; a threshold that is set explicitly overrides the selection's value. A run stores
+    all values.
     """
 
     selection: str = "visible"
-    """Name of a selection: all, paper (2 to 50 px, centre in the frame) or visible (what a frame shows)."""
+    """Name of a selection: all, paper (radius 2 to 50 px, centre in the frame) or visible (recognisable in a frame)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -48,24 +51,26 @@ class LabelSettings(Selection):
 
 
 class AugmentSettings(Section):
-    """Random augmentation of training frames; 0 disables a setting."""
+    """Random augmentation of training frames. 0 disables an effect; `scale` is disabled by 1 to 1."""
 
     flips_and_turns: bool = True
     """Apply one of the eight flips and quarter turns of a square frame, each equally likely."""
     scale: tuple[Annotated[float, Field(ge=0.25, le=4)], Annotated[float, Field(ge=0.25, le=4)]] = (1.0, 1.0)
-    """Smallest and largest zoom factor of a frame; its logarithm is uniform."""
+    """Smallest and largest zoom factor of a frame. The logarithm of the factor is uniformly distributed."""
     gain: Fraction = 0.3
-    """Largest change of brightness: the factor is between 1 / (1 + gain) and 1 + gain, uniform in logarithm."""
+    """Largest change of brightness: grey values are multiplied by a factor between 1 / (1 + gain) and 1 + gain. The
+    logarithm of the factor is uniformly distributed."""
     gamma: Fraction = 0.3
-    """Largest absolute logarithm of the exponent of the grey values."""
+    """Largest change of tone: grey values between 0 and 1 are raised to a power between exp(-gamma) and exp(gamma)."""
     stretch: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
-    """Largest fraction of the darkest pixels, and of the brightest, that become black and white. Published images are
+    """Largest fraction of the pixels that become black, and largest fraction that become white. Published images are
     often stretched in this way."""
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.2
     """Largest standard deviation of a Gaussian blur, pixels. Rendered frames already contain the sensor's blur; a much
     larger value hides the smallest craters."""
     noise: Annotated[float, Field(ge=0, le=100)] = 1.0
-    """Largest standard deviation of Gaussian noise, in grey levels of 0 to 255, added to the sensor's noise."""
+    """Largest standard deviation of the added Gaussian noise, in grey levels of 0 to 255. Rendered frames already
+    contain the sensor's noise."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "AugmentSettings":
@@ -78,9 +83,9 @@ class LossSettings(Section):
     """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss")."""
 
     aspect: Literal["circular", "standard"] = "circular"
-    """Reference of the aspect term of CIoU: a circle (the paper), or the aspect ratio of the label."""
+    """Aspect ratio to which the aspect term of CIoU pulls a box. circular: 1 (the paper). standard: the label's."""
     objectness: Literal["hard", "iou"] = "iou"
-    """Objectness target of a positive predictor: 1, or the IoU of its box with its label."""
+    """Objectness target of a positive predictor. hard: 1. iou: the IoU of its box with its label."""
     reduction: Literal["means", "sums"] = "means"
     """means: average over the predictors of each scale, weight scales by 1 / stride. sums: plain sums (the paper)."""
     lambda_iou: Weight = 0.05
@@ -90,15 +95,16 @@ class LossSettings(Section):
     lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
     lambda_teacher: Weight = 1.0
-    """Weight of the distillation loss from `teacher`; its two terms are weighted by lambda_iou and lambda_obj."""
+    """Weight of the distillation loss, used with `teacher`. lambda_iou and lambda_obj weight the two terms of the
+    loss."""
     lambda_guide: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Weight of the guidance loss of attention gates: 1 - correlation of the gate's mask with the labelled craters. It
-    covers B_11, B_22 and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the
-    paper). No effect without attention."""
+    """Weight of the guidance loss of attention gates: 1 - correlation of the gate's mask with the labelled craters. The
+    loss covers the gates B_11, B_22 and B_38, the last gates of the stages up to stride 8. 0: gates learn from the
+    detection loss alone (the paper). No effect without attention."""
 
 
 class EvaluationSettings(Section):
-    """Detection from the network's outputs, and its evaluation."""
+    """Inference with a trained network, and evaluation of its detections."""
 
     scales: Annotated[tuple[Annotated[float, Field(ge=0.25, le=4)], ...], Field(min_length=1, max_length=4)] = (1.0,)
     """Factors by which frames are resized before inference; detections at all scales are merged. Scales 1 and 2
@@ -111,10 +117,10 @@ class EvaluationSettings(Section):
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Detections below this score are dropped before suppression. The precision-recall curve ends at this score."""
     max_aspect: Annotated[float, Field(gt=1, le=1000)] | None = None
-    """Largest ratio of a box's longer to its shorter side; longer boxes are dropped before suppression. A box around
-    two craters is longer than a crater seen from above. None keeps all."""
+    """Boxes are dropped before suppression if their longer side exceeds this multiple of the shorter side. A box around
+    two craters is more elongated than a crater seen from above. None keeps all boxes."""
     max_detections: Annotated[int, Field(ge=1, le=100_000)] = 2000
-    """Largest number of detections in a frame; the usual 100 would truncate crowded frames."""
+    """Largest number of detections in a frame. COCO's limit of 100 would truncate crowded frames."""
     varied_frames: bool = False
     """Choose the score threshold on the validation frames and on copies of them with other contrast, blur and noise.
     Use this for a detector of images from unknown cameras."""
@@ -152,12 +158,12 @@ class DetectConfig(Section):
     """Allow attention=cbam with frozen_epochs even if `init_from` has no gates (the paper). New plain gates scale their
     input by about 0.25, so the frozen layers get features on which they were not trained."""
     teacher: str | None = None
-    """Teacher for distillation in addition to the labels: best.ckpt of a detect run, usually wider. Its strides and
-    in_channels must equal those of this network, which takes over its anchors."""
+    """Teacher for distillation, in addition to the labels: best.ckpt of a detect run, usually of a wider network. Both
+    networks must have equal strides and in_channels. This network uses the teacher's anchors."""
     validate_every: Count = 1
     """Epochs between validations; `epochs` must be a multiple. The weights of the best validation are kept."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] = 8
-    """Frames of each process in a training step."""
+    """Number of frames that each process uses in a training step."""
     learning_rate: Rate = 1e-3
     """Peak learning rate of AdamW. It rises linearly (warm-up), then falls as a cosine to a hundredth."""
     warmup_steps: Annotated[int, Field(ge=0, le=100_000_000)] = 100
@@ -170,14 +176,14 @@ class DetectConfig(Section):
     """Decay per step of the moving average of the weights; the average is evaluated and saved. At step s the decay is
     at most (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
     anchor_sampling: Literal["rare", "plain"] = "rare"
-    """Weights of the label sizes from which anchors are clustered. rare: one over the square root of the frequency of
-    the size, so that large craters get anchors. plain: equal weights (the paper)."""
+    """Weights of the label sizes from which anchors are clustered. rare: inverse square root of the frequency of the
+    size, so that large craters get anchors. plain: equal weights (the paper)."""
     assignment: Literal["several", "one"] = "several"
     """Predictors that learn a label. several: every anchor within anchor_ratio, in the cell of the label's centre and
     in the two nearest cells. one: the anchor of the highest IoU, in the cell of the centre, as in YOLOv3 (the
     paper)."""
     anchor_ratio: Annotated[float, Field(gt=1, le=1000)] = 2.0
-    """An anchor is assigned to a label if width and height are both within this factor."""
+    """An anchor is assigned to a label if its width and its height differ from the label's by less than this factor."""
     labels: LabelSettings = LabelSettings()
     """Craters to find."""
     augment: AugmentSettings = AugmentSettings()
@@ -195,7 +201,7 @@ class DetectConfig(Section):
     num_nodes: Annotated[int, Field(ge=1, le=10_000)] = 1
     """Number of machines; `torchrun --nnodes` overrides it."""
     strategy: Strategy = "auto"
-    """Lightning's strategy for several processes; auto selects what the settings need."""
+    """Lightning's strategy for several processes; auto selects a strategy that fits the other settings."""
     checkpoint_minutes: Annotated[float, Field(ge=0, le=100_000)] = 10.0
     """Minutes between saves of the training state within an epoch; 0 saves after every step. The state is always saved
     after an epoch."""

@@ -52,7 +52,7 @@ _COLUMNS = {
     "recall": "recall",
     "f1": "F1",
 }
-_LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
+_LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP of the {by} bins" for by in ("radius", "altitude", "sun")}
 
 
 def evaluate_again(
@@ -62,10 +62,10 @@ def evaluate_again(
     threshold: float | Literal["run", "validation"] = "run",
     out: Path | None = None,
 ) -> Path:
-    """Evaluate a run's best weights on a split of a dataset; all output is in the returned folder.
+    """Evaluate a run's best weights on a split of a dataset; returns the folder of the output.
 
     `threshold` is a score, "run" for the threshold that the run chose, or "validation" to choose a new threshold on the
-    validation split of the dataset. Without `out`, the folder is `evaluation` in the run's folder.
+    validation split of the dataset. Without `out`, the output folder is `evaluation` in the run's folder.
     """
     folder = out or run / "evaluation"
     check_output(folder, run)
@@ -140,7 +140,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         cells = [for_markdown(name), *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        # Take AP from the metrics: the curve in the file has fewer points, so its area differs from AP.
+        # Take AP from the metrics: the file has only some points of the curve, so their area differs from AP.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]
@@ -149,7 +149,8 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     write_markdown(
         out / "compare.md",
         "# Comparison of runs\n\n"
-        "In brackets: 95 % intervals, or the value of each unit if there are fewer than five.\n\n" + text,
+        "In brackets: 95 % intervals, or the value of each scene (trajectory, image) if there are fewer than five.\n\n"
+        + text,
     )
     draw_curves(curves, out / "precision_recall.png")
     mark_files(out, ("compare.md", "precision_recall.png"), "; ".join(marks))
@@ -157,7 +158,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
 
 
 def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, str]:
-    """Terrain status of an evaluation, and the mark for its output ("" for none)."""
+    """Terrain status of an evaluation, and the mark for its output; "" if it needs no mark."""
     if "images/name" in metrics:
         return "real images", ""
     status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")

@@ -12,9 +12,10 @@ _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
 
 def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
-    """Settings of a run, from its config.yaml only; a setting missing from the file has its default.
+    """Settings of a run, read from its config.yaml.
 
-    `settings` overrides single evaluation settings. Raises UserError if a setting would change the network.
+    Settings missing from the file have their defaults. `settings` ("detect.evaluation.nms_iou=0.4") overrides single
+    evaluation settings. Raises UserError if a setting would change the network.
     """
     path = run / "config.yaml"
     if not path.is_file():
@@ -37,7 +38,7 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
 
 
 def chosen_threshold(run: Path) -> float:
-    """Read the score threshold that a run chose on its validation split. Raises UserError if it is missing."""
+    """Score threshold that a run chose on its validation split. Raises UserError if it is missing."""
     threshold = read_metrics(run).get("test/threshold")
     if isinstance(threshold, bool) or not isinstance(threshold, float | int) or not math.isfinite(threshold):
         raise UserError(run / METRICS_FILE, "test/threshold", threshold, "a number; or give --threshold")

@@ -1,1 +1,1 @@
-"""The crater population: places and sizes, profiles, stamping on the ground, measured rims."""
+"""Craters of a scene: population, profiles, stamping on the ground, and measurement of rims."""

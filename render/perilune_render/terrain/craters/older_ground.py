@@ -1,4 +1,7 @@
-"""The older ground under a crater: the plane fitted to it, and its height difference from rim to centre (numba)."""
+"""The older ground under a crater: a fitted plane, and the height difference from rim to centre.
+
+The functions are compiled by numba.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +12,7 @@ from perilune_render.terrain.craters.profile import REACH
 from perilune_shared.geometry.frames import Array
 
 _PLANE_REACH = 1.3
-"""Radius of the ground to which the plane is fitted, fresh crater radii."""
+"""Radius of the circle within which the plane is fitted, fresh crater radii."""
 
 
 class Window(NamedTuple):
@@ -18,7 +21,7 @@ class Window(NamedTuple):
     lines: Array
     """Lines of vertices in the format of `perilune_render.terrain.grid.lines_in` (at least `n_lines`, 7)."""
     n_lines: int
-    """Number of lines that are used."""
+    """Number of lines in use."""
 
 
 class _Plane(NamedTuple):
@@ -40,7 +43,7 @@ class _Plane(NamedTuple):
 def _fit_plane(height, x, y, radius, window):
     """Fit a least-squares plane to the ground around (x, y).
 
-    Returns whether it has enough vertices, and the plane.
+    Returns whether there are enough vertices for a plane, and the plane.
     """
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
@@ -85,7 +88,7 @@ def _fit_plane(height, x, y, radius, window):
 
 @njit(inline="always")
 def _sag(plane, removed):
-    """Height difference from rim to centre, at least 0, of the older ground that a crater has not removed."""
+    """Height difference from rim to centre, at least 0, of the older ground that remains under a crater."""
     rim_column = int((len(removed) - 1) / REACH)
     return max(plane.rim * (1 - removed[rim_column]) - plane.floor * (1 - removed[0]), 0.0)
 

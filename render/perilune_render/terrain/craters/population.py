@@ -3,8 +3,8 @@
 A crater's age is drawn uniformly between 0 and the time in which production reaches the equilibrium density of its
 size, so that fresh, worn and nearly erased craters occur together, as in real images. If production has not reached
 equilibrium, the age is drawn between 0 and the age of the surface (our simplification: before 3 Gyr ago, production
-fell rapidly). Equilibrium densities are counts of craters that are still visible, so no crater in equilibrium is drawn
-with more wear than `_LARGEST_VISIBLE_WEAR`.
+fell rapidly). Equilibrium densities are counts of visible craters, so no crater of a size in equilibrium is drawn with
+more wear than `_LARGEST_VISIBLE_WEAR`.
 
 Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so in order of wear a large young crater
 could come before a small old crater that it has removed.
@@ -34,7 +34,7 @@ from perilune_shared.geometry.frames import Array
 ORIGINS = ("primary", "secondary", "elevation model")
 """Values of `Craters.origin`: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
 MAX_CRATERS = 5_000_000
-"""Largest mean number of craters in a scene; each needs about 1 kB of memory during stamping and measurement."""
+"""Largest expected number of craters in a scene; each needs about 1 kB of memory during stamping and measurement."""
 _LARGEST_VISIBLE_WEAR = 0.11
 """Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
 _LARGEST_SECONDARY_M = 30.0
@@ -70,12 +70,11 @@ class Craters:
     origin: np.ndarray
     """Index into ORIGINS (N,)."""
     listed_diameter_m: Array
-    """Diameters in the catalogue, for craters whose rims were measured in its elevation model, metres (N,); otherwise
-    NaN."""
+    """Diameters in the catalogue, metres (N,), if its rims are measured in the elevation model; otherwise NaN."""
     rim_rms_share: Array
     """R.m.s. distance of a measured rim from the fitted ellipse, divided by the radius (N,); NaN if not measured."""
     rim_axis_ratio: Array
-    """Minor axis of this ellipse divided by the major axis (N,); NaN if not measured."""
+    """Minor axis of the fitted ellipse divided by its major axis (N,); NaN if not measured."""
 
     def __len__(self) -> int:
         return len(self.x_m)
@@ -99,9 +98,9 @@ class Craters:
         age_myr: Array,
         wear_m2: Array,
     ) -> "Craters":
-        """Circular primary craters, in the given order, with bowl-shaped floors and the rims of Fassett & Thomson.
+        """Circular primary craters, in the given order, with bowl-shaped floors.
 
-        The arrays (N,) are the fields of the same names.
+        The arrays (N,) are the fields of the same names. Rim heights are those of the profile `fassett_thomson`.
         """
         n = len(x_m)
         rim = fresh_rim_height_m(diameter_m, fresh_depth_m)
@@ -177,13 +176,16 @@ def _sizes(config: CratersConfig, grid: Grid, max_diameter_m: float | None = Non
 
 
 def _bins(config: CratersConfig, grid: Grid, smallest: float, largest: float) -> tuple[Array, Array]:
-    """The edges of the size bins (B + 1,) and the half-width (B,) of the ground fine enough for each bin, metres."""
+    """The edges of the size bins (B + 1,), and a half-width for each bin (B,), metres.
+
+    Within this half-width, the ground is fine enough for the bin.
+    """
     edges = log_bins(smallest, max(largest, 1.001 * smallest))
     return edges, np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
 
 
 def check_craters(config: CratersConfig, grid: Grid) -> None:
-    """Raise UserError if the craters of a scene would not fit in memory, before any is drawn."""
+    """Raise UserError, before drawing, if the craters of a scene would not fit in memory."""
     equilibrium = EQUILIBRIA[config.equilibrium](share=config.equilibrium_share.high)
     law = Minimum(NeukumProduction(age_gyr=config.surface_age_gyr), equilibrium)
     edges, half_m = _bins(config, grid, *_sizes(config, grid))
@@ -195,7 +197,7 @@ def check_craters(config: CratersConfig, grid: Grid) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Single:
-    """N craters that are drawn one by one."""
+    """N craters that are drawn independently, before some of them are moved into clusters."""
 
     x_m: Array
     """x of the centres, O_L, metres (N,)."""
@@ -206,17 +208,17 @@ class _Single:
     age_myr: Array
     """Ages, Myr (N,)."""
     oldest_myr: Array
-    """Largest age at which a crater of this size is visible, Myr (N,)."""
+    """Largest age that can be drawn for the size of each crater, Myr (N,)."""
     reach_m: Array
     """Half-width of the ground with a vertex spacing fine enough for each crater, metres (N,)."""
 
 
 def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple[Array, Array, Array, np.ndarray]:
-    """Move a share of the small craters into elongated clusters, as secondaries form, each of a single age.
+    """Move a share of the small craters into elongated clusters, which resemble secondary craters.
 
-    Returns x, y, age and whether each crater was moved (N,). The size-frequency law does not change. We chose the sizes
-    and shapes of the clusters by eye, in comparison with NAC images. A crater is not moved if it would leave the part
-    of the grid that is fine enough for it.
+    Returns x, y, age and whether each crater was moved (N,). The craters of a cluster have one age. The size-frequency
+    law does not change. We chose the sizes and shapes of the clusters by eye, in comparison with images of the Narrow
+    Angle Camera. A crater is not moved if it would leave the part of the grid that is fine enough for it.
     """
     x, y, age, diameter = single.x_m, single.y_m, single.age_myr, single.diameter_m
     chosen = np.flatnonzero((rng.random(len(x)) < share) & (diameter < _LARGEST_SECONDARY_M))
@@ -246,5 +248,5 @@ def _clustered(single: _Single, share: float, rng: np.random.Generator) -> tuple
 
 
 def _in_bin(law: SizeFrequency, diameter_m: Array) -> Array:
-    """Number of craters per square metre in a bin that extends a tenth of a decade upwards from a diameter."""
+    """Number of craters per square metre from a diameter to a tenth of a decade above it."""
     return law.csfd(diameter_m) - law.csfd(diameter_m * 10**0.1)

@@ -1,8 +1,9 @@
 """Crater profiles, fresh and worn, as tables over distance and wear.
 
-With x = r/R, a fresh profile is h = h_rim rim(x) + d bowl(x). `rim` describes rim and ejecta, with height 1 at the
-crest; `bowl` is a bowl of depth 1 below the crest. Both have continuous slopes everywhere, since a kink at the crest or
-at the end of the ejecta blanket would render as a ring.
+R is the radius of a crater, r the distance from its centre, and x = r/R. A fresh profile is h = h_rim rim(x) + d
+bowl(x), with the rim height h_rim and the depth d. `rim` describes rim and ejecta, with height 1 at the crest; `bowl`
+is a bowl of depth 1 below the crest. Both have continuous slopes everywhere, since a kink at the crest or at the end of
+the ejecta blanket would render as a ring.
 
 - `fassett_thomson`: Fassett & Thomson 2014, eq. 4 (doi 10.1002/2014JE004698). Deviations: the outer polynomial is
   scaled by 13 % to meet the crest (as printed, it leaves a step of 0.004 D). The crest and the end of the
@@ -46,14 +47,17 @@ MIN_WEAR, MAX_WEAR, N_WEAR = 2e-4, 0.6, 56
 
 @dataclass(frozen=True, slots=True)
 class ProfileTables:
-    """Tables over wear (rows, evenly spaced in log K/R^2) and distance (columns, evenly spaced in x, 0 to REACH)."""
+    """Tables of profiles over wear and distance.
+
+    Rows are wear, evenly spaced in log K/R^2. Columns are distance, evenly spaced in x from 0 to REACH.
+    """
 
     rim: Array
     """Height of rim and ejecta relative to the fresh rim height (N_WEAR, n_x)."""
     bowl: Array
     """Height of the bowl, at most 0, relative to the fresh depth (N_WEAR, n_x)."""
     flat_bowl: Array
-    """As `bowl`, for a crater with a flat floor (N_WEAR, n_x)."""
+    """`bowl` of a crater with a flat floor (N_WEAR, n_x)."""
     removed: Array
     """Share of the older ground that is removed (N_WEAR, n_x)."""
     crest: Array
@@ -74,7 +78,7 @@ def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
 
 
 def fresh_bowl(x: Array, profile: str = "fassett_thomson", *, flat: bool = False) -> Array:
-    """Height of the fresh bowl at x = r/R, relative to the depth: -1 at the centre, 0 from the crest outwards."""
+    """Height of the fresh bowl at x = r/R, relative to the depth: -1 at the centre, 0 beyond the crest."""
     x = np.asarray(x, np.float64)
     deepest = _depth_below_crest(np.zeros(1), profile, flat)
     inside = -_depth_below_crest(x, profile, flat) / deepest
@@ -135,8 +139,9 @@ def _depth_below_crest(x: Array, profile: str, flat: bool) -> Array:
 def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
     """Depth of a newly formed crater from rim to floor, metres.
 
-    `stopar`: Stopar et al. 2017. Their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m; extrapolated to 0.11
-    and 0.10 below) are interpolated linearly in log D between the middles of their ranges.
+    `stopar`: Stopar et al. 2017. The source gives d/D in steps: 0.21 from 400 m, then 0.17, 0.15, and 0.13 from 40 m.
+    Below 40 m we extrapolate with 0.11 and 0.10. Between the middles of the steps, d/D is interpolated linearly in log
+    D.
     `pike`: Pike 1977, 0.196 D^1.01 km with D in km; derived from larger craters.
     """
     d = np.asarray(diameter_m, np.float64)
@@ -150,8 +155,8 @@ def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fasset
 
     `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this gives 0.0368 D,
     as in the source. A rim of 0.0368 D at all sizes would be too high for small, shallow craters.
-    `pangu`: the smaller of the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and Pike's rim
-    height, 0.036 D^1.014 km with D in km.
+    `pangu`: the smaller of two values: the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and
+    Pike's rim height, 0.036 D^1.014 km with D in km.
     """
     if profile == "pangu":
         d = np.asarray(diameter_m, np.float64)
@@ -200,7 +205,10 @@ def profile_tables(profile: str = "fassett_thomson") -> ProfileTables:
 
 
 def _crests(x: Array, rim: Array, bowl: Array) -> Array:
-    """Radius of the maximum of rim + depth x bowl for each wear and depth, refined by a parabola through 3 columns."""
+    """Radius of the highest point of the profile, for each wear and each of DEPTH_OVER_RIM.
+
+    Refined by a parabola through three columns.
+    """
     shape = rim[:, None] + DEPTH_OVER_RIM[None, :, None] * bowl[:, None]
     top = np.clip(shape.argmax(axis=2), 1, len(x) - 2)
     left, here, right = (np.take_along_axis(shape, (top + k)[..., None], axis=2)[..., 0] for k in (-1, 0, 1))
@@ -210,9 +218,10 @@ def _crests(x: Array, rim: Array, bowl: Array) -> Array:
 
 
 def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_thomson") -> Array:
-    """Crest radius of craters divided by their fresh radius (N,), from wear K/R^2 and the ratio of depth to rim height.
+    """Crest radius of craters divided by their fresh radius (N,).
 
-    Limited to 1.5: at larger values hardly any crest is left.
+    `wear` is K/R^2, `depth_over_rim` the ratio of fresh depth to fresh rim height, (N,) each. The result is limited to
+    1.5, since at larger values hardly any crest remains.
     """
     tables = profile_tables(profile)
     row = wear_row(wear)

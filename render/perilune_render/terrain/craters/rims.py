@@ -21,12 +21,12 @@ class Rims:
     normal: Array
     """Unit normal of the plane through the rim, O_L (N, 3)."""
     depth_m: Array
-    """Mean height of the rim minus the mean height of the inner fifth, minus `Stamped.sag_m`, at least 0, metres
-    (N,)."""
+    """Depths, at least 0, metres (N,): mean height of the rim, minus the height of the floor, minus `Stamped.sag_m`.
+    The height of the floor is the mean of the height at the centre and the mean height at a fifth of the radius."""
 
 
 def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:
-    """Fit a plane to 16 points of each rim by least squares, and measure the depth below it.
+    """Fit a plane to 16 points of each rim by least squares, and measure the depth below the rim.
 
     `sag_m` (N,) is subtracted from the depth: the bowl of a large old crater must not count as depth of a small worn
     crater on its floor.

@@ -21,8 +21,8 @@ class Stamped:
     """Results of stamping N craters."""
 
     sag_m: Array
-    """Height difference from rim to centre of the older ground that remains under each crater, metres (N,). The
-    crater's own depth is not part of it."""
+    """Height difference from rim to centre of the older ground that remains under each crater, metres (N,). It does not
+    include the depth of the crater."""
     rim_left: Array
     """Share of each crater's rim that younger craters have not removed (N,)."""
 
@@ -35,8 +35,8 @@ class _Ground(NamedTuple):
     albedo: Array
     """Factor on the reflectance (n_vertices,)."""
     log_left: Array
-    """Logarithm of the share of the initial ground that is left (n_vertices,). Its change since a rim was stamped gives
-    how much of the rim is lost."""
+    """Logarithm of the share of the initial ground that is left (n_vertices,). The change since a rim was stamped gives
+    the share of the rim that is lost."""
     n_half: int
     """`Grid.n_half`."""
     half_widths: Array
@@ -93,14 +93,14 @@ class _Profile(NamedTuple):
 
 
 class _RimSamples(NamedTuple):
-    """Points at which the survival of the rims is sampled: _N_RIM of each of N craters."""
+    """Points at which the survival of rims is sampled: _N_RIM for each of N craters."""
 
     cos: Array
-    """Cosines of their directions from the centre (_N_RIM,)."""
+    """Cosines of the points' directions from the crater's centre (_N_RIM,)."""
     sin: Array
-    """Sines of their directions (_N_RIM,)."""
+    """Sines of the points' directions (_N_RIM,)."""
     vertex: np.ndarray
-    """Nearest vertex, -1 outside the grid (N, _N_RIM)."""
+    """Index of the vertex nearest to each point, -1 outside the grid (N, _N_RIM)."""
     before: Array
     """`_Ground.log_left` at this vertex when the rim was new (N, _N_RIM)."""
 
@@ -193,7 +193,7 @@ def _stamp_one(ground, shapes, k, profile, plane, window):
             if c >= columns - 1:
                 continue
             f = position - c
-            # The rim is uneven, the floor is not.
+            # Only the rim is uneven: the unevenness fades towards the centre.
             inner = min(r, 1.0)
             unevenness *= inner * inner * (3 - 2 * inner)
             lost = removed[c] * (1 - f) + removed[c + 1] * f

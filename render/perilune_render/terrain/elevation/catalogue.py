@@ -1,6 +1,6 @@
 """Craters of a real elevation model, read from a catalogue.
 
-They become labels, as generated craters do.
+They get labels, like generated craters.
 """
 
 import functools
@@ -26,12 +26,12 @@ _LIKELY_KM = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """How many craters of a catalogue are used, and why the others are not."""
+    """How many craters of a catalogue are used, and why the other craters are not used."""
 
     used: int
     """Number of craters that become labels."""
     measured: int
-    """Number of used craters whose rims are measured in the model; the others keep the catalogue's rims."""
+    """Number of used craters whose rims are measured in the model; the other used craters keep the catalogue's rims."""
     outside: int
     """Number of craters whose centre or rim is outside the ground."""
     unmeasured: int
@@ -69,11 +69,12 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
     """Read the craters of a catalogue that the model shows.
 
     These are the craters larger than `resolved_m` whose centre and rim are on the grid and on measured pixels of the
-    model; smaller craters are generated. Position and diameter come from the crest in the model where it is found,
-    unless the configuration prefers the catalogue. Age and fresh depth are unknown (NaN); wear is 0.
+    model; smaller craters are generated. Position and diameter are measured on the crest in the model. They are taken
+    from the catalogue if no crest is found, or if the configuration prefers the catalogue. Age and fresh depth are
+    unknown (NaN); wear is 0.
 
     The columns are recognised (`perilune_shared.storage.tables.catalogues`) or stated in the configuration. Raises
-    UserError, with the line number, for a faulty row, and if no crater can be used.
+    UserError for a faulty row, with the line number, or if no crater can be used.
     """
     listed = _listed(path, config.elevation.catalogue_columns)
     smallest_m = resolved_m(model)
@@ -126,7 +127,7 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
 
 
 def remark(path: Path, real: RealCraters) -> str:
-    """A message for the user about a catalogue, shown before its ground is generated."""
+    """A message for the user about a catalogue, shown before the ground is generated."""
     return f"{path.name}: {real.counts}"
 
 

@@ -27,15 +27,15 @@ def margin_m(sides_m: tuple[float, float]) -> float:
 
 
 def fade(distance_m: Array, wavelength_m: float) -> Array:
-    """Share of the model's relief of one wavelength that remains at distances (...) from its known ground, metres.
+    """Share (...) of the model's relief of one wavelength L that remains at a distance d from the model.
 
-    exp(-(d / 0.3 L)^2), whose slope at the edge is 0.
+    It is exp(-(d / 0.3 L)^2), with slope 0 at the edge. Both arguments are in metres.
     """
     return np.exp(-((distance_m * _WAVES / (_FADE * wavelength_m)) ** 2))
 
 
 def continued(height_m: Array, beyond_m: Array, margin: int, pixel_m: tuple[float, float]) -> Array:
-    """Heights (rows, columns) minus their mean slope (`mean_slope`), extended by `margin` pixels on each side.
+    """Heights (rows, columns) minus their `plane`, extended by `margin` pixels on each side.
 
     beyond_m (rows + 2 margin, columns + 2 margin) is the distance from known ground, metres; where it is 0, the heights
     do not fade. pixel_m is the pixel size between rows and between columns, metres.
@@ -57,9 +57,9 @@ def continued(height_m: Array, beyond_m: Array, margin: int, pixel_m: tuple[floa
 
 
 def plane(height_m: Array, row: Array, column: Array) -> Array:
-    """The least-squares plane through heights (rows, columns).
+    """Heights, at rows and columns, of the least-squares plane through heights (rows, columns).
 
-    Row and column are 0 at the first pixel's centre.
+    Row and column are 0 at the centre of the first pixel.
     """
     n_rows, n_columns = height_m.shape
     i, j = np.arange(n_rows) - (n_rows - 1) / 2, np.arange(n_columns) - (n_columns - 1) / 2
@@ -72,12 +72,12 @@ def plane(height_m: Array, row: Array, column: Array) -> Array:
 def mean_slope(height_m: Array, row: Array, column: Array, beyond_m: Array, side_m: float) -> Array:
     """The mean height plus the model's mean slope (`plane`), metres; beyond the model, the slope fades.
 
-    It fades as 1 / (1 + (d / side)^2), where `side_m` is the model's shorter side.
+    The slope fades as 1 / (1 + (d / side)^2), where `side_m` is the model's shorter side.
     """
     mean = height_m.mean()
     return mean + (plane(height_m, row, column) - mean) / (1 + (beyond_m / side_m) ** 2)
 
 
 def distance_in_holes_m(known: np.ndarray, pixel_m: tuple[float, float]) -> Array | None:
-    """Distance, metres, of each pixel (rows, columns) from the nearest known one; None if all are known."""
+    """Distance of each pixel (rows, columns) from the nearest known pixel, metres; None without holes."""
     return None if known.all() else ndimage.distance_transform_edt(~known, sampling=pixel_m)

@@ -1,8 +1,8 @@
 """Measure the rim crests of catalogued craters in an elevation model.
 
 A catalogue often gives the diameter at formation, or a diameter marked by hand on an image; worn rims lie farther out.
-The crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane
-that is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
+In each of 36 directions, the crest is the highest place of the height profile from the centre outwards, above a plane
+fitted to the ground around the crater. An ellipse through the 36 places gives centre and diameter.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,9 @@ _LARGEST_SHIFT = 0.4
 _MIN_DEPTH = 0.02
 """Smallest depth of the centre below the crest, diameters."""
 _OUTLIER = 2.5
+"""Distance from the ellipse above which a direction is excluded from the fit, standard deviations."""
 _CHUNK = 256
+"""Number of craters that are measured at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,7 @@ def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Ar
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Ellipses of N craters; where no crest was found, the input craters."""
+    """Ellipses of N craters. Without a crest, position and radius are those of the input."""
 
     x_m: Array
     y_m: Array
@@ -117,7 +119,7 @@ def _fit(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array) -> _Fit
 
 
 def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
-    """Radius of the crest in each direction (N, A), shares of the crater's radius, and whether one exists (N, A).
+    """Radius of the crest in each direction (N, A), crater radii, and whether there is a crest (N, A).
 
     A crest is a maximum of the profile (N, A, R) inside a range around the highest point of the median profile; a
     maximum at the end of this range does not count.
@@ -144,13 +146,13 @@ def _plane(height_m: Array, unit_x: Array, unit_y: Array, share: Array) -> Array
 
 
 def _rim_level(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array, crest: Array, angle: Array) -> Array:
-    """Mean height (N,) of the model along a crest (N, A) given in shares of the radius (N,)."""
+    """Mean height (N,) of the model along a crest (N, A) given in crater radii."""
     reach = crest * radius_m[:, None]
     return _at(model, x_m[:, None] + reach * np.cos(angle), y_m[:, None] + reach * np.sin(angle)).mean(axis=1)
 
 
 def _heights(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array, unit_x: Array, unit_y: Array) -> Array:
-    """Heights (N, A, R) of the model at positions around centres (N,), given in radii."""
+    """Heights (N, A, R) of the model at positions around centres (N,), given in crater radii."""
     scale = radius_m[:, None, None]
     return _at(model, x_m[:, None, None] + scale * unit_x, y_m[:, None, None] + scale * unit_y)
 

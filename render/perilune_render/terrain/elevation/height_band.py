@@ -1,4 +1,4 @@
-"""The heights of a raster file: which band has them, their unit, and the values that mark missing heights."""
+"""The heights of a raster file: their band, their unit, and the values that mark missing heights."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _UNITS = {
     "mm": r"mm|millimet(?:er|re)s?",
 }
 _LOWEST_M, _HIGHEST_M = -9_900.0, 11_500.0
-"""Heights that the Moon has, above and below its mean radius, with a margin: -9.1 to 10.8 km."""
+"""Lowest and highest accepted height relative to the mean radius. The Moon has heights of -9.1 to 10.8 km."""
 _MIN_RELIEF = 7e-4
 """Range of heights, as a share of the ground's width, below which heights without a unit may be kilometres."""
 _WIDEST_RELIEF = 25.0
-"""Range of heights of the whole Moon, in kilometres, with a margin. Values with a larger range are not kilometres."""
+"""Range of heights of the whole Moon, kilometres, with a margin. Values with a larger range are not in kilometres."""
 _MIN_EXTENT_M = 1000.0
 """Smallest width of the ground, metres, at which heights are tested for kilometres."""
 _MIN_PLATEAU = 4
-"""Smallest number of equal values that may be fill."""
+"""Smallest number of equal values that are tested for fill."""
 _ISIS_SPECIAL = 3.4e38
 """Smallest absolute value of pixels without data in an ISIS cube (Null, and saturated or out of range)."""
 
@@ -83,9 +83,9 @@ class HeightBand:
     def in_metres(self, height: Array, width_m: float) -> Array:
         """Convert heights or radii (rows, columns) to metres of height, in place.
 
-        The ground is `width_m` wide. Raises UserError if they cannot be heights on the Moon: if values are beyond the
-        Moon's highest and lowest points, if many are equal and far from the rest (undeclared fill), or if the ground is
-        too flat for metres and no unit is stated.
+        The ground is `width_m` wide. Raises UserError if the values cannot be heights on the Moon: if some are beyond
+        the Moon's highest and lowest points, if many are equal and far from the rest (undeclared fill), or if the
+        ground is too flat for metres and no unit is stated.
         """
         height[np.isinf(height)] = np.nan
         known = height[np.isfinite(height)]
@@ -143,16 +143,17 @@ class HeightBand:
                 )
 
     def _hint(self, value: float, metres: float) -> str:
-        """How to declare a value as fill."""
+        """Hint in an error message: how to declare a value as fill."""
         raw = (value - self.raster.offsets[self.index - 1]) / (self.raster.scales[self.index - 1] or 1.0)
         unit = "" if metres == 1 or self.metres is not None else ", or the unit with --height-unit"
         return f"; if it is fill, --set {_FIELD}.nodata={raw:.9g}{unit}"
 
 
 def height_band(path: Path, files: RasterFiles, raster: Any, config: ElevationConfig) -> HeightBand:
-    """The band of heights that a configuration chooses, or the only one that can have them.
+    """The band that a configuration chooses for heights, or the only band that can have heights.
 
-    Raises UserError if there are several, if the raster is a picture, or if its unit is not a length.
+    Raises UserError if several bands can have heights, if the raster is a picture or has complex numbers, or if the
+    unit of the band is not a length.
     """
     index = _index_of(path, raster, config)
     unit = config.height_unit or _unit_of(path, files, raster, index)
@@ -195,9 +196,9 @@ def _index_of(path: Path, raster: Any, config: ElevationConfig) -> int:
 
 
 def _unit_of(path: Path, files: RasterFiles, raster: Any, index: int) -> str | None:
-    """The unit of heights that a file states: in the band, in a label, or as vertical unit.
+    """The unit of heights that a file states in the band, in a label, or as vertical unit.
 
-    Returns None if it states none.
+    Returns None if the file states no unit.
     """
     stated = [raster.units[index - 1] or ""]
     if files.driver == "PDS":

@@ -1,4 +1,7 @@
-"""Use a real elevation model as the base of a scene: any projection and pixel size, holes allowed."""
+"""Use a real elevation model, with any projection and pixel size, as the base of a scene.
+
+The model may have holes.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -24,9 +26,6 @@ from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, selenographic_
 from perilune_shared.storage.files import sha256_of
 from perilune_shared.storage.rasters import RasterFiles, opened_raster, raster_files
 
-if TYPE_CHECKING:
-    pass
-
 _AT_THE_MIDDLE = ElevationConfig()
 _FIELD = "dataset.terrain.elevation"
 _LARGEST_PIXELS = 100_000_000
@@ -34,7 +33,8 @@ _LARGEST_PIXELS = 100_000_000
 _RESOLVED_PIXELS = 4.0
 """Smallest diameter of a crater that a model shows, pixels."""
 _SWELL_M = 120.0
-"""Standard deviation of the low-pass filter for a mirrored model, metres; long waves exceed about 4 times this."""
+"""Standard deviation of the low-pass filter for a mirrored model, metres. Waves longer than about 4 times this value
+count as long."""
 _SEAM_M = 100.0
 """Width of the band along a mirrored model's edge in which short waves are point-reflected too, metres."""
 
@@ -60,8 +60,8 @@ class ElevationModel:
     step_m: float
     """Quantisation step of the raster's heights if it is large enough to make terraces, metres; otherwise 0."""
     read_step: int
-    """Number of raster pixels along the side of one pixel of the model; above 1 if the raster is too large for the
-    ground."""
+    """Number of raster pixels along the side of one pixel of the model; above 1 if the ground would have too many
+    pixels."""
     hole_m: Array | None
     """Distance of each pixel (rows, columns) from the nearest known pixel, metres; None without holes."""
     source: str
@@ -74,12 +74,13 @@ def read_elevation(
     """Read an elevation model; its site is the site of `config`, or the middle of the raster.
 
     `ground_m` is the side of the ground around the site for which the model is needed, metres; None stands for
-    UNSTATED_GROUND_M. If the raster has more than LARGEST_PIXELS, only this ground is read. If the ground has more than
-    LARGEST_PIXELS too, it is read at a lower resolution. If an edge of the raster's map crosses the ground, the columns
-    are rearranged or resampled.
+    UNSTATED_GROUND_M. A raster with more than `window.LARGEST_PIXELS` pixels is read only around this ground, at a
+    lower resolution if the ground has too many pixels as well. If an edge of the raster's map crosses the ground, the
+    columns are rearranged or resampled.
 
     Raises UserError if the model is missing, unreadable or empty, if it lacks a pixel size or a projection of the Moon,
-    if the site is outside the model or in a hole, and if the values cannot be heights (`elevation.height_band`).
+    if the site is outside the model or in a hole, or if the values cannot be heights (`elevation.height_band`).
+
     Holes (nodata, NaN) are filled with the nearest known height. Heights may be elevations or radii: only differences
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
@@ -168,7 +169,7 @@ def resolved_m(model: ElevationModel) -> float:
 
 
 def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
-    """Distance, metres, of raster coordinates (...) from the model's known ground; above 0 in holes and outside."""
+    """Distance, metres, of raster coordinates (...) from known ground; above 0 in holes and outside."""
     rows, columns = model.height_m.shape
     down = np.maximum(np.maximum(-row, row - rows), 0) * model.pixel_sides_m[0]
     across = np.maximum(np.maximum(-column, column - columns), 0) * model.pixel_sides_m[1]
@@ -198,7 +199,7 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
 
 
 def refuse_unseen(model: ElevationModel, grid: Grid, config: ElevationConfig) -> None:
-    """Raise UserError if no ground in view has a height in the model, unless the configuration allows this."""
+    """Raise UserError if the model has no height on the ground, unless the configuration allows this."""
     if not config.allow_unseen and _real_share(model, grid) == 0:
         found = f"no height within {grid.extent_m:.0f} m x {grid.extent_m:.0f} m of ground"
         site_text = f"latitude {model.latitude_deg:.4f}, longitude {model.longitude_deg:.4f}"
@@ -244,7 +245,7 @@ def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
 
 
 def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:
-    """Heights (n_vertices,) of the model on the grid, and distances (n_vertices,) from known ground, both in metres.
+    """Heights on the grid, and distances from known ground, metres, (n_vertices,) each.
 
     The site is at height 0. Heights are interpolated bicubically. Beyond the model the ground continues smoothly
     (`perilune_render.terrain.elevation.continuation`), and relief and craters are added later; with `outside` "mirror"

@@ -17,7 +17,8 @@ _GENTLE = 3.5
 def step_of(height_m: Array, pixel_m: float) -> float:
     """The quantisation step, metres, of known heights (N,); 0 without a step that makes visible terraces.
 
-    There is a step if heights repeat and each is within a twentieth of a step of a multiple of the step.
+    Heights are quantised if values repeat and each height above the lowest is within a twentieth of a step of a
+    multiple of the step.
     """
     distinct = np.unique(height_m)
     if len(distinct) < 3 or len(height_m) < _MIN_REPEATS * len(distinct):

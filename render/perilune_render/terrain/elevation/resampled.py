@@ -1,6 +1,6 @@
-"""Resample an elevation model around its site, if the site is near a pole or a cut of the model's map projection.
+"""Resample an elevation model whose site is near a pole or a cut of its map projection.
 
-There, neighbouring points on the ground are in distant columns of the raster.
+Near a pole or a cut, neighbouring points on the ground are in distant columns of the raster.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ _ROWS_AT_ONCE = 64
 def resampled(
     height_m: Array, known: np.ndarray, raster: RasterMap, site: Site, pixel_m: float, ground_m: float
 ) -> tuple[Array, np.ndarray, RasterMap]:
-    """Heights (N, N), whether they are known, and their map: azimuthal equidistant about the site, north up.
+    """Heights (N, N) around the site, whether they are known (N, N), and their map.
 
-    `height_m` and `known` (rows, columns) are the pixels of `raster`. The new pixels are `pixel_m` wide, or wider if a
-    side would need more than _MAX_SIDE_PX of them. They cover a square of ground of side `ground_m` with a margin.
+    The map is azimuthal equidistant about the site, with north up. `height_m` and `known` (rows, columns) are the
+    pixels of `raster`. The new pixels are `pixel_m` wide, or wider if a side would need more than _MAX_SIDE_PX of them.
+    They cover a square of ground of side `ground_m` with a margin.
     """
     import rasterio
 
@@ -59,7 +60,10 @@ def resampled(
 
 
 def _padded(height_m: Array, raster: RasterMap) -> Array:
-    """Heights extended by _PAD_PX on each side: periodic if the map shows all longitudes, continued across poles."""
+    """Heights extended by _PAD_PX on each side.
+
+    Columns repeat if the map shows all longitudes; rows then continue across the poles.
+    """
     around, columns = repeat_px(raster), height_m.shape[1]
     if not around:
         return np.pad(height_m, _PAD_PX, mode="edge")

@@ -125,7 +125,7 @@ def map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
 
 
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
-    """Raise UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
+    """Raise UserError unless a coordinate system's ellipsoid has the Moon's radius, within one percent.
 
     PROJ refuses to transform between bodies, but its error message names neither body.
     """
@@ -163,7 +163,7 @@ def circle_of(crs: rasterio.crs.CRS) -> float | None:
 def site_in(path: Path, raster: RasterMap, config: ElevationConfig) -> Site:
     """The site that a configuration states, or the middle of the raster.
 
-    Raises UserError if a stated site is outside the raster, and if the raster's map is not a map of the Moon.
+    Raises UserError if a stated site is outside the raster, or if the raster's map is not a map of the Moon.
     """
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import RasterioError
@@ -190,7 +190,7 @@ def _place_of(raster: RasterMap, latitude_deg: float, longitude_deg: float) -> t
 
     try:
         column, row = raster.places(np.array([latitude_deg]), np.array([longitude_deg]))
-    except (RasterioError, CPLE_BaseError):  # GDAL's own errors are not wrapped here
+    except (RasterioError, CPLE_BaseError):  # rasterio does not wrap the errors of GDAL here
         return np.nan, np.nan
     return float(column[0]), float(row[0])
 
@@ -217,7 +217,7 @@ def _refuse_outside(path: Path, raster: RasterMap, column: float, row: float, fo
 def refuse_hole(path: Path, raster: RasterMap, part: RasterMap, known: np.ndarray, site: Site) -> None:
     """Raise UserError if the site has no height.
 
-    `site` has the column and row in `part` of the raster. `known` (rows, columns) says which pixels of the part have a
+    Column and row of `site` refer to `part` of the raster. `known` (rows, columns) says which pixels of the part have a
     height.
     """
     i, j = min(int(site.row), part.shape[0] - 1), min(int(site.column), part.shape[1] - 1)
@@ -244,7 +244,7 @@ def site_within(raster: RasterMap, part: RasterMap, site: Site) -> Site:
 
 
 def _between(raster: RasterMap, other: RasterMap, column: float, row: float) -> tuple[float, float]:
-    """Raster coordinates in `other`, a raster of the same projection."""
+    """Column and row in `other` of coordinates in `raster`; both rasters have the same projection."""
     if raster.transform == other.transform:
         return column, row
     column, row = ~other.transform @ (raster.transform @ (column, row))

@@ -1,8 +1,8 @@
 """Relief of the procedural ground around an elevation model, with the model's statistics.
 
-The statistic is the robust standard deviation (median absolute value divided by 0.6745, insensitive to single pits) of
-second differences of height at several baselines. It is measured on the model, and on flat ground with only the
-configured craters. A self-affine relief is fitted to the part that the craters do not explain.
+The statistics are robust standard deviations of second differences of height at several baselines: the median absolute
+value divided by 0.6745, which single pits hardly change. They are measured on the model, and on flat ground with only
+the configured craters. A self-affine relief is fitted to the part that the craters do not explain.
 """
 
 import functools
@@ -23,6 +23,7 @@ from perilune_shared.geometry.frames import Array
 _NORMAL = 0.6745
 """Ratio of the median absolute value to the standard deviation of a normal distribution."""
 _HURST = np.arange(0.4, 1.01, 0.05)
+"""Hurst exponents that the fit tries."""
 _LARGEST_TRIAL = 384
 """Largest number of pixels along a side of the trial ground, which has only craters."""
 
@@ -40,7 +41,7 @@ class FittedRelief:
 
 
 def fitted_relief(model: ElevationModel, relief: ReliefConfig, craters: CratersConfig, seed: int) -> FittedRelief:
-    """Waves fitted to the model, from the shortest wavelength that it resolves to the longest configured one."""
+    """Waves fitted to the model, from the shortest resolved to the longest configured wavelength."""
     n_octaves = int(np.floor(np.log2(relief.longest_wavelength_m / resolved_m(model)))) + 1
     wavelength = relief.longest_wavelength_m / 2.0 ** np.arange(max(n_octaves, 0))
     baselines = 2 ** np.arange(1, max(int(np.log2(min(model.height_m.shape) / 4)), 1) + 1)
@@ -76,9 +77,10 @@ def add_fitted_relief(
 
 
 def second_differences(height_m: Array, baselines: np.ndarray) -> Array:
-    """Robust deviation (B,) of h(x - b) - 2 h(x) + h(x + b) along both axes of heights (rows, columns), b in pixels.
+    """Robust standard deviation (B,) of h(x - b) - 2 h(x) + h(x + b) for each baseline b, pixels.
 
-    NaN are ignored; 0 if there are no other values.
+    Differences are taken along both axes of the heights (rows, columns). NaN values are ignored; the result is 0
+    without other values.
     """
     deviations = []
     for b in baselines:
@@ -92,7 +94,7 @@ def second_differences(height_m: Array, baselines: np.ndarray) -> Array:
 
 
 def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
-    """Heights (rows, columns), metres, of flat ground with the configured craters, at the model's pixel size."""
+    """Heights (rows, columns), metres, of flat ground with only craters, at the model's pixel size."""
     n_half = min(*model.height_m.shape, _LARGEST_TRIAL) // 2
     grid = Grid.even(n_half * model.pixel_m, n_half)
     height = np.zeros(grid.n_vertices)
@@ -102,7 +104,7 @@ def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
 
 
 def _response(ratio: Array) -> Array:
-    """Deviation of second differences of unit gradient noise, for ratios (...) of baseline to wavelength."""
+    """`second_differences` of gradient noise of amplitude 1, for ratios (...) of baseline to wavelength."""
     baselines, deviations = _measured_response()
     return np.interp(ratio, baselines, deviations)
 

@@ -1,7 +1,7 @@
-"""The part of a raster that a scene needs: all of a small raster, or a window of a large one at the scene's resolution.
+"""The part of a raster that a scene needs: all of a small raster, or a window of a large raster.
 
-The columns of a raster of the whole Moon repeat. If the scene's ground crosses the left or right edge, the raster is
-cut at another meridian.
+A window with too many pixels is read at a lower resolution. The columns of a raster of the whole Moon repeat. If the
+scene's ground crosses the left or right edge, the raster is cut at another meridian.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ _AROUND = 1.25
 _MIN_PX = 64
 """Smallest margin between the ground and the edge of a window of a large raster, pixels."""
 _NET = 65
+"""Number of points along a side of the lattice on which raster coordinates are tested for smoothness."""
 _ROUGH_PX = 0.5
 """Largest error of interpolated raster coordinates, pixels; above it, the map is discontinuous or too distorted."""
 
@@ -34,13 +35,13 @@ class Window:
     top: int
     """First row."""
     left: int
-    """First column; below 0 or beyond the last column if the raster's columns repeat."""
+    """First column; may be below 0 or beyond the last column if the raster's columns repeat."""
     shape: tuple[int, int]
     """Numbers of rows and columns of the part."""
     step: int
     """Number of raster rows, and of raster columns, in one pixel of the part."""
     cut: bool
-    """Whether the part is smaller than the raster."""
+    """Whether the part differs from the whole raster."""
 
 
 def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Window:
@@ -96,9 +97,10 @@ def read_window(band: HeightBand, raster: RasterMap, window: Window) -> Array:
 
 
 def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
-    """Whether a raster's coordinates vary smoothly over square ground around a site, so that they can be interpolated.
+    """Whether a raster's coordinates vary smoothly enough for interpolation over ground around a site.
 
-    They do not vary smoothly across a cut of the map, as at longitude 180, or around a pole of a cylindrical map.
+    The ground is a square of side `ground_m`. Coordinates do not vary smoothly across a cut of the map, as at longitude
+    180, or around a pole of a cylindrical map.
     """
     from scipy.interpolate import RectBivariateSpline
 
@@ -122,7 +124,7 @@ def places_of(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Ar
 
 
 def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Finite columns and rows of positions (N,); if the map repeats, the columns nearest to the site's column."""
+    """Finite columns and rows of positions (N,); in a map that repeats, columns nearest to the site."""
     column, row = places_of(raster, site, x_m, y_m)
     good = np.isfinite(column) & np.isfinite(row)
     column, row = column[good], row[good]
@@ -133,9 +135,10 @@ def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tupl
 
 
 def _runs(raster: RasterMap, window: Window) -> list[tuple[int | None, int]]:
-    """Split the columns of a window into runs: first raster column of each run, and its number of window columns.
+    """Split the columns of a window into runs of consecutive columns of the raster.
 
-    The first raster column is None if the raster has no columns there.
+    Returns the first raster column of each run, None where the raster has no columns, and the number of window columns
+    in the run.
     """
     columns, step, around = raster.shape[1], window.step, repeat_px(raster)
     runs: list[tuple[int | None, int]] = []

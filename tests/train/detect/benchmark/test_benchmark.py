@@ -111,7 +111,7 @@ def test_a_part_of_the_frames_is_scored_and_named(places, tmp_path):
     done = submitted((tmp_path / "data", manifests), truth(tmp_path / "data"), tmp_path)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "out/benchmark.md").read_text()
-    assert "`benchmark-detect-mare`: **a part: 4 of 8 frames** of the shared manifest" in page
+    assert "`benchmark-detect-mare`: **only 4 of 8 frames** of the shared manifest" in page
 
 
 def test_frames_that_are_not_those_of_the_manifest_are_refused(places, make_dataset, tmp_path):

@@ -189,7 +189,7 @@ def test_fewer_than_five_units_give_their_values_and_no_interval(tmp_path):
     evaluation = scenes_found("aabbcd")
     write_evaluation(tmp_path, evaluation, [np.zeros((200, 200), np.uint8)] * 6, [])
     report = (tmp_path / "report.md").read_text()
-    assert "4 of them are too few for an interval" in report and " to 1.000)" not in report
+    assert "at least 5 scenes are needed for an interval" in report and " to 1.000)" not in report
     assert "| recall | 0.667 (a 1.000, b 0.000, c 1.000, d 1.000)" in report
 
 
@@ -228,7 +228,7 @@ def test_the_report_of_images_of_which_nothing_is_known(tmp_path: Path):
     assert (
         "made by hand" in report
         and "3 frames, 3 selected labels" in report
-        and "the value of each image; 3 of them" in report
+        and "the value of each image; at least 5 images are needed" in report
     )
     assert "| precision | 0.333" in report
     assert "## Radius" in report and "## Sun" not in report and "## Freshness" not in report

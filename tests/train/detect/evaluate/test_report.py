@@ -7,7 +7,11 @@ from perilune_train.records.spread import draw_resamples
 
 @pytest.mark.parametrize(
     ("scenes", "words"),
-    [(6, "resamples of 6 scenes"), (1, "resamples of 6 trajectories"), (2, "the value of each scene; 2 of them")],
+    [
+        (6, "resamples of 6 scenes"),
+        (1, "resamples of 6 trajectories"),
+        (2, "the value of each scene; at least 5 scenes"),
+    ],
 )
 def test_the_note_names_the_units(scenes, words):
     names = [f"scene-{k % scenes}" for k in range(6)]

@@ -16,7 +16,10 @@ _SELECTIONS = {
 
 
 def page_of(score: Score, about: Sequence[str]) -> str:
-    """The page as Markdown: headline, all scoring rules, regions, bins. `about` (Markdown) states what was scored."""
+    """The page as Markdown: headline, all scoring rules, regions, bins.
+
+    The Markdown lines `about` state what was scored.
+    """
     ap_selection, ap_rule, ap = score.least("ap50_paper")
     spread = score.evaluations[ap_selection].spreads[f"{SCORING_RULES[ap_rule]}ap50_paper"]
     f1_selection, f1_rule, f1 = score.least("f1")
@@ -34,8 +37,9 @@ def page_of(score: Score, about: Sequence[str]) -> str:
         *_scoring_rules(score),
         "",
         *[f"- {text}" for text in _SELECTIONS.values()],
-        "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored",
-        f"- edge: detections down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater",
+        "- usual: unmatched detections on ignored craters, outside the range of radii, or centred off the image are "
+        "ignored",
+        f"- edge: as usual, but the range of radii of detections starts at {EDGE:g} of the smallest radius",
         "- strict: every unmatched detection is a false positive",
         f"- {spread_note(score.evaluations[SELECTIONS[0]].resamples)}; a match needs an IoU of {MATCH_IOU:g}",
         "",
@@ -50,7 +54,7 @@ def page_of(score: Score, about: Sequence[str]) -> str:
 def _coverage(score: Score) -> list[str]:
     lines = []
     for part, (n_frames, n_locked) in score.frames_of.items():
-        whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
+        whole = "all frames" if n_frames == n_locked else f"**only {n_frames} of {n_locked} frames**"
         lines.append(f"`{part}`: {whole} of the shared manifest")
     return lines + [f"`{part}`: **not scored**" for part in part_names("detect") if part not in score.frames_of]
 

@@ -1,4 +1,4 @@
-"""Score detections on all parts of the benchmark: by scoring rule, bin and region, and the lowest figures."""
+"""Score detections on all parts of the benchmark, by label selection, scoring rule, bin and region."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Spread, spreads
 
 SELECTIONS = ("visible", "paper")
-"""Selections of labels; the paper uses the second."""
+"""Selections of labels (shared/labels/thresholds.py)."""
 SCORING_RULES = {"usual": "", "edge": "edge/", "strict": "strict/"}
 """Rules that decide which detections are false positives (matching.py), and their prefix in the figures."""
 MATCH_IOU = 0.5
@@ -30,7 +30,10 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Region:
-    """Figures of one region with one selection of labels, by the usual scoring rule."""
+    """Figures of one region for one selection of labels.
+
+    They follow the usual scoring rule unless the field states another rule.
+    """
 
     name: str
     """See `Part.region`."""
@@ -72,9 +75,10 @@ class Score:
         return selection, rule, values[selection, rule]
 
     def figures(self) -> Metrics:
-        """Flat keys for benchmark.json.
+        """Entries of benchmark.json.
 
-        headline/..., <selection>/<key of an evaluation>, <selection>/region/<name>/...
+        The keys are headline/..., <selection>/<key of an evaluation>, <selection>/region/<name>/..., frames/<part> and
+        locked_frames/<part>.
         """
         figures: Metrics = {}
         for metric in ("ap50_paper", "f1"):
@@ -114,9 +118,10 @@ def score(
     detections_by_part: Mapping[str, list[Detections]],
     threshold: float,
 ) -> Score:
-    """Score detections.
+    """Score detections on all parts.
 
-    `detections_by_part` has one entry per frame for each part of the benchmark; `loaded` is the result of `load_parts`.
+    `detections_by_part` has a list for each part of the benchmark, with one entry per frame. `loaded` is the result of
+    `load_parts`. `threshold` is the minimum score of the detections that count in precision, recall and F1.
     """
     evaluations, regions = {}, {}
     splits = loaded[SELECTIONS[0]]

@@ -73,7 +73,7 @@ def score_submission(
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """Detections to score, and what the page says about them."""
+    """Detections to score, and their description."""
 
     detections: dict[str, list[Detections]]
     """Detections of each frame, by part of the benchmark."""
@@ -84,11 +84,11 @@ class _Entry:
     extra_metrics: Metrics
     """Further entries of benchmark.json."""
     checks: Sequence[TerrainCheck]
-    """Checks of the terrain of each part."""
+    """Checks of the training terrain against the terrain of each part; empty if the training terrain is unknown."""
 
 
 def _write(out: Path, parts: Sequence[Part], loaded: dict[str, dict[str, DetectSplit]], entry: _Entry) -> Score:
-    """Score detections and write all files; returns the score."""
+    """Score detections, write all files and return the score."""
     about, threshold = entry.about, entry.threshold
     result = score(parts, loaded, entry.detections, threshold)
     mark = "; ".join(dict.fromkeys(check.mark for check in entry.checks if check.mark))

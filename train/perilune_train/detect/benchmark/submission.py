@@ -19,15 +19,17 @@ COLUMNS: dict[str, Kind] = {
     "y1_px": "number",
     "score": "number",
 }
-"""Columns of a submission. A box contains the whole ellipse, including any part outside the image. In x and y, the
-first pixel extends from 0 to 1."""
+"""Columns of a submission. A box contains the whole ellipse, including any part outside the image. The first pixel
+extends from 0 to 1 in x and in y."""
 _BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 
 
 def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[Detections]]:
     """Read the detections of each dataset, as a list with one entry per frame.
 
-    `frames` has the frame_ids of each dataset; the lists have their order. Frames without rows have no detections.
+    `frames` has the frame_ids of each dataset. Each returned list has the order of these ids. A frame without rows in
+    the table has no detections.
+
     Raises UserError if the file cannot be read, lacks a column, names another dataset or frame, or contains a number
     that is not finite, a box without area, or a score outside 0 to 1.
     """
@@ -37,12 +39,12 @@ def read_submission(path: Path, frames: dict[str, list[str]]) -> dict[str, list[
     of_dataset = _known(datasets, list(frames))
     table.check("dataset", of_dataset >= 0, f"one of {', '.join(sorted(frames))}")
     by_dataset = {}
-    for number, (name, own_ids) in enumerate(frames.items()):
+    for number, (name, frame_ids) in enumerate(frames.items()):
         rows = np.flatnonzero(of_dataset == number)
-        at = _known(ids, own_ids)[rows]
-        if (at < 0).any():
-            raise table.fault(int(rows[(at < 0).argmax()]), "frame_id", f"a frame of {name}")
-        by_dataset[name] = _of_dataset(table, rows, at, len(own_ids))
+        frame = _known(ids, frame_ids)[rows]
+        if (frame < 0).any():
+            raise table.fault(int(rows[(frame < 0).argmax()]), "frame_id", f"a frame of {name}")
+        by_dataset[name] = _of_dataset(table, rows, frame, len(frame_ids))
     return by_dataset
 
 
@@ -59,11 +61,14 @@ def _check_numbers(table: Columns) -> None:
     table.finite("score", 0, 1)
 
 
-def _of_dataset(table: Columns, rows: np.ndarray, at: np.ndarray, n_frames: int) -> list[Detections]:
-    """Detections of each frame, best first; `rows` (n,) are the rows of a dataset and `at` (n,) their frames."""
+def _of_dataset(table: Columns, rows: np.ndarray, frame: np.ndarray, n_frames: int) -> list[Detections]:
+    """Detections of each frame of a dataset, best first.
+
+    `rows` (n,) are the dataset's rows of the table, and `frame` (n,) is the index of each row's frame.
+    """
     boxes = np.column_stack([table.numbers(name)[rows] for name in _BOX]).reshape(-1, 4)
     scores = table.numbers("score")[rows]
-    order = np.lexsort((-scores, at))
-    bounds = np.searchsorted(at[order], np.arange(n_frames + 1))
+    order = np.lexsort((-scores, frame))
+    bounds = np.searchsorted(frame[order], np.arange(n_frames + 1))
     parts = (order[start:stop] for start, stop in pairwise(bounds))
     return [Detections(boxes[chosen], scores[chosen]) for chosen in parts]

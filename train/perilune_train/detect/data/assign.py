@@ -1,14 +1,14 @@
 """Assignment of predictors to labels.
 
-For each scale:
+A predictor is one anchor in one cell of a scale's grid. For each scale:
 
-1. `matching_anchors` compares the sizes of anchors and labels.
-2. Predictors in the cell of a label's centre, and in its nearest neighbours, become positive.
-3. Predictors whose cells touch the middle of an ignored label become ignored (`_cells_touched`).
+1. `matching_anchors` selects the anchors whose size fits a label.
+2. The predictors of these anchors in the cell of the label's centre, and in the nearest cells, become positive.
+3. For an ignored label, the predictors whose cells touch the middle of the label become ignored (`_cells_touched`).
 4. All other predictors are negative.
 
 The number of positive predictors depends on the labels. If the GPU assigned predictors, the CPU would have to wait for
-this number in every step. Therefore the loader assigns predictors on the CPU, and the loss only gathers them.
+this number in every step. Therefore the loader assigns predictors on the CPU, and the loss only gathers their outputs.
 """
 
 from collections.abc import Callable
@@ -61,7 +61,7 @@ class Assignment:
         return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Assignment":
-        """Copy the assignment to another device; from page-locked memory, the process does not wait."""
+        """Copy the assignment to another device; the process does not wait for a copy from page-locked memory."""
         return self._each(lambda part: part.to(device, non_blocking=True))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "Assignment":
@@ -69,7 +69,10 @@ class Assignment:
 
 
 def flat_predictors(predictors: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Indices (P,) of predictors (frame, anchor, row and column: (4, P)) in a flattened tensor of this shape."""
+    """Indices (P,) of predictors in a flattened tensor of shape (N, 3, h, w).
+
+    `predictors` (4, P) are the frame, anchor, row and column of each predictor.
+    """
     frame, anchor, row, column = predictors
     _, anchors, height, width = shape
     return ((frame * anchors + anchor) * height + row) * width + column
@@ -80,10 +83,10 @@ Targets = list[Assignment]
 
 
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float | None) -> Tensor:
-    """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
+    """Whether each anchor (K, 2) is assigned to each label box (T, 4): (T, K) bool.
 
-    True for the anchor of the highest IoU (all boxes centred on one point). With `ratio`, also true for every anchor
-    whose width and height are within this factor.
+    True for the anchor of the highest IoU, with anchor and box centred on one point. With `ratio`, also true for every
+    anchor whose width and height differ from the box's by less than this factor.
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors
@@ -102,17 +105,20 @@ def assign(
     shapes: list[tuple[int, int, int]],
     ratio: float | None,
 ) -> Targets:
-    """Positive and ignored predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
+    """Positive and ignored predictors of every scale.
+
+    `anchors` (scales, 3, 2) are in pixels; `shapes` has the grid (N, h, w) of each scale.
 
     A predictor is positive if its anchor matches a selected label (`matching_anchors`) and its cell is one of three:
-    the cell that contains the label's centre, its nearest neighbour along x, or its nearest neighbour along y (as in
-    later YOLO versions). Deviation: YOLOv3 makes one predictor of one scale positive for each label. Our rule gives
-    about nine times as many positives, so a short training suffices. Without `ratio`, one predictor is positive, as in
-    YOLOv3.
+    the cell that contains the label's centre, the cell nearest to the centre along x, or the cell nearest along y (as
+    in later YOLO versions). Deviation: YOLOv3 makes one predictor of one scale positive for each label. Our rule gives
+    about nine times as many positives, so a short training suffices. Without `ratio`, each label has one positive
+    predictor, as in YOLOv3.
 
-    A predictor is ignored if its anchor matches and its cell touches the middle half of an ignored label's box. All
-    other predictors are negative, including those around a selected label. Deviation: YOLOv3 ignores predictors around
-    a label if their boxes overlap it by more than 0.5. Here the loss lowers their scores, so better boxes score higher.
+    A predictor is ignored if its anchor matches an ignored label and its cell touches the middle half of that label's
+    box. All other predictors are negative, including other predictors around a selected label. Deviation: YOLOv3
+    ignores predictors around a label if the IoU of their boxes with the label exceeds 0.5. Here the loss lowers their
+    scores, so better boxes score higher.
     """
     matches = matching_anchors(labels.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
     centre = (labels.boxes[:, :2] + labels.boxes[:, 2:]) / 2
@@ -148,10 +154,10 @@ def assign(
 
 
 def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shape: tuple[int, int, int, int]) -> Tensor:
-    """Whether each cell touches the middle half of a box, along x and along y (N, 3, h, w).
+    """Whether the cell of each predictor touches the middle half of a box with this anchor: (N, 3, h, w).
 
-    The centre of such a cell is less than a quarter of the box's side plus half a cell from the centre of the box.
-    `at` and `size` (P, 2) are the centres and sizes of the boxes in cells.
+    Along x and along y, the centre of such a cell is less than a quarter of the box's side plus half a cell from the
+    centre of the box. `at` and `size` (P, 2) are the centres and sizes of the boxes in cells.
     """
     touched = torch.zeros(shape, dtype=torch.bool, device=at.device)
     if not len(at):

@@ -39,13 +39,13 @@ def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, fl
     # OpenCV's coordinates are 0 at the centre of the first pixel, box coordinates at its outer corner.
     origin = shift + 0.5 / factor - 0.5
     matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    scaled = cv2.warpAffine(image, matrix, (width, height), flags=how, borderValue=float(image.mean()))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    scaled = cv2.warpAffine(image, matrix, (width, height), flags=flags, borderValue=float(image.mean()))
     return scaled, (boxes - np.tile(shift, 2)) * factor
 
 
 def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Output value of each of the 256 grey levels of a frame, after stretch, gamma and gain; at most 255."""
+    """Values (256,) of a frame's grey levels after a random stretch, gamma and gain; at most 255."""
     level = np.arange(256) / 255
     if settings.stretch:
         below = np.bincount(image.ravel(), minlength=256).cumsum() / image.size
@@ -64,10 +64,11 @@ def augment(
     settings: AugmentSettings,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-    """Augment a frame; return grey levels (height, width) float32, boxes (M, 4) and whether each is selected (M,).
+    """Augment a frame and its boxes at random.
 
-    A crater is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is
-    removed if it becomes much smaller than that range or leaves the image.
+    Returns grey levels (height, width) float32, boxes (M, 4) in pixels, and whether each box is selected (M,). A crater
+    is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is removed
+    if it becomes much smaller than that range or leaves the image.
     """
     turned: NDArray = image
     if settings.flips_and_turns:

@@ -18,15 +18,18 @@ from perilune_train.training.runs import choose_device
 
 Array = NDArray[np.float64]
 Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
-"""A normalised frame (H, W), its boxes (M, 4) in pixels, and which of them are selected (M,)."""
+"""A normalised frame (H, W), its boxes (M, 4) in pixels, and whether each box is selected (M,)."""
 Batch = tuple[Tensor, Targets]
-"""Normalised frames (N, H, W) and the assignments of their labels; no assignments outside training."""
+"""Normalised frames (N, H, W) and the assignments of their labels; outside training the assignments are empty."""
 Key = tuple[int, int]
-"""Epoch and number of a frame within a share."""
+"""Epoch, and number of a frame within one process's share of the split."""
 
 
 class TrainingFrames(torch_data.Dataset):
-    """The frames of a share, indexed by epoch and number; the augmentation depends on seed, epoch and frame only."""
+    """The frames of one process's share of a split, indexed by epoch and number.
+
+    The augmentation depends on seed, epoch and frame only.
+    """
 
     def __init__(self, split: DetectSplit, config: DetectConfig):
         self.split, self.settings, self.seed = split, config.augment, config.seed
@@ -62,7 +65,7 @@ class EvaluationFrames(torch_data.Dataset):
 
 
 def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
-    """Convert normalised frames (N, H, W) to the network's input (N, in_channels, H, W), channels last in memory."""
+    """Convert normalised frames (N, H, W) to the network's input (N, in_channels, H, W), channels last."""
     stacked = torch.as_tensor(images)[:, None].expand(-1, in_channels, -1, -1)
     return stacked.contiguous(memory_format=torch.channels_last)
 
@@ -96,10 +99,11 @@ class Collate:
 def training_loader(
     split: DetectSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> torch_data.DataLoader:
-    """Training batches of a share in the order of each epoch; the first epoch, `epoch`, starts at batch `start`.
+    """Training batches of a share, in the order of each epoch.
 
-    `anchors` (scales, 3, 2) are the anchors of the network. All processes have equally many batches. So each frame is
-    used once in an epoch, except at most processes - 1 frames, which differ from epoch to epoch.
+    The first epoch is `epoch`; it starts at batch `start`. `anchors` (scales, 3, 2) are the network's anchors. All
+    processes have equally many batches, so up to processes - 1 frames are left out of an epoch; these frames differ
+    from epoch to epoch. All other frames are used once.
     """
     frames = TrainingFrames(split, config)
     fewest = split.n_frames // split.share.processes
@@ -108,7 +112,7 @@ def training_loader(
 
 
 def evaluation_loader(split: DetectSplit, config: DetectConfig, anchors: Tensor | None = None) -> torch_data.DataLoader:
-    """Batches of a share in order, not augmented; with `anchors` they have assignments, as in training."""
+    """Batches of a share in order, not augmented; they have assignments only if `anchors` are given."""
     frames = EvaluationFrames(split)
     batches = torch_data.BatchSampler(range(len(frames)), config.batch_size, drop_last=False)
     return batch_loader(frames, batches, collate_of(config, anchors), config.workers, pinned(config))

@@ -1,4 +1,4 @@
-"""Metadata of evaluated frames: scene, trajectory, altitude, Sun elevation. Any may be unknown for real images."""
+"""Metadata of evaluated frames: scene, trajectory, altitude, Sun elevation; unknown for real images."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """One entry per frame."""
+    """Metadata of N frames, one entry per frame."""
 
     name: list[str]
     """Name in titles (N)."""
@@ -22,7 +22,7 @@ class FrameFacts:
     scene: list[str]
     """Name of the terrain; "" if unknown (N). Bootstrap intervals resample whole scenes (records/spread.py)."""
     trajectory: list[str]
-    """Trajectory over the terrain, with a unique name; "" if unknown (N)."""
+    """Name of the trajectory over the terrain, unique in the dataset; "" if unknown (N)."""
     altitude_m: Array
     """Altitude of the camera above the site's ground plane; NaN if unknown (N,)."""
     sun_elevation_deg: Array
@@ -33,7 +33,7 @@ class FrameFacts:
 
 
 def unknown_facts(name: list[str], sizes_px: NDArray) -> FrameFacts:
-    """Metadata of images with known name, width and height (N, 2) only."""
+    """Metadata of images of which only the names and sizes (width and height, (N, 2)) are known."""
     nothing = np.full(len(name), np.nan)
     return FrameFacts(name, np.asarray(sizes_px), [""] * len(name), [""] * len(name), nothing, nothing)
 
@@ -56,7 +56,10 @@ def facts_of(frames: FrameStore) -> FrameFacts:
 
 
 def joined_facts(parts: Mapping[str, FrameFacts]) -> FrameFacts:
-    """Join the metadata of several parts; names of frames, scenes and trajectories begin with the part's name."""
+    """Join the metadata of several parts.
+
+    The names of frames, scenes and trajectories then begin with the part's name.
+    """
 
     def renamed(part: str, names: list[str]) -> list[str]:
         return [f"{part}/{name}" for name in names]

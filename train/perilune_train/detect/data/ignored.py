@@ -1,4 +1,4 @@
-"""Craters of a frame just outside the labelled range, which training and evaluation ignore."""
+"""Craters without a label that training and evaluation ignore: craters just outside the labelled range."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from perilune_shared.geometry.frames import matrix_from_quaternion
 
 Array = NDArray[np.float64]
 MARGIN = np.sqrt(0.5)
-"""Craters down to this fraction of the smallest evaluated radius are ignored. A smaller crater cannot reach an IoU of
-0.5 with a box in the range."""
+"""Craters down to this fraction of the smallest evaluated radius are ignored. The IoU of a smaller crater with a box in
+the range of radii is below 0.5."""
 _CENTRE, _NORMAL = ["x_m", "y_m", "z_m"], ["normal_x", "normal_y", "normal_z"]
 _SIZE = ["diameter_m", "depth_m"]
 
@@ -52,17 +52,17 @@ def unlabelled_craters(
     scale: tuple[float, float] = (1.0, 1.0),
     labelled: NDArray[np.int64] | None = None,
 ) -> Array:
-    """Shapes (M, 10) of the craters to ignore: a frame shows them just outside the labelled range.
+    """Shapes (M, 10) of the craters to ignore in a frame.
 
     The columns are box (x0, y0, x1, y1), radius and ellipse (centre x and y, semi-axes, all in pixels, and direction in
-    radians).
+    radians). `frame` is a row of the table frames, `radius_px` the range of labelled radii, and `labelled` has the ids
+    of the craters with a label in this frame.
 
-    A crater of 1.9 px looks like a crater of 2.1 px. If the smaller crater were background, training would lower the
-    scores of both, and a detection of the smaller crater would be a false positive. So two kinds of crater are ignored,
-    as COCO ignores objects outside its area range: craters within a factor of sqrt(2) of the range, and craters centred
-    off the image. Craters beyond that factor cannot reach an IoU of 0.5 with a box in the range. If frames will be
-    resized by factors from scale[0] to scale[1], smaller and larger craters are ignored too. `frame` is a row of the
-    table frames; `labelled` has the ids of the craters with a label in this frame.
+    Craters within a factor of sqrt(2) of the range, and craters centred off the image, are ignored, as COCO ignores
+    objects outside its area range. A crater of 1.9 px looks like a crater of 2.1 px. If the smaller crater were
+    background, training would lower the scores of both, and a detection of the smaller crater would be a false
+    positive. Beyond that factor, the IoU of a crater with a box in the range is below 0.5. If frames will be resized by
+    factors from scale[0] to scale[1], even smaller and larger craters are ignored.
     """
     low, high = radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
     rotation_camera_from_site = matrix_from_quaternion(frame["rotation_wxyz"])
@@ -88,10 +88,11 @@ def unlabelled_craters(
 def _right_size(
     craters: Craters, camera: Camera, forward: Array, position_m: Any, range_px: tuple[float, float]
 ) -> NDArray[np.int64]:
-    """Rows (M,) of craters in front of the camera whose radius in the frame may be in a range, by distance only.
+    """Rows (M,) of the craters in front of the camera whose radius in the frame may be in a range.
 
-    The distance is measured along `forward`, the camera's z axis in O_L. The result is exact for level ground and a
-    level camera; the margins of the limits are much larger than the effect of a tilt.
+    The radius is estimated as fx r / depth, with the depth along `forward`, the camera's z axis in O_L. The estimate is
+    exact for level ground and a camera that looks straight down. The factors 0.8 and 2 allow for more than the effect
+    of a tilt.
     """
     depth_m = craters.centre_m @ forward - np.asarray(position_m, np.float64) @ forward
     scaled = camera.fx_px * (craters.diameter_m / 2)

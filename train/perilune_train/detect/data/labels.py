@@ -49,7 +49,7 @@ class FrameLabels:
 
 @dataclass(frozen=True, slots=True)
 class LabelLimits:
-    """Which craters are labels, which of them are selected, and which craters are ignored."""
+    """Limits that decide which craters are labels, which labels are selected, and which craters are ignored."""
 
     selection: Selection
     """Thresholds of the selected labels."""
@@ -61,7 +61,10 @@ class LabelLimits:
 
 @dataclass(frozen=True)
 class SplitLabels(Sequence[FrameLabels]):
-    """Labels of N frames; an item is a view of the arrays. Worker processes share the arrays without copies."""
+    """Labels of N frames in joint arrays; an item is a view of the arrays.
+
+    Worker processes share the arrays without copies.
+    """
 
     shape: Array
     """Box (4), radius and ellipse (5) of all labels, frame after frame (L, 10)."""
@@ -98,11 +101,11 @@ def read_split_labels(
     share: Share,
     limits: LabelLimits,
 ) -> tuple[SplitLabels, Array]:
-    """Labels and ignored craters of this process's share of the frames, and sizes (S, 2) of selected labels.
+    """Labels and ignored craters of this process's share, and sizes (S, 2) of the selected labels.
 
-    The sizes are those of all frames of the split, not only of the share, in pixels. `table` has all frames of the
-    split (`frame_table`). Memory holds the result and one scene's craters and labels at a time. Raises UserError if a
-    part cannot be read, or if a key refers to a missing row or is not unique.
+    The sizes are widths and heights in pixels, in all frames of the split, not only in the share. `table` has all
+    frames of the split (`frame_table`). Memory holds the result and one scene's craters and labels at a time. Raises
+    UserError if a file of the dataset cannot be read, or if a key refers to a missing row or is not unique.
     """
     rows = dataset.table("frames", FRAME_COLUMNS)
     check = KeyCheck(dataset, rows)
@@ -123,7 +126,7 @@ def read_split_labels(
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
                 raise UserError(dataset.store, "labels: frame_id", got, expected)
             craters = read_craters(dataset, str(scene_id))
-            # Drop labels of other splits: their frame is -1, so they are first in the order.
+            # Drop labels of other splits. Their frame is -1, so they are first in the order.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
             labels, bounds = labels.take(order), np.searchsorted(frame[order], [*scene_frames, scene_frames[-1] + 1])
             scene_labels = _SceneLabels.of(labels, craters, limits.selection)

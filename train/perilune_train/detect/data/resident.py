@@ -1,8 +1,8 @@
 """Training frames and their assignments on the GPU, so that the CPU does not prepare batches.
 
 A GPU trains a detector faster than a process can prepare the batches. Without augmentation a frame does not change
-between epochs, so frames and assignments are moved to the GPU once, and batches are gathered there. All batches of one
-size have equal shapes, which a captured step needs (`detect/train/captured.py`).
+between epochs, so frames and assignments are moved to the GPU once, and batches are gathered there. The tensors of all
+batches of one size have equal shapes, so that a step can run as a CUDA graph (`detect/train/captured.py`).
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,18 @@ from perilune_train.detect.data.split import DetectSplit
 _UNCHANGED = AugmentSettings(
     flips_and_turns=False, scale=(1.0, 1.0), gain=0.0, gamma=0.0, stretch=0.0, blur_px=0.0, noise=0.0
 )
-_MAX_SHARE = 0.25
-"""Share of the memory of a GPU that resident frames may take."""
+_MAX_MEMORY_FRACTION = 0.25
+"""Largest fraction of a GPU's memory that resident frames may take."""
 _PORTION = 256
-"""Frames whose assignments are computed together."""
+"""Number of frames whose assignments are computed together."""
 
 
 @dataclass(frozen=True)
 class ResidentScale:
-    """Assignments of all F frames for one scale, K rows each; frames with fewer rows are padded."""
+    """Assignments of all F frames for one scale.
+
+    Each frame has K rows; the rows of frames with fewer positive predictors are padded.
+    """
 
     predictors: Tensor
     """Anchor, row and column of each positive predictor (F, K, 3)."""
@@ -78,7 +81,7 @@ class ResidentFrames:
         return cls(torch.as_tensor(split.frames.images).to(device), scales)
 
     def batch(self, numbers: Tensor, in_channels: int) -> tuple[Tensor, Targets]:
-        """The network's input (B, in_channels, height, width) and the assignments of the frames `numbers` (B,).
+        """Network input (B, in_channels, height, width) and assignments of the frames `numbers` (B,).
 
         Frames are normalised as by `perilune_train.data.frames.normalised`.
         """
@@ -97,7 +100,7 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
         predictors += list(part.predictors[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
     counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
-    # Pad with a box that has an area, since the loss is computed for all rows.
+    # Pad with the box 0, 0, 1, 1: the loss is computed for all rows, so the padding needs an area.
     filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
     return ResidentScale(
         pad_sequence(predictors, batch_first=True).to(device),
@@ -108,15 +111,18 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
 
 
 def may_reside(config: DetectConfig) -> bool:
-    """Whether the settings allow resident frames: one process, and no augmentation, teacher, guidance or stream."""
+    """Whether the settings allow resident frames.
+
+    They need a single process, and no augmentation, teacher, guidance loss or stream.
+    """
     alone = config.devices == config.num_nodes == 1
     plain = config.teacher is None and config.loss.lambda_guide == 0
     return alone and plain and not config.stream and config.augment == _UNCHANGED
 
 
 def fits(split: DetectSplit, device: torch.device) -> bool:
-    """Whether the frames of a split take at most a quarter of the memory of a GPU; assignments take far less."""
-    return split.frames.images.nbytes <= _MAX_SHARE * torch.cuda.get_device_properties(device).total_memory
+    """Whether the frames of a split take at most a quarter of a GPU's memory; assignments take far less."""
+    return split.frames.images.nbytes <= _MAX_MEMORY_FRACTION * torch.cuda.get_device_properties(device).total_memory
 
 
 class _Numbers(torch_data.Dataset):

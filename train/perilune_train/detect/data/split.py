@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DetectSplit:
-    """One split in memory, or the share of it that one of several processes trains on."""
+    """One split in memory, or one process's share of it."""
 
     frames: FrameStore
     """Pixels and poses of the share."""
@@ -55,12 +55,14 @@ def load_split(
     scale: tuple[float, float] = (1.0, 1.0),
     share: Share = ALONE,
 ) -> DetectSplit:
-    """Load frames and labels of a split, or only those of a share of it.
-
-    Raises UserError on damaged files, on frame sizes unfit for the network and on fewer frames than processes.
+    """Load the frames and labels of a split, or of one process's share of it.
 
     `scale` has the smallest and the largest zoom factor that will be applied to frames; the range of ignored craters is
-    extended accordingly. The edge scoring rule needs a largest factor of 1 / EDGE.
+    extended accordingly. For the edge scoring rule, pass a largest factor of 1 / EDGE, so that the ignored craters
+    extend below EDGE times the smallest radius.
+
+    Raises UserError if a file is damaged, if the network cannot use the frame size, or if there are fewer frames than
+    processes.
     """
     check_frame_size(dataset)
     table = frame_table(dataset, split)
@@ -86,12 +88,12 @@ def check_frame_size(dataset: Dataset) -> None:
 def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
     """Smallest and largest selected radius, pixels.
 
-    If the settings have no radii, these are the extremes of all labels of the dataset. If they have no largest radius,
-    it is the largest radius that the dataset labels.
+    If the settings have no radii, these are the extremes of all labels of the dataset, NaN without labels. If the
+    settings have no largest radius, it is the largest radius that the dataset labels.
     """
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()
-        least, largest = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))
-        return least, largest
+        smallest_px, largest_px = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))
+        return smallest_px, largest_px
     smallest_px, largest_px = settings.radius_px
     return smallest_px, label_bound_px(dataset.info) if largest_px is None else largest_px

@@ -28,7 +28,7 @@ class StreamedSplit:
     """The training split as a stream; see FrameStream."""
 
     stream: FrameStream
-    """The share of this process."""
+    """Frames of this process's share."""
     radius_px: tuple[float, float]
     """Range of radii that are labelled and evaluated, pixels."""
     label_sizes_px: NDArray[np.float64]
@@ -60,9 +60,9 @@ def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> Strea
 def streamed_loader(
     split: StreamedSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> StreamLoader:
-    """Training batches of a stream in the order of each epoch; the first epoch, `epoch`, starts at batch `start`.
+    """Training batches of a stream, in the order of each epoch.
 
-    `anchors` (scales, 3, 2) are the anchors of the network.
+    The first epoch is `epoch`; it starts at batch `start`. `anchors` (scales, 3, 2) are the network's anchors.
     """
     stream = split.stream
     stream.make = _Batches(_Labels(stream.dataset, config, split.radius_px), collate_of(config, anchors))
@@ -104,7 +104,7 @@ class _Batches:
         return self.collate([self.sample(frame, epoch) for frame in frames])
 
     def sample(self, frame: StreamedFrame, epoch: int) -> Sample:
-        """Decode and augment a frame; as for frames in memory, augmentation depends on seed, epoch and frame only."""
+        """Decode and augment a frame; the augmentation depends on seed, epoch and frame only."""
         config, camera, labels = self.labels.config, self.labels.dataset.info.camera, self.labels(frame)
         name, size = frame.row["frame_id"], frame.row["png_bytes"]
         image = decode(frame.png, f"{self.labels.dataset.store}/{name}", camera.height_px, camera.width_px, size)

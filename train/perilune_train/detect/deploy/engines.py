@@ -39,7 +39,7 @@ def package(name: str) -> Any:
 
 
 def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engine:
-    """Engine of a torch network that returns boxes and scores; uses channels last and torch's thread count."""
+    """Engine of a torch network that returns boxes and scores, with torch's number of threads."""
     network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
     @torch.inference_mode()
@@ -53,7 +53,7 @@ def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engi
 
 
 def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
-    """ONNX Runtime engine of an .onnx file. `threads` 0: one thread per core, within a container's CPU quota."""
+    """ONNX Runtime engine of an .onnx file. `threads` 0: one thread per core that the CPU quota allows."""
     onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or _within_quota()
@@ -114,7 +114,7 @@ def has_bf16() -> bool:
 
 @contextlib.contextmanager
 def _readable(path: Path) -> Any:
-    """Raise UserError if an engine cannot read a file; engines raise various kinds of RuntimeError."""
+    """Check a network file, and turn any error of the block that reads it into a UserError."""
     if not path.is_file():
         raise UserError(path, "network", "no such file", _EXPECTED)
     if path.stat().st_size > MAX_WEIGHT_BYTES:

@@ -39,7 +39,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 MAX_DIFFERENCE_PX = 1e-3
 """Largest allowed difference between a compared box coordinate and torch's float32 result, pixels."""
 MAX_DIFFERENCE_SCORE = 1e-3
-"""Largest allowed difference between a predictor's score and torch's."""
+"""Largest allowed difference between a score and torch's float32 result."""
 _CHECKED_BOXES = 100
 FORMATS = ("onnx", "openvino")
 _CHECKED_FRAMES = 8
@@ -47,19 +47,20 @@ _CHECKED_FRAMES = 8
 
 @torch.no_grad()
 def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
-    """Largest differences from torch's float32 results: of box coordinates, in pixels, and of scores.
+    """Largest differences of an engine from torch in float32: of box coordinates (pixels), and of scores.
 
-    Compares all scores, but only boxes with a score of at least `min_score` or among the best 100 of their image.
+    Compares all scores. Compares a box only if its score is at least `min_score` or among the best 100 of its image.
+    Both differences are infinite if the shapes differ.
     """
     boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
-    found_boxes, found_scores = engine(images)
-    if found_boxes.shape != boxes.shape or found_scores.shape != scores.shape:
+    engine_boxes, engine_scores = engine(images)
+    if engine_boxes.shape != boxes.shape or engine_scores.shape != scores.shape:
         return float("inf"), float("inf")
     # Always compare some boxes, even if the network detects nothing in these frames.
     best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
-    counts = scores >= np.minimum(best, min_score)
-    apart = np.abs(found_boxes - boxes)[counts]
-    return float(apart.max(initial=0.0)), float(np.abs(found_scores - scores).max())
+    compared = scores >= np.minimum(best, min_score)
+    box_differences = np.abs(engine_boxes - boxes)[compared]
+    return float(box_differences.max(initial=0.0)), float(np.abs(engine_scores - scores).max())
 
 
 def check(path: Path, name: str, network: YOLOv3, engine: Engine, images: Array, min_score: float) -> dict[str, float]:
@@ -76,7 +77,7 @@ def check(path: Path, name: str, network: YOLOv3, engine: Engine, images: Array,
 
 
 def noise_frames(count: int, size_px: int) -> np.ndarray:
-    """Grey frames (count, size_px, size_px) of seeded noise, used if there are no real frames to compare on."""
+    """Grey frames (count, size_px, size_px) of seeded noise, for a comparison without real frames."""
     return np.random.default_rng(0).integers(0, 256, (count, size_px, size_px)).astype(np.uint8)
 
 
@@ -95,13 +96,16 @@ class Trained:
 
 
 def load_trained(root: Path) -> Trained:
-    """Load a finished run's network, settings and threshold. Raises UserError if the folder is not a finished run."""
+    """Load a finished run's network, settings and threshold.
+
+    Raises UserError if the folder is not a finished run.
+    """
     config, threshold, best = config_of_run(root), chosen_threshold(root), RunFolder(root).best
     return Trained(load_detector(best), config, threshold, best)
 
 
 def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
-    """All data needed to use the exported files without this code."""
+    """Metadata of an export: all values that a user of the exported files needs."""
     network, settings = trained.network, trained.config.evaluation
     return {
         "input": {
@@ -133,9 +137,9 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """Terrain record of the exported network, and the check of the int8 calibration's terrain.
+    """Terrain record of the exported network, and the check of the terrain used to calibrate int8.
 
-    The record includes the terrain of the calibration. Without calibration the check is None.
+    The record includes the calibration terrain. Without `calibration` the check is None.
     """
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
@@ -167,7 +171,8 @@ def export_run(
     """Export a run's detector to the new folder `out`, and check the files.
 
     Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (metadata)
-    and README.md. Compares on frames of the dataset's validation split, or on noise without a dataset.
+    and README.md. Compares the outputs of the files with torch's on frames of the dataset's validation split, or on
+    noise without a dataset.
 
     Raises UserError, and writes nothing, if a file's output differs from torch's, if the dataset has frames of another
     size, or if int8 would be calibrated on terrain of a test split (of the run or of the dataset). `allow_overlap`

@@ -1,4 +1,4 @@
-"""The detector for flight, with fewer and simpler operations, and its export to ONNX and OpenVINO files."""
+"""The detector in fewer and simpler operations, and its export to ONNX and OpenVINO files."""
 
 import copy
 import json
@@ -17,11 +17,12 @@ _OPSET = 17
 
 
 class FlightDetector(nn.Module):
-    """Maps images (N, in_channels, size_px, size_px) to boxes (N, K, 4), x0 y0 x1 y1 in pixels, and scores (N, K).
+    """A detector in operations that ONNX supports: maps images to boxes and scores.
 
-    Boxes and scores equal those of `YOLOv3.detect` up to rounding. Batch norm is folded exactly into the convolutions:
-    W' = W g / sqrt(v + eps), b' = beta - m g / sqrt(v + eps). CBAM has no custom backward pass. The module decodes
-    boxes but does not suppress any. The given network is not changed.
+    Images (N, in_channels, size_px, size_px) give boxes (N, K, 4), x0 y0 x1 y1 in pixels, and scores (N, K). They equal
+    the results of `YOLOv3.detect` up to rounding; non-maximum suppression is not included. Batch norm is folded exactly
+    into the convolutions: W' = W g / sqrt(v + eps), b' = beta - m g / sqrt(v + eps). CBAM is replaced by standard
+    operations. The given network is not changed.
     """
 
     def __init__(self, network: YOLOv3, size_px: int = 256):
@@ -70,7 +71,7 @@ def write_onnx(detector: FlightDetector, path: Path, metadata: dict[str, Any], i
 
 
 def write_openvino(onnx_path: Path, path: Path) -> None:
-    """Convert an ONNX file to OpenVINO's format: `path` (.xml) and, beside it, the weights (.bin) in float32."""
+    """Convert an ONNX file to OpenVINO's format: `path` (.xml), and the float32 weights (.bin) beside it."""
     openvino = package("openvino")
     # Read with the runtime: the converter sends telemetry.
     openvino.save_model(openvino_core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)

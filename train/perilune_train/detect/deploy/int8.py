@@ -49,7 +49,7 @@ class Int8Verdict:
 
     @property
     def kept(self) -> bool:
-        """Whether int8 is faster and loses at most MAX_AP_LOSS."""
+        """Whether int8 is faster and loses at most MAX_AP_LOSS of AP."""
         return self.ap50_paper_float - self.ap50_paper_int8 <= MAX_AP_LOSS and self.int8_s < self.float_s
 
     def as_metadata(self) -> dict[str, Any]:
@@ -66,9 +66,9 @@ class Int8Verdict:
 
 
 def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config: DetectConfig) -> Int8Verdict:
-    """Quantise the ONNX file `source` into `out` and evaluate both on `val`; deletes `out` unless int8 is kept.
+    """Quantise the ONNX file `source` into `out`, and evaluate both files on `val`.
 
-    Calibrates on 64 frames spread over the training split.
+    Calibrates on 64 frames spread over the training split. Deletes `out` unless int8 is kept.
     """
     frames = load_frames(dataset, "train").images
     chosen = frames[np.linspace(0, len(frames) - 1, min(_CALIBRATION_FRAMES, len(frames))).astype(int)]
@@ -97,10 +97,10 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
     class Frames(quantization.CalibrationDataReader):  # type: ignore[name-defined]
         def __init__(self) -> None:
-            self.left: Iterator[Array] = iter(images)
+            self.remaining: Iterator[Array] = iter(images)
 
         def get_next(self) -> dict[str, Array] | None:
-            image = next(self.left, None)
+            image = next(self.remaining, None)
             return None if image is None else {"images": image[None]}
 
     graph = onnx.load(str(source), load_external_data=False).graph
@@ -125,7 +125,10 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
 
 def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, label: str) -> float:
-    """The paper's AP of an engine on a split, at the run's IoU; images run one by one at scale 1, as in flight."""
+    """The paper's AP of an engine on a split, at the run's IoU.
+
+    The engine gets one image at a time, at scale 1, as in flight.
+    """
     import torch
 
     detections = []

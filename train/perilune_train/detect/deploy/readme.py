@@ -34,7 +34,7 @@ def detect(grey):
 
 
 def readme(metadata: dict[str, Any]) -> str:
-    """Markdown for users of an export with this metadata (detector.json)."""
+    """Markdown page for the users of an export; `metadata` is the content of detector.json."""
     _, channels, size_px, _ = metadata["input"]["shape"]
     threshold = f"{metadata['score_threshold']:.4f}"
     lines = [
@@ -55,7 +55,7 @@ def readme(metadata: dict[str, Any]) -> str:
         "|---|---|",
         *(f"| {name} | `{digest}` |" for name, digest in metadata["files"].items()),
         "",
-        "`detector.json` contains these and all other values; the ONNX file contains them as metadata.",
+        "`detector.json` contains these and all other values; the ONNX file contains most of them as metadata.",
         "OpenVINO computes in bfloat16 if the processor supports it, which is faster but less accurate;",
         "`INFERENCE_PRECISION_HINT=f32` gives the same boxes as torch. Fixing the shape to one image (`model.reshape`)",
         "also makes it faster.",

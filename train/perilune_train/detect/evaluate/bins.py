@@ -1,7 +1,7 @@
 """Metrics by crater size, altitude, Sun elevation and freshness.
 
-Altitude and Sun elevation belong to a frame, so a bin holds whole frames. Radius belongs to a label, so a bin follows
-COCO's rule for areas: detections are matched again while the labels of other bins are ignored, and an unmatched
+Altitude and Sun elevation belong to a frame, so their bins hold whole frames. Radius belongs to a label, so its bins
+follow COCO's rule for areas: detections are matched again while the labels of other bins are ignored, and an unmatched
 detection is ignored if its radius is outside the bin. Freshness (depth over diameter) belongs to a label too. A false
 positive has no freshness, so only recall is defined.
 """
@@ -39,9 +39,9 @@ class BinFigures:
     unit: str
     """px, m, deg or empty."""
     low: float
-    """Lower limit, included."""
+    """Lower limit, included; excluded in the radius bin above 50 px."""
     high: float
-    """Upper limit. It belongs to the bin only in the last bin and in the paper's largest radius bin (up to 50 px)."""
+    """Upper limit, excluded; included in the last bin and in the radius bin that ends at 50 px."""
     frames: int
     """Number of frames with a selected label in the bin."""
     labels: int
@@ -49,15 +49,15 @@ class BinFigures:
     ap50_paper: float
     """AP as defined in the paper (metrics.py)."""
     ap50_paper_spread: Spread
-    """Spread of ap50_paper over the units with selected labels in the bin."""
+    """Spread of ap50_paper over the scenes (trajectories, images) with selected labels in the bin."""
     precision: float
     """Precision by the usual scoring rule (matching.py)."""
     recall: float
     """Fraction of the selected labels that were found."""
     recall_spread: Spread
-    """Spread of recall over the same units."""
+    """Spread of recall over the same scenes (trajectories, images)."""
     f1: float
-    """F1 of precision and recall."""
+    """F1 at the threshold."""
 
     @property
     def key(self) -> str:
@@ -83,10 +83,10 @@ def figures_by_bin(
     criteria: Criteria,
     resamples: Resamples,
 ) -> list[BinFigures]:
-    """Metrics of every bin that holds selected labels; `matches` must follow `criteria`.
+    """Metrics of every bin that holds selected labels; `matches` must result from `criteria`.
 
-    The outer altitude bins include frames up to a tenth beyond the first and the last altitude, because trajectories
-    end near the nominal altitude, not exactly at it.
+    The lowest altitude bin includes frames up to a tenth below its lower limit, and the highest bin includes frames up
+    to a tenth above its upper limit: trajectories end near the nominal altitude, not exactly at it.
     """
     bins, threshold, radius_px = [], criteria.threshold, criteria.radius_px
     for low, high in pairwise(RADIUS_BINS_PX):
@@ -121,7 +121,6 @@ class _Bin(NamedTuple):
 
 
 def _of_matches(limits: _Bin, matches: Matches, threshold: float, resamples: Resamples) -> BinFigures:
-    """All metrics of the matches in a bin."""
     precision, recall, f1 = at_threshold(matches, threshold)
     spread = spreads(
         lambda drawn: {

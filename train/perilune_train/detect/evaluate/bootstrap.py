@@ -13,9 +13,9 @@ _GROUPS = 2000
 def average_precisions(matches: Matches, resamples: Resamples) -> Array:
     """The paper's AP (`Curve.ap_paper`) of every resample (R,); NaN without selected labels.
 
-    For speed, the sorted detections of each unit are counted in at most 2000 groups of neighbouring scores, and the
-    curve has one point per group. The result is exact for up to 2000 distinct scores; otherwise the error is a few
-    ten-thousandths.
+    For speed, the sorted detections of each scene (trajectory, image) are counted in at most 2000 groups of similar
+    scores, and the curve has one point per group. The result is exact for up to 2000 distinct scores. With more scores,
+    the error is a few ten-thousandths.
     """
     counted = np.flatnonzero(matches.outcome != IGNORED)
     order = counted[np.argsort(-matches.scores[counted], kind="stable")]
@@ -36,7 +36,7 @@ def average_precisions(matches: Matches, resamples: Resamples) -> Array:
 
 
 def at_threshold_resampled(matches: Matches, threshold: float, resamples: Resamples) -> dict[str, Array]:
-    """precision, recall and f1 of every resample (R,), at one score threshold; NaN without selected labels."""
+    """Precision, recall and F1 of every resample (R,) at one threshold; NaN without selected labels."""
     strong = matches.scores >= threshold
     hits, counted = (
         resamples.totals(matches.frame[strong & chosen])

@@ -17,7 +17,7 @@ def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def coverage_matrix(first: ArrayLike, second: ArrayLike) -> Array:
-    """Share (N, M) of each box (N, 4) that lies inside each region (M, 4); 0 for empty boxes."""
+    """Fraction (N, M) of the area of each box (N, 4) inside each region (M, 4); 0 for empty boxes."""
     overlap, area = _intersections(first, second)
     return np.divide(overlap, area[:, None], out=np.zeros_like(overlap), where=area[:, None] > 0)
 
@@ -50,23 +50,23 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
 
 @compiled
 def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
-    """Indices of the boxes (N, 4) that suppression keeps, at most `max_count`.
+    """Indices of the boxes that suppression keeps, at most `max_count`.
 
-    Boxes are x, y, width, height, best first.
-
-    Each cell of a grid lists the kept boxes that touch it, so that a box is compared only with nearby boxes. Two boxes
-    that overlap touch a common cell; cells at the edge of the grid include everything beyond the grid. A box that
-    touches more than `most` cells, or has no area, goes to a separate list and is compared with all boxes.
+    The boxes (N, 4) are x, y, width, height, best first. Each cell of a grid lists the kept boxes that touch it, so
+    that a box is compared only with nearby boxes. Two boxes that overlap touch a common cell; cells at the edge of the
+    grid include everything beyond the grid. A box that touches more than `max_cells` cells, or has no area, goes to a
+    separate list and is compared with all boxes.
     """
-    side, most = 32, 64
+    side, max_cells = 32, 64
     n, low, high = len(boxes), np.empty(2), np.empty(2)
     for axis in range(2):
         middle = boxes[:, axis] + boxes[:, 2 + axis] / 2
         low[axis], high[axis] = middle.min(), middle.max()
     cell = np.maximum((high - low) / side, 1e-6)
     heads = np.full((side, side), -1)
-    # Each cell has a linked list. An entry is the index of a kept box and the index of the next entry, or -1.
-    entries, n_entries = np.empty((4 * n + most, 2), np.int64), 0
+    # Each cell has a linked list that starts at its entry in `heads`. An entry is the index of a kept box, and the
+    # index of the next entry (-1 at the end).
+    entries, n_entries = np.empty((4 * n + max_cells, 2), np.int64), 0
     kept, n_kept = np.empty(min(n, max_count), np.int64), 0
     large, n_large = np.empty(n, np.int64), 0
     first, last = np.empty(2, np.int64), np.empty(2, np.int64)
@@ -79,7 +79,7 @@ def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np
             last[axis] = min(max((stop - low[axis]) / cell[axis], 0.0), side - 1.0)
         touched = (last[0] - first[0] + 1) * (last[1] - first[1] + 1)
         # OpenCV gives two boxes without area an overlap of 1, wherever they are.
-        everywhere = touched > most or boxes[k, 2] * boxes[k, 3] <= 0
+        everywhere = touched > max_cells or boxes[k, 2] * boxes[k, 3] <= 0
         removed = False
         if everywhere:
             for i in range(n_kept):

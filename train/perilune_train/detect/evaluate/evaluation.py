@@ -5,8 +5,8 @@
     write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
 
 `detections` is a list of Detections, `labels` a list of FrameLabels, and `facts` a FrameFacts (`unknown_facts` if
-nothing is known). Each has one entry per frame. Labels of real images are all selected and labelled, and their ellipses
-are inscribed in the boxes.
+nothing is known). Each has one entry per frame. In real images all craters are labelled, and the ellipse of a label is
+inscribed in its box.
 """
 
 from collections.abc import Sequence
@@ -61,10 +61,10 @@ class Evaluation:
     by_iou: list[Matches]
     """Matches at each of COCO_IOUS."""
     bins: list[BinFigures]
-    """Metrics by radius, altitude, Sun elevation and freshness, for bins that hold labels."""
+    """Metrics by radius, altitude, Sun elevation and freshness, for bins that hold selected labels."""
     spreads: dict[str, Spread]
-    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper by the edge and
-    strict scoring rules."""
+    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper by the edge and strict scoring
+    rules."""
     resamples: Resamples
     """Resamples of the bootstrap intervals."""
 
@@ -74,10 +74,10 @@ class Evaluation:
         return errors_of_found(self.overlaps, self.matches, self.threshold)
 
     def figures(self) -> Metrics:
-        """Flat keys for metrics.json; NaN where undefined.
+        """Entries of metrics.json; NaN where undefined.
 
-        The keys come from `metrics.figures`, `figures_over_ious`, `Spread.keys` and `errors`; others are
-        <bin>/ap50_paper and further metrics of each bin, and recall_radius_...
+        The keys come from `metrics.figures`, `figures_over_ious`, `Spread.keys` and `errors`. Further keys are
+        <bin>/ap50_paper and other metrics of each bin, recall_radius_... and lowest_ap50_paper_by_...
         """
         result: Metrics = {
             **figures(self.matches, self.threshold),
@@ -126,8 +126,8 @@ def evaluate_detections(
 ) -> Evaluation:
     """Evaluate the detections of all frames.
 
-    The edge scoring rule is valid only if `labels` also include craters well below the range of radii, as ignored.
-    `seed` is the random seed of the bootstrap.
+    The edge scoring rule is valid only if `labels` include the craters down to EDGE times the smallest radius and
+    somewhat smaller, as ignored labels. `seed` is the random seed of the bootstrap.
     """
     match_iou, radius_px, threshold = criteria.match_iou, criteria.radius_px, criteria.threshold
     overlaps = find_overlaps(detections, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))

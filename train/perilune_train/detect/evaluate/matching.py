@@ -2,29 +2,29 @@
 
 Evaluate detections against labels of rendered or real images with:
 
-    overlaps = find_overlaps(found, labels, sizes_px)          # list[Detections], FrameLabels, (N, 2)
-    matches = overlaps.match(0.5, (2.0, 50.0))                 # at one IoU
+    overlaps = find_overlaps(detections, labels, sizes_px)     # list[Detections], list[FrameLabels], (N, 2)
+    matches = overlaps.match(0.5, (2.0, 50.0))                 # at an IoU of 0.5, radii of 2 to 50 px
     curve(matches).ap_paper()                                  # metrics.py
 
-Detections are matched in order of score. Each takes the unmatched selected label of highest IoU, if that is at least
-the given IoU. Only selected labels count in recall. Three scoring rules differ in which unmatched detections are false
-positives:
+Detections are matched in order of score. Each takes the unmatched selected label of highest IoU, if this IoU is at
+least `match_iou`. Only selected labels count in recall. Three scoring rules differ in which unmatched detections are
+false positives:
 
-- Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
-  labelled range), if its radius sqrt(w h) / 2 is outside the labelled range, or if its centre is off the image. The
-  labels cannot decide whether such a detection is right.
-- Edge (`edge_range`): a detection down to 0.75 of the smallest radius is a false positive too, unless it overlaps
-  a crater, selected or not. By the usual rule a detector can report boxes just below the smallest radius everywhere:
-  some of them match a label and count, and the others are ignored.
+- Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the range
+  of radii), if its radius sqrt(w h) / 2 is outside the range of radii, or if its centre is off the image. The labels
+  cannot decide whether these detections are right. All other unmatched detections are false positives.
+- Edge (`edge_range`): as usual, but the range of radii of detections starts at 0.75 of the smallest radius. By the
+  usual rule a detector can report boxes just below the smallest radius everywhere: some of them match a label and
+  count, and the others are ignored.
 - Strict: every unmatched detection is a false positive.
 
 A crowd (`FrameLabels.crowd`, COCO's `iscrowd`) is a region with any number of craters that are not labelled one by one.
-As in COCO, the share of a detection inside the region replaces its IoU, and a matching detection is ignored.
+As in COCO, the fraction of a detection inside the region replaces its IoU, and a matching detection is ignored.
 
 There are two differences from COCO. In COCO an ignored label that is not a crowd takes only one detection; here it
 takes any number, since detections on an ignored crater cannot be evaluated. COCO gives the same metrics if each ignored
 label is repeated once for every detection (a test checks this). COCO counts a detection whose centre is off the image
-as a false positive, because its labels have no such centres.
+as a false positive, because COCO's labels have no centres off the image.
 """
 
 from collections.abc import Sequence
@@ -42,13 +42,13 @@ Rows = NDArray[np.intp]
 FOUND, FALSE, IGNORED = 1, 0, -1
 NO_LABEL, ON_IGNORED = -1, -2
 EDGE = 0.75
-"""The edge scoring rule counts false positives down to this fraction of the smallest radius."""
+"""In the edge scoring rule, false positives count down to this fraction of the smallest radius."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
 """The IoUs over which COCO averages, bit-identical to COCO's."""
 
 
 def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
-    """Range of radii, pixels, in which the edge scoring rule counts unmatched detections as false positives."""
+    """Range of radii, pixels, in which unmatched detections are false positives by the edge scoring rule."""
     return radius_px[0] * EDGE, radius_px[1]
 
 
@@ -57,7 +57,7 @@ class Criteria:
     """Which detections and labels an evaluation counts."""
 
     threshold: float
-    """Minimum score of the detections that count in precision, recall and F1; choose it on other frames."""
+    """Minimum score of the detections that count in precision, recall and F1. Choose it on other frames."""
     radius_px: tuple[float, float]
     """Range of the evaluated radii, pixels."""
     match_iou: float = 0.5
@@ -83,7 +83,7 @@ class Matches:
     outcome: NDArray[np.int8]
     """Outcome of each detection: FOUND, FALSE or IGNORED (D,)."""
     label: Rows
-    """Matched label, a row of Overlaps; NO_LABEL or ON_IGNORED if there is none (D,)."""
+    """Row in Overlaps of the matched label (D,). NO_LABEL: no match. ON_IGNORED: overlaps an ignored label only."""
     frame: Rows
     """Frame of each detection (D,)."""
     selected_frame: Rows
@@ -107,7 +107,7 @@ class Matches:
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Detections and labels of some frames, concatenated, and all pairs of the two that may match."""
+    """Detections and labels of some frames, concatenated, and their pairs that may match."""
 
     boxes: Array
     """Boxes of the detections, pixels, best first within a frame (D, 4)."""
@@ -130,19 +130,19 @@ class Overlaps:
     pair_detection: Rows
     """Detection of each pair, ascending (P,)."""
     pair_label: Rows
-    """Label of each pair; for one detection by decreasing IoU, and for equal IoU the later label first, as in
-    COCO (P,)."""
+    """Label of each pair (P,). The labels of one detection are sorted by decreasing IoU; for equal IoU the later label
+    is first, as in COCO."""
     pair_iou: Array
-    """IoU of each pair; for a crowd the share of the detection inside it (P,)."""
+    """IoU of each pair; for a crowd, the fraction of the detection inside the crowd (P,)."""
 
     def radius_px(self) -> Array:
         """Radius sqrt(w h) / 2 of every detection, pixels (D,)."""
         return np.sqrt(np.prod(np.maximum(self.boxes[:, 2:] - self.boxes[:, :2], 0), axis=1)) / 2
 
     def match(self, match_iou: float, radius_px: tuple[float, float], selected: Flags | None = None) -> Matches:
-        """Match every detection at one IoU, not below the `min_iou` of `find_overlaps`.
+        """Match every detection at one IoU, which must be at least the `min_iou` of `find_overlaps`.
 
-        `radius_px` is the evaluated range of radii; unmatched detections outside it are ignored. `selected` (L,)
+        `radius_px` is the evaluated range of radii; unmatched detections outside the range are ignored. `selected` (L,)
         replaces `label_selected`.
         """
         selected = self.label_selected if selected is None else selected
@@ -166,7 +166,10 @@ class Overlaps:
 def find_overlaps(
     detections: list[Detections], labels: Sequence[FrameLabels], sizes_px: NDArray, min_iou: float = 0.5
 ) -> Overlaps:
-    """All pairs with an IoU of at least `min_iou`, for frames of the widths and heights `sizes_px` (N, 2)."""
+    """Overlaps of the detections and labels of N frames, with all pairs of at least `min_iou`.
+
+    `sizes_px` (N, 2) are the widths and heights of the frames.
+    """
     boxes, scores, pair_detections, pair_labels, pair_ious, n_found, n_labels = [], [], [], [], [], 0, 0
     for ours, truth in zip(detections, labels, strict=True):
         order = np.argsort(-ours.scores, kind="stable")
@@ -217,7 +220,7 @@ def match_split(
 def joined(parts: Sequence[Matches]) -> Matches:
     """Join the matches of several processes, each of which had every n-th frame; sorted by frame.
 
-    Rows of labels (`label`) are not unique in the result.
+    In the result, `label` is no longer the row of the label: several labels have equal numbers.
     """
 
     def numbered(name: str) -> NDArray:

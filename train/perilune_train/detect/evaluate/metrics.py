@@ -23,10 +23,10 @@ class Curve:
     """Recall at each threshold (K,)."""
 
     def ap_paper(self) -> float:
-        """The paper's AP, the headline metric: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.
+        """The paper's AP, the headline metric: sum of (R_n - R_(n-1)) P_n over all thresholds.
 
-        There is one threshold per distinct score, as in scikit-learn's average_precision_score, so equal scores count
-        together. The result is never above `ap_envelope`.
+        P_n is the precision without interpolation. There is one threshold per distinct score, as in scikit-learn's
+        average_precision_score, so equal scores count together. The result is never above `ap_envelope`.
         """
         ends = self._thresholds()
         return float(np.sum(np.diff(self.recall[ends], prepend=0.0) * self.precision[ends]))
@@ -45,7 +45,7 @@ class Curve:
         return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
 
     def _thresholds(self) -> NDArray[np.bool_]:
-        """Which points are possible thresholds (K,): only the last of equal scores, since a threshold keeps all."""
+        """Which points (K,) are possible thresholds: of equal scores the last, since all are kept together."""
         return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:
@@ -74,7 +74,7 @@ def f1_score(precision: Array, recall: Array) -> Array:
 
 
 def curve(matches: Matches) -> Curve:
-    """The precision-recall curve of all detections that are not ignored. Without selected labels recall is 0."""
+    """Precision-recall curve of all detections that are not ignored; recall is 0 without selected labels."""
     counted = matches.outcome != IGNORED
     order = np.argsort(-matches.scores[counted], kind="stable")
     hits = np.cumsum(matches.outcome[counted][order] == FOUND)
@@ -92,15 +92,15 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
 
 
 def figures(matches: Matches, threshold: float) -> dict[str, float]:
-    """Six metrics by key: ap50_paper, ap50_envelope, ap50_coco101, precision, recall, f1.
+    """Six metrics by key, by the usual and, with the prefix "strict/", by the strict scoring rule.
 
-    Keys with the prefix "strict/" hold the metrics by the strict scoring rule.
+    The keys are ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1.
     """
     return figures_of_rule(matches, threshold, "") | figures_of_rule(matches.strict(), threshold, "strict/")
 
 
 def figures_of_rule(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
-    """The six metrics by one scoring rule; `prefix` starts their keys."""
+    """The six metrics of `figures` by one scoring rule; `prefix` starts their keys."""
     points = curve(matches)
     precision, recall, f1 = at_threshold(matches, threshold)
     return {
@@ -114,7 +114,7 @@ def figures_of_rule(matches: Matches, threshold: float, prefix: str) -> dict[str
 
 
 def figures_over_ious(by_iou: Sequence[Matches]) -> dict[str, float]:
-    """ap50_95_... (mean over COCO_IOUS) and ap75_..., each as paper, envelope and coco101."""
+    """AP averaged over COCO_IOUS (ap50_95_...) and AP at an IoU of 0.75 (ap75_...), in three definitions."""
     curves = [curve(matches) for matches in by_iou]
     at_75 = curves[COCO_IOUS.index(0.75)]
     return {

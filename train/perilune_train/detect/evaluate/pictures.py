@@ -22,7 +22,7 @@ _GOAL = 0.85
 
 
 def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] | None = None) -> None:
-    """Draw precision against recall, one named line per curve."""
+    """Draw precision against recall: solid lines for `curves`, dashed lines for `dashed`, by name."""
     figure = Figure(figsize=(7.5, 4.8), layout="constrained")
     axes = figure.subplots()
     for group, style in ((curves, "-"), (dashed or {}, "--")):
@@ -37,8 +37,8 @@ def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] |
 def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
     """Draw AP by radius, altitude and Sun as bars.
 
-    Each bar has its 95 % interval, or a dot per unit if there is no interval, and its number of labels. A dashed line
-    shows the goal of 0.85.
+    Each bar has its 95 % interval and its number of labels. Without an interval, it has a dot per scene, trajectory or
+    image. A dashed line shows the goal of 0.85.
     """
     unit = bins[0].ap50_paper_spread.unit if bins else "unit"
     drawn = [(by, title) for by, title in _PANELS.items() if any(part.by == by for part in bins)]
@@ -73,7 +73,7 @@ def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) ->
     """Choose the `count` best, the `count` typical and the `count` worst frames by their F1 (N,).
 
     Typical frames have an F1 near the median. Prefers frames of different `groups` (trajectories). Never chooses a
-    frame twice, or a frame without selected labels (NaN).
+    frame twice. Never chooses a frame without selected labels, whose F1 is NaN.
     """
     known = np.flatnonzero(np.isfinite(f1))
     middle = np.median(f1[known]) if len(known) else 0.0
@@ -116,8 +116,8 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
         drawn.set_title(_title(evaluation, index), fontsize=8)
         _draw_marks(drawn, evaluation, index)
     figure.suptitle(
-        "labels (ellipses): red, bold if missed; ignored ones yellow. Detections (boxes): matched cyan, "
-        "false positives magenta, ignored ones white",
+        "labels (ellipses): red (bold if missed), yellow if ignored. Detections (boxes): cyan if matched, magenta if "
+        "false positive, white if ignored",
         fontsize=10,
     )
     save_figure(path, figure)

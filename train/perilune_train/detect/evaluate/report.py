@@ -1,4 +1,4 @@
-"""Output files of an evaluation: report.md, pictures, and the curve as a table. Works without a dataset."""
+"""Output files of an evaluation: report.md, pictures, and the precision-recall curve as a table."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -63,7 +63,7 @@ _CURVE_COLUMNS = {"score": "scores", "precision": "precision", "recall": "recall
 
 
 def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
-    """The whole report."""
+    """The whole report as Markdown; the lines `about` state what was evaluated and how."""
     figures, spreads = evaluation.figures(), evaluation.spreads
     fullest = max((len(part.scores) for part in evaluation.found), default=0)
     lines = ["# Evaluation of crater detection", "", *[f"- {line}" for line in about]]
@@ -71,8 +71,8 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         f"- {figures['frames']} frames, {figures['labels']} selected labels; most detections in one frame: {fullest}",
         f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
         f"- {spread_note(evaluation.resamples)}",
-        "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored; "
-        f"edge: those down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater; "
+        "- usual: unmatched detections on ignored craters, outside the range of radii, or centred off the image are "
+        f"ignored; edge: as usual, but the range of radii of detections starts at {EDGE:g} of the smallest radius; "
         "strict: every unmatched detection is a false positive",
         "",
         "## All frames",
@@ -87,7 +87,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_coco101"]), "", ""],
         ["AP at IoU 0.75", number(figures["ap75_paper"]), "", ""],
     ]
-    lines += [*table(["", "usual", "edge", "strict"], rows), ""]
+    lines += [*table(["metric", "usual", "edge", "strict"], rows), ""]
     lines += ["AP alone means the paper's AP: the sum of (R_n - R_(n-1)) P_n over all thresholds.", ""]
     lines += bin_tables(evaluation)
     lines += ["## Errors of detected craters", ""]
@@ -102,7 +102,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
             ("radius, bias (detected minus true)", "radius_bias", ""),
         )
     ]
-    lines += [*table(["", "px", "relative to the radius"], rows), ""]
+    lines += [*table(["error", "px", "relative to the radius"], rows), ""]
     return "\n".join(lines)
 
 
@@ -122,14 +122,14 @@ def spread_cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], ke
 
 
 def spread_note(resamples: Resamples) -> str:
-    """Explanation of the brackets after a number."""
+    """Explanation of the brackets after a number, for reports."""
     count, unit = resamples.count, resamples.unit
-    if count < MIN_UNITS:
-        return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"
     plural = "trajectories" if unit == "trajectory" else f"{unit}s"
+    if count < MIN_UNITS:
+        return f"in brackets: the value of each {unit}; at least {MIN_UNITS} {plural} are needed for an interval"
     return (
-        f"in brackets: 95 % intervals, {RESAMPLES} resamples of {count} {plural}; the value of each {unit} where fewer "
-        f"than {MIN_UNITS} have labels"
+        f"in brackets: 95 % bootstrap intervals ({RESAMPLES} resamples of {count} {plural}), or the value of each "
+        f"{unit} if fewer than {MIN_UNITS} have labels"
     )
 
 

@@ -43,7 +43,7 @@ def evaluate_split(
 
 
 def selection_entries(config: DetectConfig, split: DetectSplit) -> Metrics:
-    """The label selection for metrics.json: its name and thresholds; null means no limit."""
+    """The label selection for metrics.json: name and thresholds; null sets no threshold."""
     used = {f"labels/{key}": value for key, value in config.labels.model_dump(exclude={"radius_px"}).items()}
     return used | {"labels/min_radius_px": split.radius_px[0], "labels/max_radius_px": split.radius_px[1]}
 

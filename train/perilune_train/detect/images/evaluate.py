@@ -1,9 +1,10 @@
 """Evaluate a run on labelled real images; the report has the form of a dataset's report.
 
 Boxes of at least `min_size_px` (sqrt(w h)) that are centred in their image are ground truth. Smaller boxes, boxes
-centred off the image and boxes that a COCO file marks as ignored are ignored, and so are unmatched detections below
-that size. The run chose the threshold on its validation split. The report also gives the metrics at the best threshold
-for these images, as an oracle: this threshold cannot be chosen without labels.
+centred off the image and boxes that the label file marks as ignored are ignored. Unmatched detections smaller than
+`min_size_px` are ignored too. By default the threshold is the threshold that the run chose on its validation split. The
+report also gives the metrics at the best threshold for these images, as an oracle: this threshold cannot be chosen
+without labels.
 """
 
 from collections.abc import Iterator, Sequence
@@ -54,7 +55,7 @@ class ImageSettings:
     min_size_px: float = 8.0
     """Minimum size of a crater to find, sqrt(w h), pixels."""
     threshold: float | None = None
-    """Score threshold; None takes the threshold of the run."""
+    """Score threshold; None for the threshold of the run."""
     nodata: float | None = None
     """Value of pixels without data."""
     request: Request = field(default_factory=Request)
@@ -65,7 +66,7 @@ class _Pictures(Sequence[NDArray[np.uint8]]):
     """Pictures that are read only when needed, because they may not all fit into memory."""
 
     def __init__(self, images: Sequence[LabelledImage], nodata: float | None):
-        self._images, self._nodata, self._told = images, nodata, set[int]()
+        self._images, self._nodata, self._reported = images, nodata, set[int]()
 
     def __len__(self) -> int:
         return len(self._images)
@@ -77,8 +78,9 @@ class _Pictures(Sequence[NDArray[np.uint8]]):
     def __getitem__(self, index: int | slice) -> NDArray[np.uint8] | list[NDArray[np.uint8]]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        quiet = index in self._told
-        self._told.add(index)
+        # Report the missing data of a picture only when it is read for the first time.
+        quiet = index in self._reported
+        self._reported.add(index)
         return read_grey(self._images[index].path, self._nodata, quiet)
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
@@ -104,8 +106,9 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
     )
     threshold = chosen_threshold(run) if threshold is None else threshold
     images = _Pictures(image_set.images, settings.nodata)
+    # Read all images once, so that a damaged image is refused before hours of detection.
     for _ in images:
-        pass  # a damaged image is refused before hours of detection
+        pass
     detections = _detect(open_detector(runs.RunFolder(run).best, config), image_set, images, tiling)
     evaluation = evaluate_detections_in_images(
         image_set, detections, threshold, min_size_px, config.evaluation.match_iou
@@ -141,7 +144,7 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
 
 
 def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
-    """Convert an image's boxes to labels; the craters are the ellipses inscribed in the boxes."""
+    """Convert an image's boxes to labels; the ellipse of a label is inscribed in its box."""
     centre, half = (image.boxes[:, :2] + image.boxes[:, 2:]) / 2, (image.boxes[:, 2:] - image.boxes[:, :2]) / 2
     ellipses = np.column_stack([centre, half, np.zeros(len(half))])
     every = np.ones(len(half), bool)
@@ -152,7 +155,7 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
 def evaluate_detections_in_images(
     image_set: ImageSet, detections: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
-    """Evaluate the detections of all images; if label boxes are clipped at the image edge, detections are too."""
+    """Evaluate the detections of all images; clips detections at the image edge if the labels are clipped."""
     sizes = np.array([[image.width_px, image.height_px] for image in image_set.images])
     if image_set.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)
@@ -181,8 +184,8 @@ def _detect(detector: Detector, image_set: ImageSet, images: _Pictures, tiling: 
 def write_crops(path: Path, images: Sequence[NDArray[np.uint8]], evaluation: Evaluation) -> None:
     """Draw the centres of at most 12 images, enlarged twice, with labels and detections side by side.
 
-    Left: labels (selected red, others orange). Right: detections above the threshold (matched cyan, false positives
-    magenta, ignored ones left out).
+    Left: labels (selected labels red, others orange). Right: detections above the threshold (matched detections cyan,
+    false positives magenta, ignored detections omitted).
     """
     chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), _MAX_PAIRS)).round().astype(int))
     pairs = [_crop_pair(images[index], evaluation, int(index)) for index in chosen]

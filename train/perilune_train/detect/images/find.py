@@ -43,7 +43,7 @@ class Craters:
     (half of sqrt(w h)), `score`, and the ellipse columns of the table `labels`. Pixels count from the outer corner of
     the first pixel. The detector finds boxes, so the ellipse is the axis-aligned ellipse inside the box."""
     image: NDArray[np.uint8]
-    """The image as the network sees it before it is normalised: upright, 8-bit grey (height, width)."""
+    """The upright image in 8-bit grey (height, width), before normalisation."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -69,7 +69,10 @@ class Craters:
 
 
 class CraterDetector:
-    """Finds craters in images of any size; `load_detector` makes one. Call it with an image or a list of images."""
+    """A crater detector for images of any size; call it with an image or a list of images.
+
+    `load_detector` creates it.
+    """
 
     def __init__(self, run: Path):
         """Load the network of a finished detect run. Raises UserError if the folder is not such a run."""
@@ -88,7 +91,7 @@ class CraterDetector:
 
         An image is a path (PNG, TIFF, JPEG; others with the extra `geo`), a NumPy array (height, width) or (height,
         width, 3), or a Pillow image. Pixels of more than 8 bits are stretched as by `perilune-train detect predict`.
-        `threshold` is the lowest score; by default the threshold that the run chose on its validation split. Raises
+        `threshold` is the minimum score; by default the threshold that the run chose on its validation split. Raises
         UserError if `image` is anything else, or if a file cannot be read.
         """
         threshold = self.threshold if threshold is None else threshold
@@ -134,7 +137,7 @@ def load_detector(run_or_file: str | PathLike[str] | None = None) -> CraterDetec
 
 
 def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
-    """The name of an image and its pixels as 8-bit grey. Raises UserError if it is not an image."""
+    """Name and 8-bit grey pixels of an image. Raises UserError if `image` is not an image."""
     if isinstance(image, str | PathLike):
         path = Path(image)
         return path.name, read_grey(path)
@@ -150,10 +153,10 @@ def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
 
 
 def _with_ellipses(table: pd.DataFrame, detections: Detections) -> pd.DataFrame:
-    """Add the axis-aligned ellipses inside the boxes to the table, as the columns of the table `labels`."""
+    """Add the axis-aligned ellipses inside the boxes to a table, in the ellipse columns of `labels`."""
     x0, y0, x1, y1 = detections.boxes.T
     width, height = x1 - x0, y1 - y0
     columns = [(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(width, height) / 2, np.minimum(width, height) / 2]
-    # The direction of the longer axis.
+    # Direction of the longer axis.
     columns.append(np.where(width >= height, 0.0, np.pi / 2))
     return table.assign(**dict(zip(ELLIPSE_COLUMNS, columns, strict=True)))

@@ -26,8 +26,8 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 _MAX_PRJ = 2**16
 _CORNERS = 32
 _GRID = 17
-"""Sample points per side to test whether an image lies on its map. The corners alone are not enough: in an image of the
-full disc they are off the map."""
+"""Number of sample points per side to test whether an image lies on its map. The corners alone are not enough: in an
+image of the full disc the corners are off the map."""
 _DECIMALS = 8
 """Decimals of degrees: 0.3 mm on the ground."""
 
@@ -37,7 +37,9 @@ class Georeference:
     """Conversion from pixels to longitude and latitude on the Moon."""
 
     transform: tuple[float, float, float, float, float, float]
-    """a, b, c, d, e, f: map x = a column + b row + c, map y = d column + e row + f, pixels from the outer corner."""
+    """a, b, c, d, e, f: map x = a column + b row + c, map y = d column + e row + f.
+
+    Columns and rows count from the outer corner of the first pixel."""
     projection: str
     """The map's coordinate reference system, WKT."""
     path: Path
@@ -74,19 +76,19 @@ def read_georeference(path: Path) -> Georeference | None:
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
 
-    beside = path.with_suffix(".prj")
+    prj = path.with_suffix(".prj")
     with opened_raster(raster_files(path, PICTURE_DRIVERS, "image"), "image") as image:
         transform, projection = image.transform, image.crs
-    if projection is None and beside.is_file():
+    if projection is None and prj.is_file():
         try:
-            projection = CRS.from_wkt(_prj_text(beside), morph_from_esri_dialect=True)
+            projection = CRS.from_wkt(_prj_text(prj), morph_from_esri_dialect=True)
         except (RasterioError, ValueError) as error:
-            raise UserError(beside, "georeference", error, "a projection as text (.prj)") from None
+            raise UserError(prj, "georeference", error, "a projection as text (.prj)") from None
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
     # A georeference refers to stored pixels, but detections refer to pixels of the upright picture.
-    stored, place = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
-    a, b, c, d, e, f = (place[:, :2] @ stored + place * [0, 0, 1]).ravel().tolist()
+    stored, map_from_stored = stored_from_upright(path), np.reshape(tuple(transform)[:6], (2, 3))
+    a, b, c, d, e, f = (map_from_stored[:, :2] @ stored + map_from_stored * [0, 0, 1]).ravel().tolist()
     size = picture_size(path)
     reference = Georeference((a, b, c, d, e, f), projection.to_wkt(), path)
     grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in size)), axis=-1).reshape(-1, 2)
@@ -106,9 +108,9 @@ def can_read_georeferences() -> bool:
 
 
 def features(name: str, detections: Detections, reference: Georeference) -> list[dict[str, Any]]:
-    """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
+    """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with properties.
 
-    The longitudes of a polygon that crosses 180 degrees continue beyond 180. A polygon around a pole is not valid in
+    If a polygon crosses 180 degrees, its longitudes continue beyond 180. A polygon around a pole is not valid in
     longitude and latitude: its vertices are correct, but its area is not. Detections that extend off the map are
     omitted.
     """
@@ -154,7 +156,7 @@ def features(name: str, detections: Detections, reference: Georeference) -> list
 def collection(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """A GeoJSON FeatureCollection in the Moon's longitude and latitude.
 
-    Deviation from RFC 7946, which allows only the Earth's WGS 84: the member `crs`, from GeoJSON 2008, names the Moon's
+    Deviation from RFC 7946, which allows only the Earth's WGS 84: the member `crs` of GeoJSON 2008 names the Moon's
     coordinate system. GDAL and QGIS read this member; other programs ignore it.
     """
     crs = {"type": "name", "properties": {"name": MOON_CRS}}

@@ -1,4 +1,4 @@
-"""Read labelled images from other sources, in their common layouts.
+"""Read labelled images in the common layouts of other tools.
 
 | Source | Layout |
 |---|---|
@@ -7,8 +7,8 @@
 | CVAT for images | an XML file, or a folder that holds annotations.xml |
 | Pascal VOC, LabelMe, YOLO, tables of boxes | a file beside each image, or in labels/, Annotations/ or annotations/ |
 
-If a folder has splits (train, val or valid, test), one of them is read. The origin of coordinates is the outer corner
-of the top-left pixel of the upright image.
+If a folder has splits (train, val or valid, test), one split is read (`Request.split`). The origin of coordinates is
+the outer corner of the top-left pixel of the upright image.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,7 +47,7 @@ class Request:
     """What to read from a source."""
 
     split: str | None = None
-    """train, val or test; None for test, or for the only split."""
+    """train, val or test; None for test, or for the only split of the source."""
     categories: tuple[str, ...] = ()
     """Names of the categories that count as craters; () for "crater" and "craters"."""
     image_folder: Path | None = None
@@ -55,7 +55,10 @@ class Request:
 
 
 def read_images(source: Path, request: Request = Request()) -> ImageSet:
-    """Read the labelled images of a folder or a label file. Raises UserError, naming file and line."""
+    """Read the labelled images of a folder or a label file.
+
+    Raises UserError, which names file and line, if the source has no labelled images or a file is not valid.
+    """
     if source.is_dir():
         label_file, split = _from_folder(source, request)
     elif source.is_file():
@@ -102,9 +105,9 @@ def _from_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
 
 
 def _split(by_split: dict[str, Path], paths: list[Path], request: Request, source: Path) -> tuple[Path, str]:
-    """Choose one of several splits. Returns its path and a text that names it.
+    """Choose one of several splits; returns its path and a text that names the split.
 
-    The text is "" for a single part that is not named after a split.
+    The text is "" if there is only one path and it was not chosen by a requested split.
     """
     named = {split: path for split, path in by_split.items() if split}
     if len(paths) == 1 and not (named and request.split):
@@ -122,7 +125,7 @@ def _split_of(name: str) -> str:
 
 
 def _coco_files(folder: Path) -> list[Path]:
-    """The JSON files of a folder, or of its folder annotations, that contain COCO annotations, not LabelMe."""
+    """The COCO files of a folder or of its subfolder annotations; skips JSON files of LabelMe."""
     for parent in (folder, folder / "annotations"):
         paths = sorted(parent.glob("*.json")) if parent.is_dir() else []
         stems = {path.stem for path in pictures_of(parent)} if paths else set()
@@ -155,7 +158,7 @@ def _from_yaml(path: Path, request: Request) -> tuple[LabelFile, str]:
 
 
 def _from_yolo(source: Path, pictures: list[Path], names: dict[str, str]) -> LabelFile:
-    """Pictures with their YOLO label files; a picture without a file has no objects."""
+    """Read pictures and their YOLO label files; a picture without a label file has no objects."""
     root = source.resolve().parent if source.is_file() else source.resolve()
     entries, n_absent = [], 0
     for picture in pictures:
@@ -178,7 +181,7 @@ def _numbers_as_names(entries: Sequence[Entry]) -> dict[str, str]:
 
 
 def _from_image_folder(folder: Path, request: Request) -> tuple[LabelFile, str]:
-    """Read images with one label file each, beside the image or in another folder."""
+    """Read images that have a label file each, beside the image or in another folder."""
     images = pictures_of(folder)
     root = folder
     if not images:
@@ -237,7 +240,7 @@ def _from_pairs(folder: Path, root: Path, files: dict[Path, Path], n_unlabelled:
 
 
 def _text_reader(paths: list[Path]) -> tuple[Callable[[Path, Path], list[LabelledObject]], bool]:
-    """The reader for YOLO files or tables, chosen by the first non-empty file, and whether boxes are clipped."""
+    """Reader for YOLO files or tables, chosen by the first non-empty file, and whether to clip its boxes."""
     first = next((text for path in paths if (text := read_text(path, "boxes")).strip()), "")
     if yolo.is_yolo(first):
         return yolo.read_yolo_text, True

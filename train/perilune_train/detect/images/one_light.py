@@ -1,8 +1,8 @@
 """Warn about pictures that are not of the Moon.
 
-In a lunar picture, the Sun lights all craters from the same side. The grey levels inside the box of a crater fall from
-its lit to its shaded side. `agreement_of_light` is the length of the mean of the unit vectors of these directions: 1 if
-all directions are equal, near 0 if they are random.
+In a lunar picture, the Sun lights all craters from the same side. The grey levels inside the box of a crater change
+from its lit to its shaded side. `agreement_of_light` is the length of the mean of the unit vectors of these directions:
+1 if all directions are equal, near 0 if they are random.
 
 With the installed detector, 192 lunar pictures (12 crops of Narrow Angle Camera images, 180 rendered frames) have an
 agreement of 0.87 to 0.99. Of 35 other pictures (from the wheels of scikit-image 0.26 and scikit-learn 1.9, and six
@@ -20,7 +20,7 @@ from perilune_train.detect.evaluate.matching import Detections
 MIN_AGREEMENT = 0.8
 """A picture with a lower agreement is flagged as possibly not lunar."""
 MIN_CRATERS = 10
-"""Number of craters below which the agreement is not meaningful."""
+"""Minimum number of craters; the agreement of fewer craters is not meaningful."""
 _MAX_CRATERS = 500
 _MIN_SIDE_PX, _MIN_SCORE = 4, 0.5
 _SIDE, _FLAT = 16, 1e-6
@@ -40,7 +40,7 @@ def doubt_of(image: NDArray[np.uint8], detections: Detections) -> str | None:
 
 
 def agreement_of_light(image: NDArray[np.uint8], detections: Detections) -> tuple[float, int]:
-    """Return the agreement (0 to 1) of the light directions in the highest-scored craters, and their number."""
+    """Return the agreement (0 to 1) of the light on the craters of highest score, and their number."""
     height, width = image.shape
     best = np.argsort(-detections.scores, kind="stable")
     best = best[detections.scores[best] >= _MIN_SCORE]

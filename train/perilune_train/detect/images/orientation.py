@@ -1,8 +1,7 @@
-"""Orientation of a picture: the EXIF or TIFF tag 274, which states how to turn the stored picture upright.
+"""Orientation of a picture: the EXIF or TIFF tag 274 states how to turn the stored picture upright.
 
-In all formats the tag is applied, so pixels, labels and detections refer to the upright picture. Otherwise
-a photograph that a camera marked as rotated would be compared with labels drawn on the upright picture that every
-viewer shows.
+The tag is applied in all formats, so pixels, labels and detections refer to the upright picture, which every viewer
+shows. Without it, the pixels of a rotated photograph would not match labels drawn on the upright picture.
 """
 
 import io
@@ -17,7 +16,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 UPRIGHT = 1
 ORIENTATION_TAG = 274
 _MIRRORED, _HALF_TURNED, _TRANSPOSED = (2, 3, 6, 7), (3, 4, 7, 8), (5, 6, 7, 8)
-"""Orientations with reversed columns, with reversed rows, and with rows and columns exchanged first."""
+"""Orientations that reverse the columns, that reverse the rows, and that first exchange rows and columns."""
 _MAX_EXIF = 2**20
 _BIG_TIFF = (b"II\x2b\x00", b"MM\x00\x2b")
 
@@ -37,9 +36,9 @@ def upright(pixels: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
 
 
 def stored_coordinates(orientation: int, width_px: int, height_px: int) -> NDArray[np.float64]:
-    """The matrix (2, 3) from pixel coordinates of the upright picture to coordinates of the stored picture.
+    """Matrix (2, 3) that converts pixel coordinates of the upright picture to the stored picture.
 
-    `width_px` and `height_px` are those of the stored picture. Coordinates begin at the outer corner of the top-left
+    `width_px` and `height_px` are the size of the stored picture. Coordinates begin at the outer corner of the top-left
     pixel.
     """
     right, down = (height_px, width_px) if is_turned(orientation) else (width_px, height_px)
@@ -62,7 +61,10 @@ def orientation_of(picture: Any, path: Path) -> int:
 
 
 def tiff_tags(path: Path) -> dict[int, Any]:
-    """The tags of a TIFF's first picture, even if Pillow cannot open the picture; {} if the tags are damaged."""
+    """The tags of a TIFF's first picture; {} if the tags are damaged.
+
+    Works even if Pillow cannot open the picture.
+    """
     try:
         with path.open("rb") as file:
             header = file.read(8)

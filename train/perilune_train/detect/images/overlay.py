@@ -10,29 +10,29 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.records.pictures import save_image
 
 MAX_DRAWN = 1000
-"""Maximum number of craters in an overlay: more lines would hide the ground."""
+"""Maximum number of craters drawn in an overlay; more lines would hide the ground."""
 _MAX_PX = 4096
 _MIN_PX = 1600
 _LINE_OPACITY = 0.8
-"""Lines are one pixel wide, OpenCV's minimum, so that the ground shows through."""
+"""Opacity of the lines, so that the ground shows through. Lines are one pixel wide, OpenCV's minimum."""
 _DARKEST = 80
-"""First entry used of the 256 entries of the colour map: darker entries are invisible on grey."""
-_STRIP_SHARE = 0.02
-"""Height of the strip below the image, as a share of the image's longer side."""
+"""First entry used of the 256 entries of the colour map. Darker entries are invisible on grey."""
+_STRIP_FRACTION = 0.02
+"""Height of the strip below the image, as a fraction of the image's longer side."""
 
 
 def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, threshold: float) -> None:
-    """Draw the detections as ellipses over the image; small images are enlarged, large ones reduced.
+    """Draw detections as ellipses over an image; enlarges small images and reduces large images.
 
-    Colours go from purple (the threshold) to yellow (a score of 1). Draws at most the MAX_DRAWN detections of the
-    highest scores; the strip below the image states their number.
+    Colours go from purple (the threshold) to yellow (a score of 1). Draws at most MAX_DRAWN detections, those with the
+    highest scores. The strip below the image states the number of all detections.
     """
     side = max(image.shape)
     factor = min(max(_MIN_PX // side, 1), 4) if side < _MAX_PX else _MAX_PX / side
     size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
-    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-    canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
-    # Draw the strongest last, on top of the others.
+    interpolation = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=interpolation), cv2.COLOR_GRAY2BGR)
+    # Draw the highest scores last, on top of the others.
     drawn = np.argsort(detections.scores, kind="stable")[-MAX_DRAWN:]
     lines = canvas.copy()
     for k, colour in zip(drawn, _colours(detections.scores[drawn], threshold), strict=True):
@@ -45,7 +45,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, 
 
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
-    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) in blue, green, red."""
+    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3): blue, green, red."""
     # OpenCV takes integers, here sixteenths of a pixel, and counts from the centre of the first pixel.
     sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
     for x, y, a, b in sixteenths.astype(int).tolist():
@@ -54,16 +54,16 @@ def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tu
 
 def _colours(scores: NDArray[np.float64], threshold: float) -> list[tuple[int, int, int]]:
     """Colours of scores between the threshold and 1, in OpenCV's order blue, green, red."""
-    share = np.clip((scores - threshold) / max(1 - threshold, 1e-9), 0, 1)
-    levels = np.rint(_DARKEST + share * (255 - _DARKEST)).astype(np.uint8)
+    fraction = np.clip((scores - threshold) / max(1 - threshold, 1e-9), 0, 1)
+    levels = np.rint(_DARKEST + fraction * (255 - _DARKEST)).astype(np.uint8)
     if not len(levels):
         return []
     return [(int(b), int(g), int(r)) for b, g, r in cv2.applyColorMap(levels[:, None], cv2.COLORMAP_PLASMA)[:, 0]]
 
 
 def _strip(width_px: int, side_px: int, threshold: float, count: str) -> NDArray[np.uint8]:
-    """A black strip (height, width, 3) with the colour scale and a line of text, cut off below narrow images."""
-    height = max(round(_STRIP_SHARE * side_px), 24)
+    """A black strip (height, width, 3) with colour scale and text, cut off if the image is narrow."""
+    height = max(round(_STRIP_FRACTION * side_px), 24)
     strip = np.zeros((height, max(width_px, 1), 3), np.uint8)
     scale, margin = height / 48, height // 4
     base = height - height // 3

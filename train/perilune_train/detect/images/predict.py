@@ -53,10 +53,11 @@ class PredictSettings:
 
 
 def predict_images(sources: list[Path], run: Path, config: DetectConfig, out: Path, settings: PredictSettings) -> int:
-    """Find craters in images, folders of images, videos and multi-page TIFF files; returns the number of craters.
+    """Find craters in images, folders of images, videos and multi-page TIFF files; returns their number.
 
-    A frame of a video, or a page, is an image with its index in the name (sequences.py). Writes all output to the new
-    folder `out`, or nothing. Raises UserError on the first image that cannot be read, before detection starts.
+    Each frame of a video, and each page of a TIFF, is an image with its index in the name (sequences.py). Writes all
+    output to the new folder `out`. If an image cannot be read, raises UserError before detection starts, and writes
+    nothing.
     """
     settings.tiling.check()
     with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
@@ -93,11 +94,8 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
                 located = features(path.name, detections, reference)
                 shapes += located
                 if len(located) < len(detections.boxes):
-                    left_out = len(detections.boxes) - len(located)
-                    message = (
-                        f"{path.name}: {left_out} craters have no map coordinates and are not in detections.geojson"
-                    )
-                    say(message)
+                    n_off_map = len(detections.boxes) - len(located)
+                    say(f"{path.name}: {n_off_map} craters have no map coordinates and are not in detections.geojson")
         table = pd.concat(tables, ignore_index=True)
         table.to_parquet(folder / "detections.parquet", index=False)
         write_csv(table.round(4), folder / "detections.csv")
@@ -115,7 +113,7 @@ def _reference(path: Path) -> Georeference | None:
         try:
             return read_georeference(path)
         except UserError as error:
-            # Detection needs no georeference, and georeferences that are wrong or of other bodies are common.
+            # Detection needs no georeference, and many files have a wrong georeference or one of another body.
             message = (
                 f"{path.name}: not in detections.geojson, since its georeference cannot be used: {error.field}: got"
             )
@@ -147,9 +145,10 @@ def strongest(detections: Detections, top: int | None) -> Detections:
 
 
 def expanded(sources: list[Path], frames: Path) -> list[Path]:
-    """The given images, the images of given folders, and the frames of videos, which are written into `frames`.
+    """Paths of all images: the sources that are images, the images of folders, and the frames of videos.
 
-    Raises UserError on a folder without images, and on a video that cannot be decoded.
+    Writes the frames of videos and the pages of TIFF files into the folder `frames`. Raises UserError on a folder
+    without images, and on a video that cannot be decoded.
     """
     paths = []
     for path in sources:
@@ -166,7 +165,7 @@ def expanded(sources: list[Path], frames: Path) -> list[Path]:
 
 
 def table_of(name: str, detections: Detections) -> pd.DataFrame:
-    """Detections as rows: image, box, centre and radius in pixels (sqrt(w h) / 2), score."""
+    """Detections as table rows: image name, box, centre, radius sqrt(w h) / 2 (all in pixels) and score."""
     x0, y0, x1, y1 = detections.boxes.T
     columns: dict[str, Any] = {
         "image": pd.Series([name] * len(detections.scores), dtype="str"),

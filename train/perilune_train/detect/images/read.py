@@ -35,10 +35,10 @@ from perilune_train.detect.images.stretch import MAX_VALUE, SAMPLE, Stretch, str
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".img", ".cub", ".lbl")
 _KINDS = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000", "ISIS3": "ISIS cube", "PDS": "PDS3"}
 MAX_PIXELS = 2**29
-"""Largest number of pixels of an image: twice a whole Narrow Angle Camera image. A limit is needed, because the header
-of a small file can state any size."""
+"""Largest number of pixels of an image: twice the number of a whole Narrow Angle Camera image. A limit is needed,
+because the header of a small file can state any size."""
 MAX_DECODED = 2**30
-"""Largest size, bytes, of a picture that is decoded as a whole; only rasterio reads larger pictures."""
+"""Largest decoded size, bytes, of a picture that is decoded as a whole; only rasterio reads larger pictures."""
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _BITS_TAG, _PHOTOMETRIC_TAG, _SAMPLE_FORMAT_TAG, _NODATA_TAG = 258, 262, 339, 42113
 _WHITE_IS_ZERO, _SIGNED = 0, 2
@@ -58,15 +58,15 @@ class _Picture:
     height_px: int
     """Height as decoded, pixels."""
     orientation: int
-    """See orientation.py."""
+    """Orientation tag, 1 to 8 (orientation.py)."""
     is_upright: bool
     """Whether the decoder turns the pixels upright, as Pillow does for TIFF."""
     white_is_zero: bool
     """Whether larger values are darker in the decoder's output."""
     nodata: float | None
-    """The value of pixels without data, as the file states it."""
+    """Value of pixels without data, as stated in the file."""
     strips: Callable[[], Iterator[NDArray]]
-    """Reads the bands (1 or 3, rows, width) from top to bottom; uint8 is used unchanged."""
+    """Function that reads the picture in strips (1 or 3 bands, rows, width), from top to bottom."""
 
     def size_px(self, upright: bool) -> tuple[int, int]:
         """Width and height, pixels, of the upright or the stored picture."""
@@ -77,14 +77,14 @@ class _Picture:
 def picture_size(path: Path) -> tuple[int, int]:
     """Width and height of the upright picture, pixels, from the header.
 
-    Raises UserError if the file is not a picture or too large.
+    Raises UserError if the file is not a picture or is too large.
     """
     with _opened(path) as picture:
         return picture.size_px(upright=True)
 
 
 def stored_from_upright(path: Path) -> NDArray[np.float64]:
-    """The matrix (2, 3) from pixel coordinates of the upright to the stored picture (orientation.py)."""
+    """Matrix (2, 3) that converts pixel coordinates of the upright picture to the stored picture."""
     with _opened(path) as picture:
         return stored_coordinates(picture.orientation, *picture.size_px(upright=False))
 
@@ -98,13 +98,13 @@ def stored_size(path: Path) -> tuple[int, int]:
 def read_grey(path: Path, nodata: float | None = None, quiet: bool = False) -> NDArray[np.uint8]:
     """Read the upright picture's pixels (height, width) as 8-bit grey.
 
-    8-bit grey is not changed. Colours become their luma; of other bands, the first is used. Deeper images (16 bits and
-    more, float) are stretched so that 99.9 % of their values are within 0..255. The stretch loses little: the network
-    removes mean and deviation anyway, and 16-bit files often use a small part of their range.
+    8-bit grey is not changed. Red, green and blue become luma; of other bands, the first is used. Deeper images (16
+    bits and more, float) are stretched so that 99.9 % of their values are within 0..255. The stretch loses little: the
+    network removes mean and deviation anyway, and 16-bit files often use a small part of their range.
 
-    Values without data do not affect the stretch and become 0. These are values that are not finite, beyond 1e30, or
-    equal to the file's no-data value or to `nodata`. If neither is given, they are also the values that stretch.py
-    takes as missing data; a message names these values unless `quiet`. Raises UserError on a damaged file.
+    Pixels without data do not affect the stretch and become 0. Their values are not finite, beyond 1e30, or equal to
+    the file's no-data value or to `nodata`. If neither is given, stretch.py may take other values of a deep image as
+    missing data; a message names these values unless `quiet`. Raises UserError on a damaged file.
     """
     with _opened(path) as picture:
         grey = np.empty((picture.height_px, picture.width_px), np.uint8)
@@ -145,10 +145,8 @@ def grey_of_array(pixels: NDArray, where: object = "image") -> NDArray[np.uint8]
 
 
 def _grey_of(bands: NDArray, picture: _Picture, nodata: float | None, stretch: Stretch | None) -> NDArray[np.uint8]:
-    """A strip as 8-bit grey."""
     if stretch is not None:
-        grey = stretch.grey(_values(bands, picture, nodata))
-        return grey
+        return stretch.grey(_values(bands, picture, nodata))
     missing = None if nodata is None else (bands == nodata).all(axis=0)
     grey = np.rint(_luma(bands)).astype(np.uint8) if len(bands) > 1 else bands[0]
     if picture.white_is_zero:
@@ -170,7 +168,7 @@ def _stretch(picture: _Picture, nodata: float | None) -> Stretch:
 
 
 def _values(bands: NDArray, picture: _Picture, nodata: float | None) -> NDArray:
-    """Bands (1 or 3, rows, width) as float grey (rows, width), larger brighter, NaN where there is no data."""
+    """Bands (1 or 3, rows, width) as float grey (rows, width): larger is brighter, NaN is missing data."""
     if bands.dtype.kind == "c":
         raise UserError(picture.path, "image", "complex numbers", "real numbers")
     # float32 holds all 16-bit values; 32-bit values need float64.
@@ -265,7 +263,7 @@ def _by_pillow(path: Path, opened: Any, tags: dict[int, Any]) -> _Picture:
             part = opened.crop((0, top, opened.width, bottom))
             values = np.asarray(part if part.mode.startswith(("I", "F")) else part.convert("L"))
             if kind == "TIFF" and part.mode == "I" and tags.get(_SAMPLE_FORMAT_TAG, (1,)) in (1, (1,)):
-                # Pillow knows only signed numbers of 32 bits.
+                # Pillow reads unsigned integers of 32 bits as signed integers.
                 values = values.view(np.uint32)
             yield values[None]
 
@@ -324,13 +322,13 @@ def _by_rasterio(path: Path, driver: str, tags: dict[int, Any]) -> Iterator[_Pic
 
 
 def _check_size(path: Path, width: int, height: int, bytes_per_pixel: int) -> None:
-    most = min(MAX_PIXELS, MAX_DECODED // bytes_per_pixel)
-    if width * height > most:
-        raise UserError(path, "size", f"{width} x {height}", f"at most {most} pixels, for {bytes_per_pixel} bytes each")
+    limit = min(MAX_PIXELS, MAX_DECODED // bytes_per_pixel)
+    if width * height > limit:
+        expected = f"at most {limit} pixels, for {bytes_per_pixel} bytes each"
+        raise UserError(path, "size", f"{width} x {height}", expected)
 
 
 def _nodata(tags: dict[int, Any]) -> float | None:
-    """The no-data value in GDAL's tag of a TIFF."""
     try:
         return float(str(tags.get(_NODATA_TAG)).strip("\0 "))
     except ValueError:

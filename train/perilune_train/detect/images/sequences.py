@@ -23,10 +23,10 @@ of other files and of network addresses."""
 
 
 def frames_of(path: Path, folder: Path) -> list[Path] | None:
-    """Write the frames of a video, or the pages of a TIFF, into a folder as <file name>.<index>.png (or .tif).
+    """Write the frames of a video, or the pages of a TIFF, into a folder, and return their paths.
 
-    Returns None if the file is a single picture. Raises UserError if OpenCV cannot decode a video, or if all frames
-    together have more than _MAX_PIXELS.
+    The files are named <file name>.<index>.png (.tif for pages). Returns None if the file is a single picture. Raises
+    UserError if OpenCV cannot decode a video, or if all frames together have more than _MAX_PIXELS.
     """
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return _of_video(path, folder)
@@ -68,7 +68,7 @@ def _of_video(path: Path, folder: Path) -> list[Path]:
 def _pages(path: Path) -> list[int]:
     """Numbers of the pages of a TIFF that are separate pictures.
 
-    Returns [] for an unreadable file; `read_grey` later reports the error.
+    If the file cannot be read, the list ends before the damage; `read_grey` later reports the error.
     """
     pages: list[int] = []
     with contextlib.suppress(OSError, ValueError, SyntaxError, EOFError), _opened(path) as image:
@@ -100,7 +100,8 @@ def _of_tiff(path: Path, pages: list[int], folder: Path) -> list[Path]:
                 pixels += image.width * image.height
                 _check_total(path, pixels)
                 if image.width * image.height > MAX_PIXELS:
-                    raise UserError(path, f"page {page}", f"{image.width} x {image.height}", f"{MAX_PIXELS} pixels")
+                    got = f"{image.width} x {image.height}"
+                    raise UserError(path, f"page {page}", got, f"at most {MAX_PIXELS} pixels")
                 paths.append(folder / f"{path.name}.{number:06d}.tif")
                 image.save(paths[-1])
             except (OSError, SyntaxError, ValueError) as error:

@@ -23,7 +23,7 @@ from perilune_train.training.fair_threads import FairThreads
 
 @dataclass(frozen=True)
 class Detector:
-    """A trained network and how to run it."""
+    """A trained network, and the settings to run it with."""
 
     network: YOLOv3
     """The network, in evaluation mode, on the device."""
@@ -45,7 +45,7 @@ class Detector:
 
 
 def load_detector(path: Path) -> YOLOv3:
-    """Load the network of a detect run's best.ckpt, in evaluation mode. Raises UserError on another kind of file."""
+    """Load the network of a detect run's best.ckpt, in evaluation mode. Raises UserError on other files."""
     content = runs.load_weights(path)
     check_detector(content, path)
     network = YOLOv3(None, **content["architecture"])
@@ -63,7 +63,7 @@ def check_detector(content: Mapping[str, Any], path: Path) -> None:
 
 
 def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:
-    """Load a detect run's best.ckpt onto the device of the settings. Raises UserError like `load_detector`."""
+    """Load a detect run's best.ckpt onto the device of the settings; same errors as `load_detector`."""
     device = runs.choose_device(config.device)
     if device == "cpu":
         warn_if_crowded()

@@ -1,4 +1,4 @@
-"""Detection on resized frames: enlargement brings small craters to the sizes that a network detects best."""
+"""Detection on resized frames: enlargement brings small craters to sizes that a network detects better."""
 
 import time
 
@@ -21,12 +21,12 @@ _REACH = 4
 
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Resize an image (height, width); returns the input if it has this size."""
+    """Resize an image (height, width); returns the input itself if the size is right already."""
     if image.shape == (height_px, width_px):
         return image
     # When an image is shrunk, area averaging avoids aliased noise, which looks like craters.
-    how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
+    interpolation = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=interpolation), np.uint8)
 
 
 class Enlarged:
@@ -51,13 +51,13 @@ class Enlarged:
             parts.append(slice(max(low, 0), min(high, side)))
         matrix = np.array([[self._ratio[1], 0, starts[1]], [0, self._ratio[0], starts[0]]])
         source = np.ascontiguousarray(self._image[parts[0], parts[1]])
-        how = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        window = cv2.warpAffine(source, matrix, (sizes[1], sizes[0]), flags=how, borderMode=cv2.BORDER_REPLICATE)
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        window = cv2.warpAffine(source, matrix, (sizes[1], sizes[0]), flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(window, np.uint8)
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:
-    """Height and width, pixels, that the network accepts and that are nearest to `factor` times the frame's."""
+    """Height and width, pixels, nearest to `factor` times the frame's, that the network accepts."""
     if factor == 1:
         return height_px, width_px
     height, width = (max(1, round(side * factor / COARSEST_STRIDE)) for side in (height_px, width_px))

@@ -15,8 +15,8 @@ _BLOCK = 256
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
     """Detections of each frame from all predictors' boxes (N, K, 4) and scores (N, K).
 
-    On a GPU, suppression runs there on the whole batch; on a CPU it runs frame by frame, which is faster
-    (`make bench-suppress`). Both keep the boxes that OpenCV keeps, in OpenCV's order.
+    For tensors on a GPU, suppression runs on the GPU for the whole batch. For tensors on a CPU it runs frame by frame,
+    which is faster there (`make bench-suppress`). Both keep the boxes that OpenCV keeps, in OpenCV's order.
     """
     strong = scores >= settings.min_score
     if settings.max_aspect is not None:
@@ -26,9 +26,9 @@ def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -
         return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, strict=True)]
     kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
     # Transfer the whole batch at once.
-    found_boxes, found_scores, kept = (part.cpu() for part in (boxes, scores, kept))
+    boxes, scores, kept = (part.cpu() for part in (boxes, scores, kept))
     detections = []
-    for frame_boxes, frame_scores, chosen in zip(found_boxes, found_scores, kept, strict=True):
+    for frame_boxes, frame_scores, chosen in zip(boxes, scores, kept, strict=True):
         best = chosen[chosen >= 0][: settings.max_detections]
         detections.append(Detections(frame_boxes[best].double().numpy(), frame_scores[best].double().numpy()))
     return detections
@@ -42,10 +42,10 @@ def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: Evaluatio
 
 @torch.no_grad()
 def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou: float) -> Tensor:
-    """Non-maximum suppression of N frames at once, on the tensors' device; keeps the boxes that `suppress` keeps.
+    """Non-maximum suppression of N frames at once, on the tensors' device.
 
-    Takes boxes (N, K, 4), scores (N, K) and a mask (N, K) of the boxes to consider. Returns indices (N, M) of the kept
-    boxes of each frame, best first, padded with -1.
+    Keeps the boxes that `suppress` keeps. Takes boxes (N, K, 4), scores (N, K) and a mask `allowed` (N, K) of the boxes
+    to consider. Returns indices (N, M) of the kept boxes of each frame, best first, padded with -1.
 
     Boxes are processed in blocks by decreasing score. Within a block, the result of the greedy rule is a fixed point: a
     box is kept unless a kept box of a higher score overlaps it. An iteration converges to this fixed point, because the
@@ -76,13 +76,13 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
             ..., None
         ]
         candidates = candidates[:, _BLOCK:] & ~removed.any(1)
-        left = candidates.byte().argsort(dim=1, descending=True, stable=True)[
+        remaining = candidates.byte().argsort(dim=1, descending=True, stable=True)[
             :, : int(candidates.sum(1).amax()) if candidates.numel() else 0
         ]
         order, corners, candidates = (
-            order[:, _BLOCK:][rows, left],
-            corners[:, _BLOCK:][rows, left],
-            candidates.gather(1, left),
+            order[:, _BLOCK:][rows, remaining],
+            corners[:, _BLOCK:][rows, remaining],
+            candidates.gather(1, remaining),
         )
     if not kept:
         return order
@@ -92,8 +92,8 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
 
 
 def _overlap(first: Tensor, second: Tensor) -> Tensor:
-    """Intersection over union (N, A, B) of boxes (N, A, 4) and (N, B, 4), rounded as OpenCV does; 1 for two points."""
+    """IoU (N, A, B) of boxes (N, A, 4) and (N, B, 4), rounded as in OpenCV; 1 for boxes without area."""
     a, b = first[:, :, None], second[:, None]
-    # OpenCV computes 1 - IoU in float64, 0 for two points, and stores it as float32.
-    points = (a[..., 2:] == a[..., :2]).any(-1) & (b[..., 2:] == b[..., :2]).any(-1)
-    return torch.where(points, 1.0, 1.0 - (1.0 - iou(a, b)).float())
+    # OpenCV computes 1 - IoU in float64, which is 0 for two boxes without area, and stores it as float32.
+    empty = (a[..., 2:] == a[..., :2]).any(-1) & (b[..., 2:] == b[..., :2]).any(-1)
+    return torch.where(empty, 1.0, 1.0 - (1.0 - iou(a, b)).float())

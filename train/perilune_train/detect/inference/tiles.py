@@ -2,8 +2,8 @@
 
 The network was trained on frames of one size, each normalised by its mean and standard deviation. So an image is cut
 into tiles of that size, and each tile is normalised separately. Where tiles overlap, a box is taken from the tile whose
-borders are farthest from the box: near a border the network does not see whole craters, and keeping the boxes of both
-tiles would add false positives.
+borders are farthest from the box: near a border the network does not see whole craters. Keeping the boxes of both tiles
+would add false positives.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ tolerance both could drop it."""
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
-    """Starts of the tiles along a side, evenly spaced: the first is 0, and the last tile ends at the image edge."""
+    """Starts of the tiles along a side, evenly spaced, pixels; the tiles reach both edges of the image."""
     if length_px <= tile_px:
         return np.zeros(1, np.intp)
     count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
@@ -58,9 +58,10 @@ def count_tiles(height_px: int, width_px: int, tiling: Tiling) -> int:
 def detect_image(
     detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object] = lambda n: None
 ) -> Detections:
-    """Craters of an image (height, width) of any size, best first; `advance(n)` is called after n more tiles.
+    """Detections in an image (height, width) of any size, best first.
 
-    For an image of the size of one tile, the result equals that of `detect_at_scales` at scale 1.
+    `advance(n)` is called after every n tiles. For an image of the size of one tile at scale 1, the detections equal
+    the result of `detect_at_scales`.
     """
     height, width = image.shape
     boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
@@ -87,8 +88,8 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 
     The time of `suppress` grows with the square of the number of boxes. Many boxes are therefore suppressed block by
     block of the image. Each block also includes the boxes centred within a margin around it: half a block or half the
-    side of the largest box, whichever is larger (boxes with centres farther apart do not overlap by half). Only long
-    chains of boxes that suppress each other could change the result.
+    side of the largest box, whichever is larger (the IoU of boxes with centres farther apart is below 0.5). The result
+    differs from `suppress` only if a long chain of boxes that suppress each other crosses a block.
     """
     if len(boxes) <= _MAX_TOGETHER:
         return suppress(boxes, scores, threshold_iou, len(boxes))

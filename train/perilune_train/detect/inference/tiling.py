@@ -18,8 +18,9 @@ class Tiling:
     """Factors by which the image is resized before it is cut; detections at all scales are merged. Use factors above 1
     for craters smaller than those in training, and factors below 1 for larger craters."""
     box_margin_px: float = 0.0
-    """Margin added to the detected boxes at every side, pixels. Our boxes end at the crest of the rim, with subpixel
-    accuracy; the smallest box of whole pixels around a crater is on average half a pixel larger at every side."""
+    """Margin added to the detected boxes at every side, pixels. The detector's boxes end at the crest of the rim, with
+    subpixel accuracy. The smallest box of whole pixels around a crater is on average half a pixel larger at every
+    side."""
 
     def check(self) -> None:
         """Raise UserError on unusable values."""

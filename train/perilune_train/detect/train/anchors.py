@@ -1,4 +1,7 @@
-"""Anchors: k-means over the sizes of the labels, with 1 - IoU as distance (Redmon & Farhadi 2017, arXiv 1612.08242)."""
+"""Anchors by k-means over the sizes of the labels.
+
+The distance is 1 - IoU (Redmon & Farhadi 2017, arXiv 1612.08242).
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +20,12 @@ def size_iou(sizes: Array, anchors: Array) -> Array:
 
 
 def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator, plain: bool = False) -> Array:
-    """`count` anchors (count, 2), width and height in pixels, sorted by area, for sizes (N, 2) > 0.
+    """Anchors (count, 2) for label sizes (N, 2) > 0: widths and heights in pixels, sorted by area.
 
     Clusters 20,000 sizes drawn with `rng`, weighted by the inverse square root of the frequency of each size. Without
     the weights (`plain`), most anchors fit small craters, because craters of 40 px are a hundred times rarer than
-    craters of 5 px. The first anchors have evenly spaced logarithms of the area. An empty cluster takes the size with
-    the worst fit.
+    craters of 5 px. The initial anchors are squares with evenly spaced logarithms of the area. If a cluster becomes
+    empty, its anchor is replaced by the size that all anchors fit worst.
     """
     sizes = np.asarray(sizes_px, np.float64)
     if len(sizes) == 0:

@@ -1,6 +1,6 @@
 """Training steps as a CUDA graph: one launch instead of thousands.
 
-The forward and backward passes of Darknet53 with 23 attention modules have some 2,700 operations. A GPU finishes each
+The forward and backward passes of Darknet53 with 23 attention modules have some 2,700 operations. The GPU finishes each
 operation before the process can start the next one, so the GPU idles for most of a step. A captured step starts all
 operations at once.
 """
@@ -19,8 +19,8 @@ class CapturedStep:
     """A training step over a batch of constant size.
 
     `step` maps the frame numbers of a batch (B,), on the device, to losses; it computes gradients and updates weights.
-    Its operations and shapes must not depend on values, and it must use the same tensors in every call. The first steps
-    run one operation at a time; on a CPU, all steps do.
+    Its operations and shapes must not depend on tensor values, and it must use the same tensors in every call. The
+    first steps run without a graph; on a CPU, all steps do.
     """
 
     def __init__(self, step: Callable[[Tensor], Losses], batch_size: int, device: torch.device):
@@ -31,7 +31,7 @@ class CapturedStep:
         self.steps = 0
 
     def __call__(self, numbers: Tensor) -> Losses:
-        """Take a step; returns the losses, which the next step overwrites."""
+        """Take a step and return the losses, which the next step overwrites."""
         self.numbers.copy_(numbers, non_blocking=True)
         self.steps += 1
         if self.device.type != "cuda":

@@ -54,7 +54,7 @@ def run_detect(
     overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> runs.RunFolder:
-    """Train and evaluate a detector; all output is in the returned folder.
+    """Train and evaluate a detector; returns the folder with all output.
 
     Resumes an interrupted run with equal settings and dataset, and leaves a finished run unchanged; `overwrite`
     replaces either run.
@@ -101,7 +101,7 @@ def _run(
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
         say("detect.frozen_epochs is ignored without detect.init_from: the whole network is trained from the start")
-    # A resumed run loads its anchors later from its state, and they may differ from these.
+    # A resumed run later loads anchors from its state, which may differ from these anchors.
     if not resume:
         say_page(anchor_report(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
@@ -114,7 +114,7 @@ def _run(
         checkpoint_minutes=config.checkpoint_minutes,
         gradient_clip=config.gradient_clip,
     )
-    # Frozen weights have no gradient.
+    # Frozen weights have no gradient, and plain DDP would wait for their gradients.
     strategy = "ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy
     hardware = Hardware(device, config.devices, config.num_nodes, strategy, config.precision)
     wording = Wording("train detector", f"detect.learning_rate, which is {config.learning_rate:g}")
@@ -150,9 +150,9 @@ def evaluate(
     splits: dict[str, DetectSplit],
     sizes_px: NDArray[np.float64],
 ) -> Metrics:
-    """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only.
+    """Evaluate the best weights on val and test; write tables and pictures.
 
-    `sizes_px` (S, 2) are the sizes of the training labels.
+    The threshold is chosen on val only. `sizes_px` (S, 2) are the sizes of the training labels.
     """
     detector = open_detector(run.best, config)
     found_val, _ = detect_split(detector, splits["val"], "val")
@@ -170,7 +170,7 @@ def evaluate(
 
 
 def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> YOLOv3:
-    """Build the network with anchors for these label sizes (N, 2). Raises UserError if there are no labels."""
+    """Build the network with anchors for label sizes (N, 2), pixels. Raises UserError without labels."""
     if len(sizes_px) == 0:
         raise UserError(where, "labels", "no visible crater in the training split", "at least one")
     count = len(config.strides) * ANCHORS_PER_SCALE
@@ -182,7 +182,7 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> 
 
 
 def load_teacher(path: Path, config: DetectConfig) -> Teacher:
-    """Load the teacher network. Raises UserError if its input channels or strides differ from the student's."""
+    """Load the teacher network. Raises UserError if in_channels or strides differ from the student's."""
     network = load_detector(path)
     expected = {"in_channels": config.in_channels, "strides": list(config.strides)}
     runs.check_architecture(path, runs.load_weights(path)["architecture"], expected)
@@ -195,7 +195,7 @@ def anchor_sizes(network: YOLOv3) -> np.ndarray:
 
 
 def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
-    """Text: how well anchors fit label sizes (N, 2), which limits the recall that training can reach."""
+    """Text that states how well anchors fit label sizes (N, 2), which limits the recall of training."""
     recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
     return (
         f"anchors: best possible recall {recall:.4f}, the fraction of training labels with an anchor within a factor "

@@ -1,4 +1,7 @@
-"""Distillation: a small detector learns from a large one and the labels (Hinton et al. 2015, arXiv 1503.02531)."""
+"""Distillation: a small detector learns from a large one and from the labels.
+
+Source: Hinton et al. 2015, arXiv 1503.02531.
+"""
 
 from dataclasses import dataclass
 
@@ -10,7 +13,7 @@ from perilune_train.detect.train.loss import ciou_loss
 from perilune_train.models.yolo import YOLOv3, decode_grid
 
 _MIN_TEACHER_SCORE = 0.1
-"""Minimum teacher score of the predictors whose boxes are learned; below it, the teacher's boxes mean nothing."""
+"""Minimum teacher score of the predictors whose boxes are learned; boxes of lower scores are meaningless."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +36,10 @@ def distill_loss(
 
     Boxes: mean CIoU loss against the teacher's boxes, over predictors with a teacher score of at least 0.1, weighted by
     that score. Objectness: mean over all predictors of the Kullback-Leibler divergence of the student's score from the
-    teacher's. Both are 0 for equal outputs. The teacher gets no gradient. No shape depends on values, so the process
-    never waits for a GPU. Both networks must have equal anchors (3, 3, 2) and strides, so that their predictors
-    correspond.
+    teacher's. Both losses are 0 for equal outputs. The teacher gets no gradient. Both networks must have equal anchors
+    (3, 3, 2) and strides, so that their predictors correspond.
+
+    No tensor shape depends on tensor values, so the CPU never waits for the GPU.
     """
     box, weights, confidence, predictors = student[0].new_zeros(()), student[0].new_zeros(()), [], 0
     for raw, target, own_anchors, stride in zip(student, teacher, anchors, strides, strict=True):

@@ -8,11 +8,13 @@ from perilune_train.detect.data.assign import Targets
 
 GUIDED = ("B_11", "B_22", "B_38")
 """The last gates of the stages of stride 2, 4 and 8."""
-_REACHES, _LEVELS = (1.0, 1.1, 1.2, 1.3, 1.4), (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
-"""Outer radii of the crater and of its rings, divided by the crater's radius; then 1 - G inside each radius and beyond
-the last, where G is the paper's mask."""
+_REACHES = (1.0, 1.1, 1.2, 1.3, 1.4)
+"""Outer radii of the crater and of the rings around it, divided by the crater's radius."""
+_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+"""1 - G in the crater, in each ring and beyond the last ring, where G is the paper's mask."""
 _WINDOWS = (4.0, 16.0)
-"""Largest radii, in map pixels, of the groups of craters that are painted together."""
+"""Craters are painted in three groups. These are the largest radii of the first two groups, rings included, in map
+pixels."""
 _TINY = 1e-6
 
 
@@ -23,14 +25,14 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
     G is the paper's mask. Craters are the ellipses in the label boxes that predictors of any scale learn. A pixel of
     the map is `stride` image pixels wide; values are computed at pixel centres.
     """
-    boxes = torch.cat([painted.boxes for painted in targets]).float()
-    frame = torch.cat([painted.predictors[0] for painted in targets])
+    boxes = torch.cat([assignment.boxes for assignment in targets]).float()
+    frame = torch.cat([assignment.predictors[0] for assignment in targets])
     # Several predictors learn one label; paint it once.
     rows = torch.unique(torch.cat([frame[:, None].float(), boxes], 1), dim=0)
     rows = torch.cat([rows[:, :1], rows[:, 1:] / stride], 1)
     painted = torch.zeros(frames, height, width, device=boxes.device)
     reach = (rows[:, 3:] - rows[:, 1:3]).amax(1) / 2 * _REACHES[-1]
-    # Most craters are small, so small windows save nearly all of the work, for which a training step waits.
+    # Most craters are small: painting these in small windows saves nearly all of the time.
     smaller = torch.zeros_like(reach, dtype=torch.bool)
     for largest in (*_WINDOWS, float("inf")):
         fitting = (reach <= largest) & ~smaller
@@ -60,7 +62,7 @@ def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
 
 
 def guide_loss(masks: dict[str, Tensor], targets: Targets, size_px: tuple[int, int]) -> Tensor:
-    """Guidance loss: 1 - Pearson correlation of mask and craterness, averaged over frames and GUIDED gates.
+    """Guidance loss: 1 - Pearson correlation of mask and craterness, mean over frames and GUIDED gates.
 
     `masks` are the spatial masks (N, 1, h, w), by gate; `size_px` is the height and width of the images. The loss of a
     frame without craters is 1.

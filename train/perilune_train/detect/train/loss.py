@@ -3,7 +3,7 @@
 For each scale, `detection_loss` gathers the positive predictors, decodes their boxes, and computes:
 
 L_ciou   the complete IoU loss of these boxes with their labels
-L_obj    the binary cross-entropy of the objectness of positive and negative predictors; ignored ones do not count
+L_obj    the binary cross-entropy of the objectness of positive and negative predictors, without ignored predictors
 """
 
 import math
@@ -22,11 +22,12 @@ _TINY = 1e-7
 
 
 def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "standard"] = "circular") -> Tensor:
-    """1 - IoU + rho^2 / c^2 + alpha v of pairs of boxes (N, 4), x0 y0 x1 y1 in pixels: losses (N,) in float32.
+    """CIoU losses (N,), float32, of pairs of boxes (N, 4), x0 y0 x1 y1 in pixels.
 
-    rho is the distance between the centres and c the diagonal of the box around both. v = 4 / pi^2 (arctan(r) -
-    arctan(w / h))^2 with r the label's w / h (`standard`, Zheng et al. 2020, doi 10.1609/aaai.v34i07.6999) or 1
-    (`circular`, the paper's prior). alpha = v / (1 - IoU + v) carries no gradient. Boxes without area are allowed.
+    The loss is 1 - IoU + rho^2 / c^2 + alpha v. rho is the distance between the centres, and c the diagonal of the box
+    around both. v = 4 / pi^2 (arctan(r) - arctan(w / h))^2 with r the label's w / h (`standard`, Zheng et al. 2020, doi
+    10.1609/aaai.v34i07.6999) or 1 (`circular`, the paper's prior). alpha = v / (1 - IoU + v) carries no gradient. Boxes
+    without area are allowed.
     """
     predicted, label = predicted.float(), label.float()
     size = (predicted[:, 2:] - predicted[:, :2]).clamp(min=0)
@@ -49,18 +50,18 @@ def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "sta
 def detection_loss(
     outputs: list[Tensor], targets: Targets, anchors: Tensor, strides: tuple[int, ...], settings: LossSettings
 ) -> tuple[Tensor, Tensor]:
-    """L_ciou and L_obj of raw outputs (N, 3, h, w, 5) per scale; the loss is their weighted sum.
+    """L_ciou and L_obj of raw outputs (N, 3, h, w, 5) per scale; the training loss is their weighted sum.
 
-    With `reduction` "sums", the paper's form: both are plain sums over all predictors of all scales, divided by the
+    `reduction` "sums" is the paper's form: both losses are plain sums over all predictors of all scales, divided by the
     number of frames.
 
-    With "means", our deviation: for each scale, L_ciou is the mean over its positive predictors, or 0 without them.
-    L_obj is the sum of the binary cross-entropy of the objectness over positive and (times lambda_noobj) negative
-    predictors, divided by the number of all predictors of the scale. The scales are averaged with weights 1 / stride.
-    With means, both parts train with the paper's weights 0.05 and 1. The weights 1 / stride raise the coarse scales
-    relative to a plain sum, because their craters are a hundred times rarer.
+    "means" is our deviation. For each scale, L_ciou is the mean over the positive predictors, or 0 without positive
+    predictors. L_obj is the sum of the binary cross-entropy of the objectness over positive and (times lambda_noobj)
+    negative predictors, divided by the number of all predictors of the scale. The scales are averaged with weights
+    1 / stride. With means, both losses train with the paper's weights 0.05 and 1. In a plain sum the coarse scales
+    hardly count, because their craters are a hundred times rarer; the means give them more weight.
 
-    No shape depends on values, so the process never waits for a GPU.
+    No tensor shape depends on tensor values, so the CPU never waits for the GPU.
 
     The objectness target of a positive predictor is 1 (`hard`, YOLOv3) or the IoU of its box with its label (`iou`).
     With `iou` the score measures how well a box fits, and suppression keeps the best box on a crater.

@@ -28,12 +28,12 @@ from perilune_train.records.provenance import RECORD
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100
 _STEPS_BETWEEN_AVERAGES = 4
-"""Steps between updates of the average. An update of all weights takes a twentieth of the time of a small network's
+"""Number of steps between updates of the average. For a small network an update takes a twentieth of the time of a
 step; updating at every fourth step gives equal results."""
 
 
 def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> float:
-    """Factor on the learning rate: linear from nearly 0 to 1, then half a cosine to a hundredth at the last step."""
+    """Factor on the learning rate: rises linearly to 1, then falls as half a cosine to a hundredth."""
     warmup = min(warmup_steps, total_steps // 2)
     if step < warmup:
         return (step + 1) / warmup
@@ -45,7 +45,7 @@ TensorPairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
 
 
 def paired_tensors(average: nn.Module, network: nn.Module) -> TensorPairs:
-    """Matching tensors of average and network: floats of both, then counters of both."""
+    """Tensors of average and network, in equal order: floats of each, then integer counters of each."""
     old, new = list(average.state_dict().values()), list(network.state_dict().values())
     floats = [value.is_floating_point() for value in old]
     return (
@@ -60,8 +60,8 @@ def paired_tensors(average: nn.Module, network: nn.Module) -> TensorPairs:
 def update_average(tensors: TensorPairs, decay: float) -> None:
     """Move an average of weights and batch statistics towards the network by 1 - decay; copy the counters.
 
-    Lightning's EMAWeightAveraging is not used: its decay is constant, it deep-copies the task with the frames that it
-    holds, and its update tensor by tensor takes about 20 times as long.
+    Lightning's EMAWeightAveraging is not used: its decay is constant, it copies the task including all frames, and its
+    update takes about 20 times as long, because it updates tensor by tensor.
     """
     old, new, old_counters, new_counters = tensors
     torch._foreach_lerp_(old, new, 1 - decay)
@@ -72,9 +72,7 @@ class DetectTask(lightning.LightningModule):
     """Training with AdamW, warm-up and cosine schedule; a moving average of the weights is evaluated.
 
     While the backbone is frozen, its weights and batch statistics do not change, except the weights of its attention
-    gates.
-
-    `train` and `val` are the shares of this process.
+    gates. `train` and `val` are this process's shares of the splits.
     """
 
     def __init__(
@@ -176,11 +174,11 @@ class DetectTask(lightning.LightningModule):
             part.requires_grad_(not frozen)
             part.train(not frozen)
         if self.resides and (self.captured is None or self.current_epoch == self.frozen_epochs):
-            # Capture again after unfreezing: a captured step computes gradients only of the weights trained then.
+            # Capture again after unfreezing: a captured step trains only the weights that were not frozen at capture.
             self.captured = CapturedStep(self.whole_step, self.config.batch_size, self.device)
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        # The last batch of an epoch may be smaller than the captured ones.
+        # The last batch of an epoch may be smaller than the captured batch.
         self.replayable = isinstance(batch, Tensor) and len(batch) == self.config.batch_size
 
     def training_step(self, batch: Batch | Tensor, batch_idx: int) -> Tensor:
@@ -217,7 +215,10 @@ class DetectTask(lightning.LightningModule):
         return self.resident.batch(numbers, self.config.in_channels)
 
     def whole_step(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses of a batch of resident frames; updates the weights. Reads no value, so that it can be captured."""
+        """Update the weights and return the losses of a batch of resident frames.
+
+        Reads no tensor values on the CPU, so that the step can be captured.
+        """
         optimizer: Any = self.optimizers(use_pl_optimizer=False)
         optimizer.zero_grad(set_to_none=True)
         # Disable the cache: it would keep casts of weights that the step changes.
@@ -244,11 +245,10 @@ class DetectTask(lightning.LightningModule):
             super().optimizer_zero_grad(*args)
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
-        # Lightning's clipping refuses fused optimisers because of the scaled gradients of float16, which are not used
-        # here.
+        # Lightning's clipping refuses fused optimisers because of float16's scaled gradients, which are not used here.
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         norm = nn.utils.get_total_norm(gradients, foreach=True)
-        # On a CPU, reading the norm is free and saves most steps a second pass over all gradients.
+        # On a CPU, reading the norm costs nothing, and most steps then need no second pass over all gradients.
         if norm.is_cuda or norm > self.config.gradient_clip:
             nn.utils.clip_grads_with_norm_(self.network.parameters(), self.config.gradient_clip, norm, foreach=True)
 
@@ -259,7 +259,7 @@ class DetectTask(lightning.LightningModule):
         assert isinstance(self.train_split, DetectSplit)
         self.resident = ResidentFrames.of(self.train_split, self.config, self.network.anchors, self.device)
         for group in self.optimizers(use_pl_optimizer=False).param_groups:
-            # The state of a resumed run was loaded to the CPU.
+            # The learning rate of a resumed run was loaded to the CPU.
             group["lr"] = group["lr"].to(self.device)
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
@@ -280,7 +280,7 @@ class DetectTask(lightning.LightningModule):
         if isinstance(batch, Tensor):
             return batch.to(device, non_blocking=True)
         images, targets = batch
-        # The channels of a grey frame are equal, so copy one.
+        # The channels of a grey frame are equal, so copy one channel.
         moved = network_input(images.to(device, non_blocking=True), self.config.in_channels)
         return moved, [part.to(device) for part in targets]
 

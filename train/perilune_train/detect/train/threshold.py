@@ -1,6 +1,6 @@
-"""Choose the score threshold of a detector on validation frames, optionally also on varied copies of them.
+"""Choose the score threshold of a detector on validation frames.
 
-The copies have other contrast, blur and noise.
+Optionally also uses copies of the frames with other contrast, blur and noise.
 """
 
 from dataclasses import replace
@@ -39,7 +39,7 @@ def threshold_on_validation(
 
 
 def varied_split(split: DetectSplit, seed: int) -> DetectSplit:
-    """The frames with other contrast, black and white points, blur and noise (`VARIED`), and unchanged labels."""
+    """Copies of the frames with other contrast, blur and noise (`VARIED`), and unchanged labels."""
     images = np.empty_like(split.frames.images)
     for number, image in enumerate(split.frames.images):
         frame_labels = split.labels[number]

@@ -25,20 +25,20 @@ from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
-"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. The
-deviation is a power of two, so scaling by it is exact."""
+"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. The deviation is a power of two,
+so scaling by it is exact."""
 _GATES = "backbone.attentions."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
 
 @torch.no_grad()
 def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"]) -> None:
-    """Change the stem of a backbone so that it gives the same features for another scale of its input.
+    """Change the stem of a backbone so that it gives equal features for another scale of the input.
 
     Darknet's files were trained on grey values from 0 to 1 (`grey`). Our networks take frames with zero mean and unit
     standard deviation (`normalised`). Without this change the input of a frozen backbone would be about four times as
-    strong as in its training. grey = 0.25 normalised + 0.45 is folded into the stem's weights and its batch
-    norm's mean. This is exact except for rounding and for the border, where zero padding then means mean grey.
+    strong as in training. grey = 0.25 normalised + 0.45 is folded into the weights of the stem and the mean of its
+    batch norm. This is exact except for rounding, and for the border, where zero padding then means mean grey.
     """
     stem: Any = backbone.stem
     weight, mean = stem.conv.weight, stem.norm.running_mean
@@ -52,7 +52,7 @@ def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"
 
 
 def check_start(path: Path) -> None:
-    """Raise UserError if a file does not have the weights of YOLOv3 or of Darknet53, in Darknet's format."""
+    """Raise UserError unless a file has weights of YOLOv3 or Darknet53 in Darknet's format."""
     if not path.is_file():
         raise UserError(path, "initial weights", "no such file", "yolov3.weights or darknet53.conv.74")
     if not is_darknet(path):
@@ -63,10 +63,11 @@ def check_start(path: Path) -> None:
 def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill the network with weights of an earlier detect run or of a Darknet file.
 
-    A run with the same strides gives all weights and its anchors; a run with other strides gives only the backbone.
-    The gates are kept if the attention differs. `detect.init_layers=from_second` also keeps the first convolution and
-    its norm. Raises UserError if width or in_channels differ, or if a frozen backbone would have plain gates with
-    random weights.
+    A run with equal strides gives all weights and the anchors; a run with other strides gives only the backbone. If the
+    attention differs, the network's gates keep their initial weights. With `detect.init_layers=from_second`, the first
+    convolution and its norm keep theirs.
+
+    Raises UserError if width or in_channels differ, or if a frozen backbone would have plain gates with random weights.
     """
     stem = {key: value.clone() for key, value in network.backbone.stem.state_dict().items()}
     _fill(network, path, config)
@@ -97,8 +98,8 @@ def _fill(network: YOLOv3, path: Path, config: DetectConfig) -> None:
 def check_gates(path: Path, config: DetectConfig) -> None:
     """Raise UserError if a frozen backbone would have plain gates with random initial weights.
 
-    Each such gate scales its input by about 0.25, so that the frozen layers get features they were not trained on:
-    the cosine similarity to the features of the plain backbone falls to about 0.5 (`make bench-transfer`).
+    These gates scale their input by about 0.25, so the frozen layers get features on which they were not trained: the
+    cosine similarity to the features of the backbone without gates falls to about 0.5 (`make bench-transfer`).
     """
     if config.frozen_epochs and config.attention == "cbam" and not config.plain_gates_before_frozen_layers:
         expected = (
@@ -108,10 +109,10 @@ def check_gates(path: Path, config: DetectConfig) -> None:
 
 
 def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
-    """Terrain records of two networks: the one that gave the initial weights, and the teacher.
+    """Terrain records of the network that gave the initial weights, and of the teacher.
 
-    A resumed run reads them from its last saved state, `last`. Darknet's files have no records: they were trained on
-    photographs of the Earth. Raises UserError if a checkpoint is missing or damaged.
+    A resumed run reads the records from its last saved state, `last`. Darknet's files have no records: they were
+    trained on photographs of the Earth. Raises UserError if a checkpoint is missing or damaged.
     """
     if last is not None:
         content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
@@ -123,10 +124,10 @@ def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenanc
 def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill a network with the weights of a Darknet file; other weights are not changed.
 
-    A darknet53.conv.74 fills the backbone. A yolov3.weights also fills the neck and the heads' 3 x 3 convolutions if
-    the strides are 8, 16, 32; otherwise only the backbone. Its output layers are not used: they predict COCO's 80
-    classes with COCO's anchors, and would undo the prior that a cell is empty. The output layers of a file written by
-    perilune (15 filters) are used.
+    darknet53.conv.74 fills the backbone. yolov3.weights also fills the neck and the heads' 3 x 3 convolutions if the
+    strides are 8, 16, 32; with other strides it fills only the backbone. The output layers of yolov3.weights are not
+    used: they predict COCO's 80 classes with COCO's anchors, and would undo the prior that a cell is empty. The output
+    layers of a file written by perilune (15 filters) are used.
 
     Raises UserError, and changes nothing, if width is not 1, in_channels is not 3 or the file has another size.
     """
@@ -149,9 +150,10 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
 
 
 def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: Path, whole: bool) -> DarknetFile:
-    """Darknet file of a network's backbone, or of the whole network with 15 output filters. Changes the network.
+    """Darknet file of a network's backbone, or of the `whole` network with 15 output filters.
 
-    These files cannot hold attention gates. Raises UserError if the network does not have the file's shape.
+    Changes the network's stem. Darknet files cannot hold attention gates. Raises UserError if the network does not have
+    the shape of the file.
     """
     expected: dict[str, Any] = dict(DARKNET_SHAPE)
     if whole:

@@ -17,7 +17,7 @@ def is_coco(content: Any) -> bool:
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """The content of a COCO file, without the polygons of objects that have a box."""
+    """The content of a COCO file, without the polygons of objects that have a box. May raise UserError."""
     content = read_json(path, _EXPECTED, _without_polygon)
     if not isinstance(content, dict):
         raise UserError(path, "JSON", type(content).__name__, "an object with images and annotations")
@@ -25,7 +25,7 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 def read_coco(path: Path, content: dict[str, Any], image_folder: Path | None = None) -> LabelFile:
-    """Read a COCO file. Raises UserError, naming file and field, on invalid content."""
+    """Convert the content of a COCO file. Raises UserError, which names file and field, if it is invalid."""
     categories = {
         _id_of(category_record, "id", "categories", path): str(category_record.get("name", ""))
         for category_record in _records(content, "categories", path)
@@ -53,14 +53,14 @@ def read_coco(path: Path, content: dict[str, Any], image_folder: Path | None = N
 
 
 def _without_polygon(record: dict) -> dict:
-    """The object without polygons if it has a box: polygons take most of the memory."""
+    """Drop the polygons of an object that has a box, because polygons take most of the memory."""
     if record.get("bbox"):
         record.pop("segmentation", None)
     return record
 
 
 def _box(annotation: dict[str, Any], path: Path, field: str) -> Box:
-    """The box, or the box around the polygons."""
+    """The box of an annotation, or the box around its polygons."""
     if annotation.get("bbox"):
         return box_of(annotation["bbox"], path, f"{field}.bbox")
     polygons = annotation.get("segmentation")
@@ -81,7 +81,7 @@ def _flag(value: Any) -> bool:
 
 
 def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
-    """A list of objects; a missing list of categories counts as an empty one."""
+    """A list of JSON objects; a missing list of categories counts as empty."""
     records = content.get(name, [] if name == "categories" else None)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise UserError(path, name, type(records).__name__, "a list of objects, as in COCO")

@@ -22,7 +22,7 @@ class LabelledImage:
     """One image and its labels; the pixels stay in the file."""
 
     name: str
-    """Path within the folder, for tables and pictures."""
+    """Path within the folder, used as the name in tables and pictures."""
     path: Path
     """The image file."""
     width_px: int
@@ -30,11 +30,11 @@ class LabelledImage:
     height_px: int
     """Height, pixels."""
     boxes: Array
-    """x0, y0, x1, y1 in pixels (M, 4); they may extend beyond the image, except in a clipped set."""
+    """x0, y0, x1, y1 in pixels (M, 4). Boxes may extend beyond the image unless the set is clipped."""
     not_ignored: NDArray[np.bool_]
-    """False for a box that its source marks as ignored (M,)."""
+    """False for a box that the label file marks as ignored or as a crowd (M,)."""
     crowd: NDArray[np.bool_] | None = None
-    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if there is no such box."""
+    """Whether a box is a region of many craters (M,), COCO's `iscrowd`; None if no box is a crowd."""
 
     @property
     def sizes_px(self) -> Array:
@@ -42,7 +42,7 @@ class LabelledImage:
         return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
 
     def selected(self, min_size_px: float) -> NDArray[np.bool_]:
-        """Which boxes are ground truth (M,): not ignored, centred in the image, and of at least this size."""
+        """Whether each box is ground truth (M,): not ignored, centred in the image, large enough."""
         centre = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
         inside = ((centre >= 0) & (centre < [self.width_px, self.height_px])).all(axis=1)
         return self.not_ignored & inside & (self.sizes_px >= min_size_px)
@@ -57,9 +57,9 @@ class ImageSet:
     clipped: bool
     """Whether boxes are clipped at the image's edge, so that detections must be clipped before matching."""
     categories: str = ""
-    """Text that names the categories taken as craters; "" if the file left no choice."""
+    """Text that names the categories taken as craters; "" if there are no other categories than crater."""
     split: str = ""
-    """Text that names the split, if the source has several; else ""."""
+    """Text that names the split; "" if the source has no splits."""
 
 
 @dataclass(frozen=True)
@@ -94,22 +94,26 @@ class Entry:
 
 @dataclass(frozen=True)
 class LabelFile:
-    """What the readers of all formats return."""
+    """Content of a label file, or of a folder of label files, in any format."""
 
     source: Path
-    """Path in messages about categories."""
+    """Path of the file or folder, named in messages."""
     entries: list[Entry]
-    """Pictures."""
+    """Pictures and their objects."""
     categories: Mapping[str, str] = field(default_factory=dict)
     """Name of each category, by its id in the file."""
     clip: bool = True
     """Whether to clip boxes at the edges of the picture."""
     notes: tuple[str, ...] = ()
-    """Lines for the user."""
+    """Messages for the user."""
 
 
 def image_set(label_file: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
-    """Check the pictures, select the objects that are craters, and clip their boxes; may raise UserError."""
+    """Check the pictures, select the objects that are craters, and clip their boxes.
+
+    `wanted` are the names of the crater categories (`choose_categories`). Raises UserError if a picture cannot be read,
+    occurs twice or has another size than the label file states, or if no category is a crater.
+    """
     chosen, text = choose_categories(label_file.categories, wanted, label_file.source)
     check_names([entry.path for entry in label_file.entries], [entry.name for entry in label_file.entries])
     check_names(
@@ -138,11 +142,11 @@ def image_set(label_file: LabelFile, wanted: Sequence[str] = ()) -> ImageSet:
 def choose_categories(
     categories: Mapping[str, str], wanted: Sequence[str], source: Path
 ) -> tuple[set[str] | None, str]:
-    """The ids of the categories that are craters, and a text that names them.
+    """The ids of the categories that are craters, and a text that names the categories.
 
-    `wanted` names the categories. Without it, these are all categories named crater or craters, in upper or lower case;
-    there may be several, because Roboflow adds a placeholder category to its exports. Exception: without `wanted`, in a
-    file with fewer than two categories, every object is a crater, and the ids are None.
+    `wanted` are the names of the crater categories. Without `wanted`, the categories named crater or craters, in upper
+    or lower case, are chosen. There may be several, because Roboflow adds a placeholder category to its exports.
+    Without `wanted` and with fewer than two categories, every object is a crater, and the ids are None.
     """
     names = {key: " ".join(name.split()) for key, name in categories.items()}
     asked = [name.strip().lower() for name in wanted]

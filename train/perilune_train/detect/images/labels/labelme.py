@@ -14,7 +14,7 @@ _WITHOUT_AREA = ("point", "points", "line", "linestrip")
 
 
 def read_labelme(path: Path, picture: Path, name: str) -> tuple[Entry, int]:
-    """Read the objects of one file; also return how many shapes were omitted because they have no area."""
+    """Read the objects of one file; returns the entry and the number of omitted shapes without area."""
     content = read_json(path, _EXPECTED, _without_pixels)
     shapes = content.get("shapes") if isinstance(content, dict) else None
     if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):

@@ -16,7 +16,7 @@ _DOCUMENT_TYPES = ("<!DOCTYPE", "<!ENTITY")
 
 
 def read_text(path: Path, field: str, largest: int = _MAX_TEXT) -> str:
-    """A text file in UTF-8. Raises UserError if it is missing, too large or of another encoding."""
+    """Read a text file in UTF-8. Raises UserError if it is missing, too large or in another encoding."""
     if not path.is_file():
         raise UserError(path, field, "no such file", "a label file")
     size = path.stat().st_size
@@ -29,7 +29,7 @@ def read_text(path: Path, field: str, largest: int = _MAX_TEXT) -> str:
 
 
 def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = None) -> Any:
-    """The content of a JSON file; `hook` replaces each object, for example to drop parts of it."""
+    """Read a JSON file; `hook` replaces each object while parsing, for example to drop parts of it."""
     text = read_text(path, "JSON", _MAX_JSON)
     if text.count("[") + text.count("{") > _MAX_BRACKETS:
         raise UserError(path, "JSON", f"more than {_MAX_BRACKETS} lists and objects", "fewer, in several files")
@@ -40,7 +40,10 @@ def read_json(path: Path, expected: str, hook: Callable[[dict], Any] | None = No
 
 
 def read_xml(path: Path, expected: str) -> ET.Element:
-    """The root of an XML file. Document types are refused: entities can fill the memory or refer to other files."""
+    """Read an XML file; returns the root element.
+
+    Document types are refused, because entities can fill the memory or refer to other files.
+    """
     text = read_text(path, "XML", _MAX_XML)
     if any(word in text for word in _DOCUMENT_TYPES):
         raise UserError(path, "XML", "a document type or an entity", expected)
@@ -53,7 +56,7 @@ def read_xml(path: Path, expected: str) -> ET.Element:
 
 
 def below(folder: Path, name: Any, path: Path, field: str) -> Path:
-    """A path in a folder or below it. Raises UserError on a path that leads outside, including by a link."""
+    """The path `name` below a folder. Raises UserError if it leads outside the folder, also by a link."""
     if isinstance(name, str) and name and "\0" not in name:
         # Labels made on Windows have backslashes.
         parts = name if "\\" not in name or folder.joinpath(name).exists() else name.replace("\\", "/")
@@ -69,10 +72,10 @@ def below(folder: Path, name: Any, path: Path, field: str) -> Path:
 def find_picture(path: Path, name: Any, field: str, image_folder: Path | None) -> Path:
     """Path of the picture that a label file names, in the first searched folder that contains it.
 
-    Searches only `image_folder` if it is given. Otherwise searches the file's folder, its subfolder images, ../images,
-    ../images/NAME and ../NAME, where NAME is the last part of the file's name (train2017 for
-    instances_train2017.json). If the label file is in a direct subfolder of a perilune dataset, the
-    dataset's folder is searched too.
+    If `image_folder` is given, searches only this folder. Otherwise searches the folder of the label file, its
+    subfolder images, ../images, ../images/NAME and ../NAME, where NAME is the last part of the file's name (train2017
+    for instances_train2017.json). If the label file is in a direct subfolder of a perilune dataset, searches the
+    dataset's folder too.
     """
     root = path.resolve().parent
     ending = path.stem.rpartition("_")[2]

@@ -1,7 +1,8 @@
 """Pascal VOC (an XML file per image) and CVAT for images (one XML file).
 
-Corners are used as written, counted from the outer corner of the top-left pixel: labelImg and Roboflow write edges.
-The development kit of Pascal VOC numbers pixels from 1, so here its boxes lack one pixel at the left and at the top.
+Corners are used as written, and count from the outer corner of the top-left pixel, as in the files of labelImg and
+Roboflow. The development kit of Pascal VOC numbers pixels from 1, so its boxes lack one pixel at the left and at the
+top.
 """
 
 import xml.etree.ElementTree as ET
@@ -35,7 +36,10 @@ def read_voc(path: Path, picture: Path, name: str) -> Entry:
 
 
 def read_cvat(path: Path, image_folder: Path | None = None) -> LabelFile:
-    """Read a file of CVAT for images: boxes, polygons, ellipses and masks. Other shapes are counted and omitted."""
+    """Read a file of CVAT for images: boxes, polygons, ellipses and masks.
+
+    Other shapes are omitted; a note states their number.
+    """
     root = read_xml(path, "a file of CVAT for images")
     if root.tag != "annotations" or root.find("track") is not None:
         got = "tracks of CVAT for video" if root.find("track") is not None else f"<{root.tag}>"

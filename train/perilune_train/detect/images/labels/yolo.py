@@ -1,7 +1,8 @@
-"""YOLO labels: one text file per image, one line `class cx cy w h` per object, in fractions of the image size.
+"""YOLO labels: one text file per image, one line `class cx cy w h` per object.
 
-A line with a polygon (`class x1 y1 x2 y2 ...`) becomes the box around the polygon. A sixth number (a score) is ignored.
-Numbers are separated by spaces, tabs or commas. The image of an empty file has no objects.
+Coordinates are fractions of the image size. A line with a polygon (`class x1 y1 x2 y2 ...`) becomes the box around the
+polygon. In a line of six numbers, the last number (a score) is ignored. Numbers are separated by spaces, tabs or
+commas. An empty file means an image without objects.
 """
 
 from collections.abc import Mapping
@@ -23,7 +24,7 @@ _LISTED_SUFFIX = ".txt"
 
 
 def is_yolo(text: str) -> bool:
-    """Whether the text of a label file is YOLO: the first line contains only numbers, or the text is empty."""
+    """Whether the text of a label file is YOLO: empty, or with only numbers in the first line."""
     first = next((line for line in text.splitlines() if line.strip()), "")
     try:
         return all(float(cell) is not None for cell in _cells(first))
@@ -60,7 +61,7 @@ def read_yolo_text(path: Path, picture: Path) -> list[LabelledObject]:
 
 
 def label_of(picture: Path) -> Path:
-    """The text file of a picture: labels/a/b.txt for images/a/b.png, otherwise a file beside the picture."""
+    """Path of a picture's label file: labels/a/b.txt for images/a/b.png, else beside the picture."""
     parts = list(picture.parts)
     for level in range(len(parts) - 2, -1, -1):
         if parts[level].lower() == "images":
@@ -85,7 +86,10 @@ def class_names(content: Mapping[str, Any]) -> dict[str, str]:
 
 
 def pictures_of_split(path: Path, value: Any) -> list[Path]:
-    """The pictures of a split of a data.yaml. Its folders and lists of paths must be below the folder of data.yaml."""
+    """The pictures of a split of a data.yaml.
+
+    `value` has the split's folders or lists of paths, which must be below the folder of data.yaml.
+    """
     root = path.resolve().parent
     images = []
     for name in value if isinstance(value, list) else [value]:
