@@ -192,6 +192,9 @@ def build_dataset(
     return root
 
 
+_turned = frames.matrix_from_rotation_vector
+
+
 def _add_measurements(rows: dict[str, list[dict]], nominal: NominalTrajectory, own: list[dict]) -> None:
     """Five measurements between two frames: of the true constant turn, and of the nominal force and altitude."""
     force = np.array(nominal.acceleration_mps2) - gravity_mps2(0.0)
@@ -206,6 +209,10 @@ def _add_measurements(rows: dict[str, list[dict]], nominal: NominalTrajectory, o
             rows["ranges"].append(keys | {"time_s": time_s, "range_m": nominal.position_at(time_s)[2]})
             unit = {"grade": "tactical", "time_s": time_s, "interval_s": interval_s}
             rows["inertial"].append(keys | unit | {"angular_rate_radps": rate, "specific_force_mps2": force})
+            attitude = frames.quaternion_from_matrix((body[k] @ _turned(rate * part * interval_s)).T)
+            rows["star_tracker"].append(keys | {"time_s": time_s, "rotation_wxyz": attitude})
+            down = {"beam": 0, "time_s": time_s, "beam_in_body": [0.0, 0.0, -1.0]}
+            rows["doppler_lidar"].append(keys | down | {"speed_mps": -nominal.velocity_at(time_s)[2], "range_m": None})
 
 
 def seal(root: Path) -> None:

@@ -83,7 +83,10 @@ class FlightConfig(Section):
 
 
 class InstrumentsConfig(Section):
-    """Simulated measurements along each trajectory, in the tables `inertial` and `ranges`."""
+    """Simulated measurements along each trajectory.
+
+    They are in the tables `inertial`, `ranges`, `star_tracker` and `doppler_lidar`.
+    """
 
     inertial_grades: tuple[InertialGrade, ...] = ()
     """Grades of inertial measurement units (gyroscopes and accelerometers) to simulate."""
@@ -96,6 +99,30 @@ class InstrumentsConfig(Section):
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0005
     """Standard deviation that is added in proportion to the range, share of the range."""
+    star_tracker_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Attitudes of a star tracker per second; 0 for no star tracker."""
+    star_tracker_sigma_arcsec: tuple[Deviation, Deviation, Deviation] = (10.0, 10.0, 60.0)
+    """Standard deviations of an attitude about X_B, Y_B and Z_B, seconds of arc. The tracker looks along Z_B, and is
+    least precise about this axis."""
+    star_tracker_outages_s: tuple[Span, ...] = ()
+    """Times without attitudes, from `low` to `high` seconds after the first frame."""
+    doppler_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Measurements of each beam of a Doppler lidar per second; 0 for no Doppler lidar."""
+    doppler_beams: Annotated[int, Field(ge=1, le=16)] = 3
+    """Number of beams of the Doppler lidar."""
+    doppler_beam_angle_deg: Annotated[float, Field(ge=0, le=60)] = 22.5
+    """Angle between each beam and -Z_B, degrees."""
+    doppler_speed_sigma_mps: Deviation = 0.02
+    """Standard deviation of a speed along a beam, metres per second."""
+    doppler_range_sigma_m: Deviation = 2.0
+    """Standard deviation of a range along a beam, metres."""
+
+    @property
+    def largest_rate_hz(self) -> float:
+        """Largest number of measurements of one instrument per second."""
+        inertial_hz = self.inertial_rate_hz if self.inertial_grades else 0.0
+        beams_hz = self.doppler_rate_hz * self.doppler_beams
+        return max(inertial_hz, self.range_rate_hz, self.star_tracker_rate_hz, beams_hz)
 
 
 class SunConfig(Section):
@@ -145,14 +172,11 @@ class KindConfig(Section):
         if frames > MAX_FRAMES:
             product = f"n_scenes x trajectories_per_scene x n_frames, which is {frames}"
             raise ValueError(f"{product}, at most {MAX_FRAMES}: lower one of them")
-        rate_hz = max(
-            self.instruments.inertial_rate_hz if self.instruments.inertial_grades else 0, self.instruments.range_rate_hz
-        )
-        measurements = rate_hz * self.flight.duration_s
+        measurements = self.instruments.largest_rate_hz * self.flight.duration_s
         if measurements > MAX_MEASUREMENTS:
             raise ValueError(
                 f"rate x flight.duration_s, which is {measurements:.3g} measurements of one instrument, at most "
-                f"{MAX_MEASUREMENTS}: lower instruments.inertial_rate_hz, range_rate_hz or flight.duration_s"
+                f"{MAX_MEASUREMENTS}: lower the rates of instruments, or flight.duration_s"
             )
         return self
 

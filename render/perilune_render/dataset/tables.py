@@ -5,7 +5,14 @@ import pyarrow as pa
 from numpy.typing import ArrayLike
 
 from perilune_render.config.dataset import DatasetConfig, InstrumentsConfig
-from perilune_render.flight.instruments import measure_ranges, measure_ranges_of_frames, measured, true_increments
+from perilune_render.flight.instruments import (
+    measure_attitudes,
+    measure_beams,
+    measure_ranges,
+    measure_ranges_of_frames,
+    measured,
+    true_increments,
+)
 from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
 from perilune_render.labels.frame_labels import Labels
 from perilune_render.terrain.craters.population import ORIGINS
@@ -14,7 +21,7 @@ from perilune_shared.content import content_sha256
 from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY, TABLES, complete
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array, selenographic_from_site
+from perilune_shared.geometry.frames import Array, quaternion_from_matrix, selenographic_from_site
 
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _FILES = tuple(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256", "bytes"))
@@ -159,9 +166,9 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
 def measurement_tables(
     trajectory: TrajectoryPlan, scene: Scene, config: InstrumentsConfig, *, at_frames: bool
 ) -> dict[str, pa.Table]:
-    """Rows of the tables `inertial` and `ranges` of one trajectory; a table without rows is left out.
+    """Rows of the tables of measurements of one trajectory; a table without rows is left out.
 
-    Inertial measurements need the motion between frames. If this motion is unknown, ranges are measured only with
+    Measurements need the motion between frames. If this motion is unknown, only ranges are measured, only with
     `at_frames`, and only at the time of each frame.
     """
     motion = trajectory.flight.motion
@@ -186,6 +193,23 @@ def measurement_tables(
             ranges = measure_ranges_of_frames(trajectory.flight, trajectory.frame_index, scene, config, seed)
         columns = {"time_s": ranges.time_s, "range_m": pa.array(ranges.range_m, from_pandas=True)}
         parts["ranges"] = table("ranges", len(ranges.time_s), columns)
+    if config.star_tracker_rate_hz and motion is not None:
+        attitudes = measure_attitudes(motion, config, seed)
+        quaternions = np.array([quaternion_from_matrix(each) for each in attitudes.rotation_body_from_site])
+        columns = {"time_s": attitudes.time_s, "rotation_wxyz": _vectors(quaternions.reshape(-1, 4))}
+        if len(attitudes.time_s):
+            parts["star_tracker"] = table("star_tracker", len(attitudes.time_s), columns)
+    if config.doppler_rate_hz and motion is not None:
+        beams = measure_beams(motion, scene, config, seed)
+        n_times, n_beams = len(beams.time_s), len(beams.direction_in_body)
+        columns = {
+            "beam": np.repeat(np.arange(n_beams), n_times),
+            "time_s": np.tile(beams.time_s, n_beams),
+            "beam_in_body": _vectors(np.repeat(beams.direction_in_body, n_times, axis=0)),
+            "speed_mps": pa.array(beams.speed_mps.ravel(), from_pandas=True),
+            "range_m": pa.array(beams.range_m.ravel(), from_pandas=True),
+        }
+        parts["doppler_lidar"] = table("doppler_lidar", n_times * n_beams, columns)
     return parts
 
 

@@ -18,6 +18,11 @@ DEFAULT_ENGINE = "cycles"
 """Engine that recipes do not record, so that recipes of older versions stay equal."""
 _SINCE = ("blur_poses", "row_time_s")
 """Sensor settings that are recorded only if they differ from the defaults, so that older recipes stay equal."""
+_SENSORS = {
+    "star_tracker_rate_hz": ("star_tracker_sigma_arcsec", "star_tracker_outages_s"),
+    "doppler_rate_hz": ("doppler_beams", "doppler_beam_angle_deg", "doppler_speed_sigma_mps", "doppler_range_sigma_m"),
+}
+"""Settings of instruments that are recorded only if the instrument's rate, the key, is not 0."""
 _OPTIONAL = ("cameras", "hazard", "flash_lidar", "scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
@@ -74,6 +79,11 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             del plain["sensor"][name]
     if config.scene is not None and not config.scene.horizon:
         del plain["scene"]["horizon"]
+    for each in (kind, _OTHER[kind]):
+        for rate, names in _SENSORS.items():
+            if not plain[each]["instruments"][rate]:
+                for name in (rate, *names):
+                    del plain[each]["instruments"][name]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
     return plain

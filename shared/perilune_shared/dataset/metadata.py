@@ -11,8 +11,6 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     Field,
     SerializerFunctionWrapHandler,
     model_serializer,

@@ -266,7 +266,9 @@ TABLES: dict[str, pa.Schema] = {
             "measured speed over ground along the beam, positive towards the ground; null without a return",
             nullable=True,
         ),
-        _column("range_m", _REAL, "m", "measured distance to ground along the beam; null without a return", nullable=True),
+        _column(
+            "range_m", _REAL, "m", "measured distance to ground along the beam; null without a return", nullable=True
+        ),
     ),
 }
 OPTIONAL_TABLES = ("inertial", "ranges", "star_tracker", "doppler_lidar")

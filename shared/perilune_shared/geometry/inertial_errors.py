@@ -30,6 +30,17 @@ def drawn_errors(errors: InertialErrors, interval_s: Array, rng: np.random.Gener
     return gyro, accelerometer
 
 
+def drawn_axes(errors: InertialErrors, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Draw the matrices (3, 3) from true to measured angular rates and specific forces, O_B.
+
+    The diagonals hold the scale factors, and the other elements the misalignments.
+    """
+    scale, turn = errors.scale_ppm * 1e-6, np.radians(errors.misalignment_arcsec / 3600)
+    sigmas = np.where(np.eye(3, dtype=bool), scale, turn)
+    gyro, accelerometer = np.eye(3) + sigmas * rng.normal(size=(2, 3, 3))
+    return gyro, accelerometer
+
+
 def _drawn(rng: np.random.Generator, interval_s: Array, bias: float, walk: float, noise: float) -> Array:
     """Draw errors (N, 3) from the standard deviations of the bias, its random walk and the white noise.
 

@@ -1,7 +1,7 @@
 """Errors of inertial measurement units by grade, to simulate the table `inertial` and for filters.
 
-Each axis has white noise and a bias that starts at a random value and follows a random walk. Scale factors,
-misalignment and quantisation are not simulated.
+Each axis has white noise, and a bias that starts at a random value and follows a random walk. A grade may also have
+scale factors and misaligned axes. Quantisation is not simulated.
 """
 
 from dataclasses import dataclass
@@ -44,4 +44,6 @@ GRADES: dict[InertialGrade, InertialErrors] = {
 
 Biases and noise are within the ranges for tactical and aviation grade in Groves (Principles of GNSS, Inertial, and
 Multisensor Integrated Navigation Systems, 2nd edition, 2013, section 4.4). The random walks are our own choice: in one
-minute a bias changes by about an eighth of its size."""
+minute a bias changes by about an eighth of its size. The errors of `cubesat` are our own choice for small
+micromechanical units: about three times as large as those of `tactical`, with scale factors and misalignments that
+such units have after calibration at the factory."""

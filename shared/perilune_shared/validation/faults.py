@@ -55,7 +55,16 @@ _POSITIVE = (
     "interval_s",
     "range_m",
 )
-_NOT_NEGATIVE = ("crater_id", "beam", "boulder_id", "shape_id", "frame_index", "seed", "time_s", "n_craters_above_max_radius")
+_NOT_NEGATIVE = (
+    "crater_id",
+    "boulder_id",
+    "beam",
+    "shape_id",
+    "frame_index",
+    "seed",
+    "time_s",
+    "n_craters_above_max_radius",
+)
 _RANGES = {
     "latitude_deg": (-90, 90),
     "longitude_deg": (-180, 180),

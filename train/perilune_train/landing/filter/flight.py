@@ -4,9 +4,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_train.landing.craters.locate import Located
 from perilune_train.landing.craters.sightings import Sightings
@@ -61,18 +62,25 @@ class Instruments:
 
     @classmethod
     def of_trajectory(cls, dataset: Dataset, ids: tuple[str, str], grade: InertialGrade) -> "Instruments":
-        """Read the tables `inertial` and `ranges` of a trajectory, given by scene_id and trajectory_id."""
+        """Read inertial measurements of a grade, and ranges, of a trajectory, given by scene_id and trajectory_id."""
         columns = ["grade", "time_s", "interval_s", "angular_rate_radps", "specific_force_mps2"]
         rows = dataset.table("inertial", columns, *ids).to_pandas()
         rows = rows[rows["grade"] == grade].sort_values("time_s")
         ranges = dataset.table("ranges", ["time_s", "range_m"], *ids).to_pandas().sort_values("time_s")
-        rate, force = (
-            np.array(rows[name].to_list(), np.float64).reshape(-1, 3)
-            for name in ("angular_rate_radps", "specific_force_mps2")
-        )
+        rate, force = (_vectors(rows[name], 3) for name in ("angular_rate_radps", "specific_force_mps2"))
         time_s, interval_s = (rows[name].to_numpy(np.float64) for name in ("time_s", "interval_s"))
         inertial = Increments(time_s, interval_s, rate, force)
         return cls(inertial, ranges["time_s"].to_numpy(np.float64), ranges["range_m"].to_numpy(np.float64))
+
+    def with_star_tracker(self, dataset: Dataset, ids: tuple[str, str], sigmas_rad: Array) -> "Instruments":
+        """Add the star tracker of a trajectory; `sigmas_rad` (3,) are its standard deviations about the body's axes."""
+        rows = dataset.table("star_tracker", ["time_s", "rotation_wxyz"], *ids).to_pandas().sort_values("time_s")
+        attitudes = matrix_from_quaternion(_vectors(rows["rotation_wxyz"], 4))
+        return replace(self, star_tracker=StarTracker(rows["time_s"].to_numpy(np.float64), attitudes, sigmas_rad))
+
+
+def _vectors(column: pd.Series, length: int) -> Array:
+    return np.array(column.to_list(), np.float64).reshape(-1, length)
 
 
 def together(flights: Sequence[Instruments]) -> Instruments:

@@ -22,6 +22,7 @@ from perilune_train.landing.craters.catalogue import (
 )
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.fly.tables import (
+    BEAM_DIRECTION,
     CRATER_COLUMNS,
     FORCES,
     FRAME_COLUMNS,
@@ -30,6 +31,7 @@ from perilune_train.landing.fly.tables import (
     NORMAL_COLUMNS,
     RANGE_COLUMNS,
     RATES,
+    STAR_TRACKER_COLUMNS,
 )
 from perilune_train.landing.fly.truth import TRUTH_COLUMNS
 
@@ -77,9 +79,12 @@ def unpack_descent(
         write_csv(pd.DataFrame(measured), folder / "imu.csv")
         ranges = dataset.table("ranges", list(RANGE_COLUMNS), *ids).to_pandas().sort_values("time_s")
         write_csv(ranges, folder / "ranges.csv")
+        _write_sensors(dataset, ids, folder)
         sun_elevation_deg = dataset.table("scenes", ["sun_elevation_deg"], ids[0])["sun_elevation_deg"][0].as_py()
         prior = _prior(frames, np.array(dataset.info.camera.rotation_camera_from_body), grade, catalogue, offset, rng)
         prior["sun_elevation_deg"] = sun_elevation_deg
+        # The frames of a dataset have exact mounting and times.
+        prior |= {"camera_mounting_sigma_deg": 0.0, "camera_time_sigma_s": 0.0}
         (folder / "prior.yaml").write_text(to_yaml_text(prior), encoding="utf-8")
         poses = np.column_stack([frames[name].to_pylist() for name in ("time_s", "position_m", "rotation_wxyz")])
         write_csv(pd.DataFrame(poses, columns=list(TRUTH_COLUMNS)), folder / "truth.csv")
@@ -99,6 +104,19 @@ def _write_frames(dataset: Dataset, frames: pa.Table, out: Path) -> None:
         (folder / names[frame_id]).write_bytes(png)
     rows = {FRAME_COLUMNS[0]: list(names.values()), FRAME_COLUMNS[1]: frames["time_s"].to_pylist()}
     write_csv(pd.DataFrame(rows), folder / FRAMES_FILE)
+
+
+def _write_sensors(dataset: Dataset, ids: tuple[str, str], out: Path) -> None:
+    """Write star_tracker.csv and doppler_lidar.csv if the trajectory has such measurements."""
+    stars = dataset.table("star_tracker", None, *ids).to_pandas().sort_values("time_s")
+    if len(stars):
+        columns = _columns(STAR_TRACKER_COLUMNS[1:], stars["rotation_wxyz"])
+        write_csv(pd.DataFrame({"time_s": stars["time_s"], **columns}), out / "star_tracker.csv")
+    lidar = dataset.table("doppler_lidar", None, *ids).to_pandas().sort_values(["time_s", "beam"])
+    if len(lidar):
+        columns = {"time_s": lidar["time_s"], **_columns(BEAM_DIRECTION, lidar["beam_in_body"])}
+        measured = {name: lidar[name] for name in ("speed_mps", "range_m")}
+        write_csv(pd.DataFrame(columns | measured), out / "doppler_lidar.csv")
 
 
 def _write_catalogue(path: Path, catalogue: Catalogue) -> None:
