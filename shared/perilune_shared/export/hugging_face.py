@@ -1,4 +1,4 @@
-"""Export to Hugging Face: Parquet files of each split, with image, pose and labels of a frame in each row.
+"""Export to Hugging Face: Parquet files of each split; a row has a frame's image, pose and labels.
 
 The tables of a dataset mix frames of all splits and keep labels separate from frames. The library `datasets` would read
 all tables as training data. From this export, `datasets.load_dataset(folder)` loads all splits and

@@ -1,7 +1,8 @@
 """Export trajectories to the formats of TUM and KITTI, one file per trajectory.
 
-evo and the tools of both benchmarks read these files. Poses are camera poses: the position of the centre of projection, and the rotation from O_C (x right, y down, z along
-the viewing direction) to the reference frame, e.g. rotation_site_from_camera for O_L.
+evo and the tools of both benchmarks read these files. A pose is the pose of the camera: the position of the centre of
+projection, and the rotation from O_C (x right, y down, z along the viewing direction) to the reference frame. For the
+reference frame O_L, this is rotation_site_from_camera.
 
 - TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): `timestamp tx ty tz qx qy qz qw`, reference O_L.
 - KITTI (https://www.cvlibs.net/datasets/kitti/eval_odometry.php): the upper 3x4 of the pose matrix, row by row; the
