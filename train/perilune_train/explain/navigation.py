@@ -114,7 +114,10 @@ def _targets(pairs: Pairs) -> PairTargets:
 
 
 def strongest_gate(masks: Masks, validation: Pairs) -> str:
-    """The gate up to stride 8 with the largest mean PCC4 on validation pairs; the first gate if PCC4 is undefined."""
+    """The gate up to stride 8 with the largest mean PCC4 on validation pairs.
+
+    The first gate if no gate has a defined PCC4.
+    """
     values = pair_values(masks, _targets(validation))
     rows = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
     means = rows.groupby("map", sort=False)["value"].mean()

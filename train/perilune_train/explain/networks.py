@@ -30,12 +30,15 @@ from perilune_train.training.runs import choose_device, load_weights
 
 
 def folder_of(checkpoint: Path) -> Path:
-    """The folder that has the config.yaml of a checkpoint: the run folder, or the folder of an installed network."""
+    """The folder with a checkpoint's config.yaml: of the run, or of the installed network."""
     return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
 
 
 def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainConfig) -> Detector:
-    """Load a detector on the device of `settings`, at scale 1 only, because an attention mask belongs to one scale."""
+    """Load a detector on the device of `settings`, at scale 1 only.
+
+    Other scales of its configuration are ignored, because an attention mask belongs to one scale.
+    """
     evaluation = config.evaluation.model_copy(update={"scales": (1.0,)})
     return open_detector(checkpoint, config.model_copy(update={"evaluation": evaluation, "device": settings.device}))
 
@@ -43,10 +46,11 @@ def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainC
 def terrain_marks(
     networks: Mapping[str, tuple[Path, Address]], allow_overlap: bool, split: str = "test"
 ) -> tuple[dict[str, str], Metrics]:
-    """Check each network's training terrain; returns a mark for its output by network, and entries of metrics.json.
+    """Check the terrain that each network was fitted to; returns marks by network, and entries of metrics.json.
 
-    `networks` has the checkpoint and the dataset by name. A mark is empty if the network has not seen the terrain of
-    `split`. Raises UserError if a network was fitted to this terrain (unless `allow_overlap`).
+    `networks` has the checkpoint and the dataset by name. A mark is a text for all output of the network; it is empty
+    if the network's terrain is disjoint from the terrain of `split`, or shared by protocol. Raises UserError if a
+    network was fitted to the terrain of `split` (unless `allow_overlap`).
     """
     marks: dict[str, str] = {}
     metrics: Metrics = {}

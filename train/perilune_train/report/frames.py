@@ -149,9 +149,10 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
 
 
 def read_masks(path: Path) -> dict[str, NDArray[Any]]:
-    """Read masks_detect.npz: frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) per block.
+    """Read a file of masks, as written by `explain.maps.masks.save_masks`: all arrays by name.
 
-    Raises UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
+    The arrays are frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) for each block. Raises
+    UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -177,9 +177,9 @@ def picture_of(path: Path, description: str) -> Markup:
 
 
 def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
-    """Split a picture (height, width, 3) on white paper into two layers (height, width, 4): content, and black ink.
+    """Split a picture (height, width, 3) into two layers (height, width, 4): content, and black ink.
 
-    Drawn together over white, the layers give the picture. Returns None if there is no paper.
+    Drawn together over white, the layers give the picture. Returns None if the picture has no white paper.
     """
     paper = _paper(colours)
     if paper is None:
@@ -199,10 +199,10 @@ def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np
 
 
 def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """Mask (height, width) of the white paper of a picture (height, width, 3), including thin lines and letters on it.
+    """Pixels (height, width) of a picture (height, width, 3) that are white paper, or thin lines and letters on it.
 
-    Photographs and filled shapes are not part of the mask. Paper starts at each large white area and continues beyond
-    lines. Returns None if there is no large white area.
+    Photographs and filled shapes are not paper. Paper starts at each large white area and continues beyond lines.
+    Returns None if there is no large white area.
     """
     _, parts, facts, _ = cv2.connectedComponentsWithStats((colours.min(axis=2) >= _WHITE).astype(np.uint8))
     area = facts[:, cv2.CC_STAT_AREA]

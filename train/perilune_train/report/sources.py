@@ -144,7 +144,7 @@ def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Prove
 
 
 def provenance_of_dataset(dataset: Dataset) -> Provenance:
-    """Provenance of a dataset: the hash of dataset.json, and the random seeds, versions and settings of its recipes.
+    """Provenance of a dataset: the hash of dataset.json, and seeds, versions and settings of its recipes.
 
     A dataset records no command, commit or date, so that rendering it again gives equal bytes. The versions include
     hashes of the renderer's code.

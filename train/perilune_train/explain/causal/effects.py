@@ -172,7 +172,7 @@ def _facts(pairs: CraterPairs) -> pd.DataFrame:
 def pose_effects(
     navigator: StackNavigator, architecture: dict[str, Any], factual: Dataset, counterfactual: Dataset, split: str
 ) -> pd.DataFrame:
-    """The navigator's position error for each pair of consecutive frames, before and after the removal of craters.
+    """The navigator's position error in each pair of frames, before and after the removal of craters.
 
     Columns: frame_id (scene/trajectory/step), scene_id, before, after (position errors, metres), moved_m (distance
     between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory, because its

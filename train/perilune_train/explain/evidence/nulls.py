@@ -1,4 +1,4 @@
-"""Null maps: maps without a trained network's attention to the frame. Their correlations are compared with the gates.
+"""Null maps: maps without a trained network's attention to the frame, for comparison with gates.
 
 A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if it applies to the gates of stage k, and
 "<null>/<gate>" if it applies to one gate.

@@ -1,4 +1,7 @@
-"""Compare masks before and after weights are randomised, a sanity check (Adebayo et al. 2018, arXiv 1810.03292)."""
+"""Compare masks before and after weights are randomised.
+
+This is the sanity check of Adebayo et al. 2018, arXiv 1810.03292.
+"""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence

@@ -79,10 +79,11 @@ def grad_cam(target: DetectorTarget, frames: NDArray[np.float32], stage: int | N
 def integrated_gradients(
     target: DetectorTarget, frames: NDArray[np.float32], n_steps: int = 16, signed: bool = False
 ) -> NDArray[np.float32]:
-    """Absolute integrated gradients (N, height, width) of normalised frames; the path is from mean grey to the frame.
+    """Absolute integrated gradients (N, height, width) of normalised frames.
 
-    Sundararajan et al. 2017, arXiv 1703.01365, by Gauss-Legendre quadrature with `n_steps` points. With `signed` the
-    sign is kept, and the sum over pixels is the change of the target from mean grey to the frame.
+    Sundararajan et al. 2017, arXiv 1703.01365, by Gauss-Legendre quadrature with `n_steps` points on the path from mean
+    grey to the frame. With `signed` the sign is kept, and the sum over pixels is the change of the target along this
+    path.
     """
     method = IntegratedGradients(target)
 

@@ -17,7 +17,7 @@ _WHITE = (255, 255, 255)
 
 
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Sequence[float]) -> None:
-    """Draw a PNG sheet of images (N, height, width), each followed by its masks, with one colour bar at the bottom.
+    """Draw a PNG sheet of images (N, height, width), each followed by its masks, and one colour bar.
 
     `height_m` is the height of each image's camera, metres; it is written below the image. All masks share one colour
     scale, from the smallest to the largest value. The range of each mask, or "constant", is written below the mask.

@@ -105,9 +105,10 @@ def width_ratio(detected: Detected) -> WidthRatio | None:
 
 
 def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
-    """Draw the frames with the smallest and the largest craters: ground truth red, detections cyan, as in the paper.
+    """Draw the labels and detections of the frames with the smallest and the largest craters.
 
-    Frames with less than a quarter of the largest number of labels are not considered.
+    Ground truth is red and detections are cyan, as in the paper. Frames with less than a quarter of the largest number
+    of labels are not considered.
     """
     split = next(iter(by_network.values())).split
     counts = np.array([int(labels.selected.sum()) for labels in split.labels])
