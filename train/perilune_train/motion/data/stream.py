@@ -50,7 +50,7 @@ class Stream:
 
     @property
     def uses(self) -> frozenset[TerrainUse]:
-        """The terrain that was rendered so far, including before the run was resumed."""
+        """The terrain that was rendered so far; in a resumed run also the terrain from before the interruption."""
         with self._lock:
             return frozenset(self._uses.values())
 
@@ -71,10 +71,10 @@ class Stream:
     def rendered(
         self, client: SceneClient, scene: int, following: int | None, part: Trajectory, velocity: Array, index: int
     ) -> Trajectory:
-        """Return the n poses of `part` with images of a scene.
+        """Return the n poses of `part` with rendered images of a scene.
 
-        `velocity` (n, 3) sets the motion blur of the images, `index` their noise. Meanwhile the server generates the
-        `following` scene. Raises UserError if the server fails or the terrain is held out.
+        `velocity` (n, 3) sets the motion blur of the images, and `index` sets their noise. Meanwhile the server
+        generates the scene `following`. Raises UserError if the server fails or the terrain is held out.
         """
         self._record(client, scene)
         if following is not None:
