@@ -64,8 +64,8 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
     last.ckpt. finished: leave the run unchanged and print a message.
 
     Raises UserError if the existing run has other settings or inputs, or if the folder is not a run of this task. Also
-    raises it if the first process resumes but this process has no last.ckpt, because several machines train without a
-    shared folder.
+    raises it if the first process resumes and this process finds no last.ckpt; this happens if several machines train
+    without a shared folder.
     """
     if is_first_process():
         state = _decide(run, task, config, inputs, overwrite)

@@ -218,7 +218,7 @@ class Bar(Callback):
 
 
 def process_layout(devices: int, num_nodes: int) -> tuple[int, int]:
-    """Processes per machine and number of machines: from torchrun's environment, else from the arguments."""
+    """Processes per machine and number of machines: under torchrun from its environment, else the arguments."""
     if torch.distributed.is_torchelastic_launched():
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return local, int(os.environ["WORLD_SIZE"]) // local
@@ -232,7 +232,7 @@ def own_share(devices: int, num_nodes: int) -> Share:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Number of epochs, size of a step, and when to validate and save."""
+    """How long to train, how to make a step, and when to validate and save."""
 
     epochs: int
     """Number of epochs."""
@@ -293,9 +293,9 @@ def fit(
     several processes, each loader provides the batches of its own process. The task logs `schedule.monitor` in
     validation, and has `architecture` and `evaluated` (see KeepBest).
 
-    With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
+    With `resume`, training continues from last.ckpt, if the run has this file, and gives exactly the result of an
     uninterrupted run. The state is saved after every validation. With `schedule.checkpoint_minutes` it is also saved
-    within epochs; the task's training batches must then continue at the position of the checkpoint.
+    within epochs; the task's loader must then continue at the position of the checkpoint.
 
     Raises UserError if last.ckpt is damaged or belongs to another network or number of processes, if Lightning gives
     this process a rank other than the one in the environment, or if the loss diverges.

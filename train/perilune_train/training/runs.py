@@ -115,10 +115,10 @@ def save_weights(
 
 
 def load_weights(path: Path) -> dict[str, Any]:
-    """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` or `write_half` wrote.
+    """Read a file that `save_weights` or `write_half` wrote: `{"architecture": settings, "state_dict": tensors}`.
 
     The tensors are on the CPU, and finite. The architecture is a dictionary of plain values; the loader of each kind of
-    network checks them.
+    network checks them. The key `terrain` (provenance.py) may be present.
 
     Raises UserError if the file is missing, is damaged or has other content.
     """
