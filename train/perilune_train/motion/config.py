@@ -142,5 +142,5 @@ class NavigateConfig(Section):
         for name in ("target", "pool", "stages", "dropout", "views", "view_spread", "backbone_factor"):
             default = FusionConfig.model_fields[name].default
             if getattr(self.warp, name) != default:
-                raise ValueError(f"warp.{name}={default}, since only stack has another")
+                raise ValueError(f"warp.{name}={default}, since only stack has this setting")
         return self

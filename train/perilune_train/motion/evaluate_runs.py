@@ -92,8 +92,8 @@ def _check_area(path: Path, known: Provenance, dataset: Dataset, split: str) -> 
     """Raise UserError unless a split is over the landing area that a pose network was trained on."""
     trained = {use.sha256 for use in known.uses if use.use == "trained"}
     if trained and not {use.sha256 for use in split_terrain(dataset, split, "tested")} <= trained:
-        expected = f"the landing area that {path} was trained on; it estimates poses there only"
-        raise UserError(dataset.store, "terrain", "another one", expected)
+        expected = f"the landing area that {path} was trained on; it estimates poses only there"
+        raise UserError(dataset.store, "terrain", "other terrain", expected)
 
 
 def _evaluate_pose(
@@ -192,7 +192,9 @@ def _cells(metrics: Metrics, prefix: str) -> list[str]:
 def _read_errors(path: Path) -> pd.DataFrame:
     """Read the table of pairs. Raises UserError if the file is missing or lacks columns."""
     if not path.is_file():
-        raise UserError(path, "errors", "no such file", "one that `perilune-train navigate train` or `evaluate` writes")
+        raise UserError(
+            path, "errors", "no such file", "a file that `perilune-train navigate train` or `evaluate` wrote"
+        )
     try:
         return pd.read_parquet(path, columns=["method", *_DRAWN])
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:

@@ -106,7 +106,7 @@ class KeepBest(Callback):
 
 
 class KeepLast(Callback):
-    """Save the whole state after every validated epoch and, if `minutes` is set, every `minutes` within an epoch.
+    """Save the whole state after every validated epoch and, if `minutes` is given, after every `minutes` of an epoch.
 
     If a run resumes within an epoch, Lightning skips the task's `on_train_epoch_start`; this callback calls it.
     """
@@ -132,8 +132,8 @@ class KeepLast(Callback):
             pl_module.on_train_epoch_start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # After the last batch, validation and the checkpoint of the epoch follow. Between the batches of one step, do
-        # not save: the state would lack the gradients summed so far.
+        # Do not save after the last batch: the validation and the checkpoint of the epoch follow. Do not save between
+        # the batches of one step: the state would lack the gradients summed so far.
         between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
         if self.minutes is None or trainer.is_last_batch or between:
             return
@@ -149,8 +149,8 @@ class KeepLast(Callback):
             self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        # Loaders raise DataLost between two batches, when the state is complete. With several processes, do not save:
-        # the others may still train. Before the first batch of an epoch, do not save: last.ckpt already has this state.
+        # Loaders raise DataLost between two batches, when the state is complete. With several processes, do not save,
+        # because the others may still train. Before the first batch of an epoch, last.ckpt already has the state.
         done = trainer.fit_loop.epoch_loop.batch_progress.current
         between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
         if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
@@ -189,7 +189,7 @@ class FewerThreadsIfCrowded(Callback):
 
 
 class Bar(Callback):
-    """Progress bar: steps done, total steps, rate, time left, loss."""
+    """Progress bar with steps done, total steps, rate, time left and loss."""
 
     def __init__(self, label: str):
         self.label = label
@@ -226,7 +226,7 @@ def process_layout(devices: int, num_nodes: int) -> tuple[int, int]:
 
 
 def own_share(devices: int, num_nodes: int) -> Share:
-    """The share of the data that this process trains on. Also valid before training (see `is_first_process`)."""
+    """The share of the data that this process trains on; also correct before training (see `is_first_process`)."""
     return Share(int(rank_zero_only.rank), math.prod(process_layout(devices, num_nodes)))
 
 

@@ -133,5 +133,5 @@ def _check_camera(address: str, served: Camera, expected_camera: Camera) -> None
         for c, (w, h) in zip((served, expected_camera), sizes, strict=True)
     ]
     if not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
-        expected = f"{expected_camera}, that of the dataset, or one with the same view and another size"
+        expected = f"{expected_camera}, as in the dataset; another image size of the same view is allowed"
         raise UserError(address, "camera", served, expected)
