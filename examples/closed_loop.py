@@ -1,13 +1,13 @@
-"""A landing in closed loop: guidance steers by the navigation filter, which sees images from the server.
+"""A landing in closed loop: guidance uses the estimate of the navigation filter, which uses images.
 
     python examples/closed_loop.py [--out runs/closed-loop] [--seed 0]
 
-The lander starts 1400 m above the site and flies to a gate 150 m above the site in 60 s. Its initial estimate is off by
-60 m on each axis (one standard deviation). Each second it receives an image, finds craters with the installed detector
-and matches them to a catalogue with errors; between the images it integrates its inertial measurements. Guidance is the
-quadratic law of Klumpp (1974, doi 10.1016/0005-1098(74)90019-3) on the filter's estimate. A second flight without
-camera is the control. The program prints the distance by which each flight misses the gate, and draws both paths. The
-attitude is level except for a small sway.
+The lander starts 1400 m above the site and flies to a gate 150 m above the site in 60 s. The attitude is level except
+for a small sway. The initial estimate of the position has an error of 60 m on each axis (one standard deviation). Each
+second, the filter receives an image from the image server, finds craters with the installed detector, and matches them
+to a catalogue with errors. Between the images, it integrates the inertial measurements. Guidance applies the quadratic
+law of Klumpp (1974, doi 10.1016/0005-1098(74)90019-3) to the filter's estimate. A second flight without camera is the
+control. The program prints the distance by which each flight misses the gate, and draws both paths.
 """
 
 import argparse
@@ -50,12 +50,12 @@ START_M, START_MPS = np.array([520.0, -260.0, 1400.0]), np.array([-14.0, 7.0, -2
 GATE_M, GATE_MPS = np.array([0.0, 0.0, 150.0]), np.array([0.0, 0.0, -3.0])
 DURATION_S, STEP_S, FRAME_S = 60.0, 0.02, 1.0
 PRIOR_M, PRIOR_MPS, PRIOR_DEG = 60.0, 0.5, 0.5
-"""Standard deviations of the initial estimate, on each axis."""
+"""Standard deviations of the initial estimate of position, velocity and attitude, on each axis."""
 MAX_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
 DRAWN_S = (0.0, 30.0, 60.0)
 """Times of the frames in the picture."""
 LAST_S = 4.0
-"""Remaining time below which guidance keeps its last command, since the law divides by the remaining time."""
+"""Guidance keeps its last command if less time remains, since the law divides by the remaining time."""
 
 
 @dataclass(frozen=True)
@@ -72,28 +72,31 @@ class DrawnFrame:
 
 @dataclass
 class Flight:
-    """The record of a flight, one entry per frame."""
+    """Record of a flight."""
 
     true_m: list[Array] = field(default_factory=list)
+    """True position at each frame (3,), O_L, metres."""
     estimated_m: list[Array] = field(default_factory=list)
+    """Estimated position at each frame (3,), O_L, metres."""
     matched: list[int] = field(default_factory=list)
+    """Number of matched craters in each frame."""
     drawn: list[DrawnFrame] = field(default_factory=list)
     """Frames for the picture."""
 
     @property
     def miss_m(self) -> float:
-        """Distance from the gate at the end."""
+        """Distance from the gate at the end, metres."""
         return float(np.linalg.norm(self.true_m[-1] - GATE_M))
 
     @property
     def errors_m(self) -> Array:
-        """Length of the error of the estimate at each frame (N,)."""
+        """Distance of the estimated from the true position at each frame (N,), metres."""
         return np.linalg.norm(np.array(self.true_m) - np.array(self.estimated_m), axis=1)
 
 
 @contextmanager
 def server() -> Iterator[str]:
-    """A server of the scene in another process; yields its address."""
+    """Run a server of the scene in another process; yield its address."""
     program = Path(sys.executable).parent / "perilune-render"
     command = [str(program), "serve", "--scene", str(SCENE), "--port", "0", "--native-port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -113,7 +116,10 @@ def server() -> Iterator[str]:
 
 
 def guidance(position_m: Array, velocity_mps: Array, left_s: float) -> Array:
-    """Thrust per mass (3,), O_L, that leads to the gate with its velocity in the time left, limited."""
+    """Return the thrust per mass (3,), O_L, m/s^2, that leads to the gate in `left_s` seconds.
+
+    The lander then has the velocity GATE_MPS, unless the thrust is limited to MAX_THRUST_MPS2.
+    """
     gravity = gravity_mps2(position_m[2])
     to_go = GATE_M - position_m - velocity_mps * left_s
     faster = GATE_MPS - velocity_mps
@@ -122,13 +128,13 @@ def guidance(position_m: Array, velocity_mps: Array, left_s: float) -> Array:
 
 
 def sway(time_s: float) -> Array:
-    """rotation_site_from_body (3, 3): level but for a sway of half a degree."""
+    """Return rotation_site_from_body (3, 3): level, except for a sway of half a degree."""
     angle = np.radians(0.5) * np.array([np.sin(time_s / 4), np.sin(time_s / 5 + 1), 0.3 * np.sin(time_s / 7)])
     return matrix_from_rotation_vector(angle)
 
 
 def lander_of(scene: SceneClient, catalogue: Catalogue, rng: np.random.Generator) -> Lander:
-    """The filter, starting from a wrong estimate."""
+    """Return the filter; its initial estimate has a random error."""
     unit = GRADES["tactical"]
     sigmas = start_sigmas(PRIOR_M, PRIOR_MPS, PRIOR_DEG, unit)
     tilt = matrix_from_rotation_vector(np.radians(PRIOR_DEG) * rng.normal(size=3))
@@ -138,7 +144,7 @@ def lander_of(scene: SceneClient, catalogue: Catalogue, rng: np.random.Generator
 
 
 class CraterCamera:
-    """Camera of the lander: images from the server, craters by the installed detector."""
+    """Camera of the lander, with images from the server and craters from the installed detector."""
 
     def __init__(self, scene: SceneClient):
         run = shipped_run("detect")
@@ -150,7 +156,7 @@ class CraterCamera:
     def look(
         self, position_m: Array, rotation_site_from_body: Array, velocity_mps: Array
     ) -> tuple[Sightings, DrawnFrame]:
-        """Craters in the image at a true pose, and the frame for the picture."""
+        """Return the craters in the image from a true pose, and the frame for the picture."""
         rotation = ROTATION_CAMERA_FROM_BODY @ rotation_site_from_body.T
         frame = self._scene.frame(position_m, quaternion_from_matrix(rotation), velocity_mps=velocity_mps)
         detections = above(detect_image(self._detector, frame.image, self._tiling), self._threshold)
@@ -159,7 +165,10 @@ class CraterCamera:
 
 
 def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: int) -> Flight:
-    """Fly once. Without a camera the filter uses inertial unit and altimeter only."""
+    """Simulate a flight and return its record.
+
+    Without a camera, the filter uses only the inertial unit and the altimeter.
+    """
     rng = np.random.default_rng([seed, 2])
     n_steps = round(DURATION_S / STEP_S)
     gyro, force = drawn_errors(GRADES["tactical"], np.full(n_steps, STEP_S), rng)
@@ -199,7 +208,7 @@ def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: i
 
 
 def draw(path: Path, flown: dict[str, Flight]) -> None:
-    """Draw paths and estimation errors of both flights, and below them frames with the detected craters."""
+    """Draw paths and errors of both flights, and below them frames with the detected craters."""
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     (side, top, error), below = figure.subplots(2, 3)
     for (name, flight), colour in zip(flown.items(), ("tab:blue", "tab:orange"), strict=True):

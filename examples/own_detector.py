@@ -1,4 +1,4 @@
-"""Fly the navigation filter over a descent with another detector.
+"""Run the navigation filter over a descent with your own detector.
 
     perilune-train navigate descent --dataset data/small/nav --trajectory scene-0000/trajectory-0000 --out descent
     python examples/own_detector.py descent
@@ -17,7 +17,7 @@ BLOBS = cv2.SimpleBlobDetector.create()
 
 
 def detect(image: np.ndarray) -> np.ndarray:
-    """Find dark discs in a grey image; returns x, y, width, height, score of each."""
+    """Find dark discs in a grey image; return x, y, width, height and score of each disc (N, 5)."""
     rows = [(*blob.pt, blob.size, blob.size, 0.8) for blob in BLOBS.detect(image)]
     return np.array(rows, np.float64).reshape(-1, 5)
 

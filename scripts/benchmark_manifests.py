@@ -2,9 +2,10 @@
 
     python scripts/benchmark_manifests.py --elevation-models FOLDER --out data_manifests
 
-Nine scenes of highland and nine of mare ground, two scenes with another camera, and one scene on each of two elevation
-models (NPB_1km.tif and NPC_2km.tif of the repository nasa-jpl/lunasynth), for detection and for navigation. All frames
-are test frames. No preset has the same name, so no preset has the same seeds.
+The benchmark has nine scenes of highland and nine of mare ground, two scenes with another camera, and one scene on each
+of two elevation models (NPB_1km.tif and NPC_2km.tif of the repository nasa-jpl/lunasynth), for detection and for
+navigation. All frames are test frames. Seeds depend on the dataset's name, and no preset has these names, so no preset
+renders these scenes.
 """
 
 import subprocess
@@ -24,12 +25,12 @@ from perilune_shared.console.command_line import one_command, run_command_line
 
 REGIONS = ("highland", "mare")
 """Regions, named as their files in configs/."""
-OF_KIND = {
+SETTINGS_OF_KIND = {
     "detect": {"trajectories_per_scene": 2, "n_frames": 20, "flight.attitude_sigma_deg": 1.0},
     "nav": {"trajectories_per_scene": 1, "n_frames": 40},
 }
-"""Settings of each kind; each scene has 40 frames."""
-OF_ALL = {
+"""Settings of each kind of dataset, under which each scene has 40 frames."""
+SETTINGS_OF_ALL = {
     "split_by": "scene",
     "val_share": 0,
     "test_share": 1,
@@ -44,7 +45,7 @@ OTHER_CAMERA = {
 }
 """A narrower field of view with a distorting lens and a noisier sensor."""
 ELEVATION_MODELS = {"npb": "NPB_1km.tif", "npc": "NPC_2km.tif"}
-"""Files by the end of the manifest's name."""
+"""File of each elevation model, by the end of the manifest's name."""
 
 
 def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, object], *options: str) -> None:
@@ -52,7 +53,7 @@ def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, obj
     chosen = {
         "dataset.name": f"benchmark-{part}",
         f"dataset.{kind}.n_scenes": n_scenes,
-        **{f"dataset.{kind}.{key}": value for key, value in (OF_ALL | OF_KIND[kind]).items()},
+        **{f"dataset.{kind}.{key}": value for key, value in (SETTINGS_OF_ALL | SETTINGS_OF_KIND[kind]).items()},
         **settings,
     }
     pairs = [text for key, value in chosen.items() for text in ("--set", f"{key}={value}")]
@@ -66,7 +67,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder of the manifests.")],
 ) -> None:
     """Write ten manifests."""
-    for kind in OF_KIND:
+    for kind in SETTINGS_OF_KIND:
         for region in REGIONS:
             plan(kind, region, 9, out, {}, "--config", f"configs/{region}.yaml")
         plan(kind, "camera", 2, out, OTHER_CAMERA)

@@ -1,7 +1,7 @@
 """All steps of `make demo`: frames, detection, navigation, explanation, report.
 
-Navigation frames are rendered beside the training of the detector; their progress is in <data>/nav.log. Run the same
-command again to resume. Ctrl-C stops both; finished work is kept.
+Navigation frames are rendered while the detector is trained; their progress is in <data>/nav.log. Ctrl-C stops all
+commands and keeps finished work. Run the same command again to resume.
 
     python scripts/demo.py --preset demo --name demo --data data/demo --runs runs --set dataset.seed=7
 """
@@ -46,7 +46,7 @@ SECTIONS: dict[str, tuple[type[Section], str]] = {
 """Sections of a configuration, with the packages of their presets."""
 FIRST_STEP = "render detection frames"
 DRAWS = 10
-"""Flights of the filter over each test descent."""
+"""Number of simulated flights of the filter over each test descent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Demo:
     settings: tuple[str, ...]
     """Options of all commands: preset, configuration file, single settings."""
     render_options: tuple[str, ...] = ()
-    """Options of rendering alone: elevation model and catalogue."""
+    """Further options of the commands that render: elevation model and catalogue."""
 
     def render(self, kind: str, *options: str) -> list[str]:
         """Command that renders a dataset."""
@@ -75,13 +75,13 @@ class Demo:
         return ["perilune-train", *words, *self.settings, *folders]
 
     def rendered(self, kind: str) -> bool:
-        """Whether a dataset is complete; an interrupted one has a dataset.json too."""
+        """Whether a dataset is complete. An interrupted rendering also has a dataset.json."""
         path = self.data / kind / "dataset.json"
         return path.is_file() and json.loads(path.read_text(encoding="utf-8")).get("complete") is True
 
 
 class Processes:
-    """Commands of the demo, each in a separate process group, so that Ctrl-C reaches it once, through this class."""
+    """Commands of the demo. Each is in a separate process group, so that only this class interrupts it after Ctrl-C."""
 
     def __init__(self) -> None:
         self._running: list[subprocess.Popen] = []
@@ -138,7 +138,7 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     log = demo.data / "nav.log"
     beside = None
     if not demo.rendered("nav"):
-        # Half the cores render, the others train.
+        # Half of the cores render, and the other half trains.
         options = ("--workers", str(max(1, usable_cores() // 2)))
         beside = processes.start("render navigation frames in the background", demo.render("nav", *options), log)
     processes.run("train the detector", demo.train("detect", "train", dataset=demo.data / "detect"))
@@ -202,5 +202,5 @@ def main(
 
 
 if __name__ == "__main__":
-    # Wait longer than the commands that it starts do: they print how to resume.
+    # Wait longer at Ctrl-C than the commands that this program starts: they print how to resume.
     run_command_line(one_command(main), ended_after_s=2.5)

@@ -1,6 +1,6 @@
 """Draw docs/pictures/hazard.png: a frame, its scene's hazard map, and its flash lidar image.
 
-scripts/draw_hazard.py data/hazard/nav scene-0000/trajectory-0000/000004
+python scripts/draw_hazard.py data/hazard/nav scene-0000/trajectory-0000/000004
 """
 
 import sys

@@ -9,7 +9,7 @@ if __name__ == "__main__":
     # An import by another module must not change how Ctrl-C works.
     end_at_interrupt()
 
-import perilune_render.provenance.processor  # noqa: F401, I001 - before NumPy
+import perilune_render.provenance.processor  # noqa: F401, I001 - must be imported before NumPy
 import cv2
 
 from perilune_render.cli.main import app

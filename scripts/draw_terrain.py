@@ -1,7 +1,8 @@
 """Draw the pictures of docs/explanation/terrain.md: profiles, altitudes, Sun elevations, regions, an elevation model.
 
-`python scripts/draw_terrain.py docs/pictures/terrain [--dem file.tif]` writes them into that folder.
-Scenes and frames are made by perilune_render.
+    python scripts/draw_terrain.py docs/pictures/terrain [--dem file.tif]
+
+writes them into the folder docs/pictures/terrain.
 """
 
 import argparse
@@ -37,7 +38,7 @@ SEED = 23
 
 
 def draw_profiles(path: Path) -> None:
-    """Draw sections through craters: fresh craters by size and law (top row), one size by age (bottom row)."""
+    """Draw sections through craters: fresh craters by size and profile law (top row), two sizes by age (bottom row)."""
     figure, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True)
     x = np.linspace(-2, 2, 1201)
     for ax, name in zip(axes[0], ("fassett_thomson", "pangu"), strict=True):
@@ -78,7 +79,7 @@ def settings(*changes: str, config_file: Path | None = None) -> DatasetConfig:
 def nadir_frames(
     config: DatasetConfig, scene: Scene, views: list[tuple[float, float]], centre_m: tuple[float, float] = (0.0, 0.0)
 ) -> list[np.ndarray]:
-    """Grey frames from nadir for altitudes (metres) and Sun elevations (degrees)."""
+    """Grey frames looking straight down; `views` are altitudes (metres) with Sun elevations (degrees)."""
     camera = camera_of(config.camera)
     pattern = FixedPattern.draw(config.sensor, camera, SEED)
     frames = []

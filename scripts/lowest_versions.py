@@ -11,8 +11,8 @@ _BOUND = re.compile(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?>=([0-9.]+)")
 def lowest(project: Path) -> dict[str, str]:
     """Name and lowest version of each dependency of a project.
 
-    Raises ValueError if one has no lower bound. Build requirements are left out: torch itself requires a newer
-    setuptools than the build.
+    Raises ValueError if a dependency has no lower bound. Build requirements are left out, because torch itself requires
+    a newer setuptools than the build.
     """
     content = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
     versions = {}
@@ -26,7 +26,7 @@ def lowest(project: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    """Print the lowest version of each dependency; the higher one if the projects differ."""
+    """Print the lowest version of each dependency; if the projects differ, the higher version."""
     bounds: dict[str, str] = {}
     for project in ("shared", "train"):
         for name, version in lowest(_ROOT / project).items():

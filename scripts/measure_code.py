@@ -23,7 +23,7 @@ def modules_in(root: Path) -> dict[str, Path]:
 
 
 def import_depth(modules: dict[str, Path], package: str) -> int:
-    """Number of modules in the longest chain of imports that stays inside `package` (imports at the top of files)."""
+    """Number of modules in the longest chain of imports within `package`, counting imports at the top of files only."""
 
     @cache
     def imports(name: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The card of an installed network, from its metrics and its figures on the locked benchmark."""
+"""Write the card of an installed network from its metrics and its figures on the locked benchmark."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,15 +11,15 @@ class Shipment:
     name: str
     """crater-detector or lander-navigator."""
     content: dict[str, Any]
-    """Checkpoint: architecture and weights."""
+    """Content of the checkpoint: architecture and weights."""
     metrics: dict[str, Any]
     """metrics.json of the run."""
     figures: dict[str, Any]
     """benchmark.json of the run."""
     manifest: str
-    """Shared manifest of the training data."""
+    """Name of the shared manifest of the training data."""
     sha256: str
-    """SHA-256 of its dataset.json."""
+    """SHA-256 of dataset.json of this manifest."""
     size_mb: float
     """Size of the weights, MB."""
     precision: str = "half precision"

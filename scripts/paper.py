@@ -1,11 +1,14 @@
-"""The paper's experiment: render, train, evaluate, explain, and write its page.
-
-Run again to resume (`make paper`).
+"""Run the paper's experiment: render, train, evaluate, explain, and write its page. Run again to resume (`make paper`).
 
     python scripts/paper.py [--preset paper] [--part whole|gpu|full] [--ground pangu|lunar] [--attitude]
 
-Every step is a command that users can run, and is printed before it runs. Finished steps are skipped. Part `gpu`
-renders frames while networks train on finished datasets. With `--minutes`, the page shows the steps finished by then.
+Nearly every step is a command that users can run, and is printed before it runs. Finished steps are skipped. Part `gpu`
+renders frames while networks train on finished datasets. With `--minutes`, the experiment stops after that time, and
+the page shows the finished steps.
+
+A ground is the terrain under the frames of one dataset. The grounds differ in crater density: `equilibrium_share`, a
+share of the equilibrium density. The headline ground is the one on which the experiment is compared with the paper. The
+curve is the AP of YOLOv3 without attention over the crater density.
 """
 
 import itertools
@@ -46,9 +49,10 @@ PROTOCOL = Path("configs/paper_protocol.yaml")
 ATTITUDE_DEG = 1.0
 """Standard deviation of the attitude per axis in the datasets with attitude noise."""
 CALIBRATED_AP = DETECTION["YOLOv3"]["ap50_paper"]
-"""Validation AP of YOLOv3 without attention for which the headline ground is chosen: the paper's AP."""
+"""The paper's AP of YOLOv3 without attention. With --calibrate, the headline ground is chosen so that our validation AP
+equals it."""
 SPARSE, LUNAR = "0.1", "lunar"
-"""The ends of the curve of AP over crater density: a tenth of the equilibrium density, and perilune's usual ground."""
+"""The ends of the curve: a ground with a tenth of the equilibrium density, and perilune's usual ground."""
 RENDER_CORE_S = 0.12
 """Core-seconds to render a frame of 256 px with the engine heightfield, including the generation of the scene."""
 FRAME_BYTES = 75_000
@@ -64,7 +68,7 @@ class Part(StrEnum):
 
 
 class Ground(StrEnum):
-    """The headline ground."""
+    """Kind of the headline ground: as difficult as the paper's, which PANGU rendered, or our usual lunar ground."""
 
     PANGU = "pangu"
     LUNAR = "lunar"
@@ -81,32 +85,33 @@ class Sizes:
     nav_trajectories: int
     """Navigation trajectories."""
     curve: tuple[str, ...]
-    """Crater densities of the grounds between the ends of the curve, shares of the equilibrium density."""
+    """Crater densities of the grounds between the ends of the curve, as shares of the equilibrium density."""
     epochs: int
     """Epochs of each detector on the headline ground and on the curve."""
     long_epochs: int
-    """Epochs on the sparse and on our usual ground. If larger than `epochs`, two more detectors train for so long on
-    the headline ground, to show the effect of epochs."""
+    """Epochs on the sparse ground and on our usual ground. If it is larger than `epochs`, two further detectors also
+    train for this number of epochs on the headline ground, to show the effect of the number of epochs."""
     curve_width: float
     """Width of the detectors on the curve and on the lunar ground."""
     half_width: float
-    """Width of the detectors that are trained with three seeds."""
+    """Width of the narrower detectors, which are trained with several random seeds."""
     seeds: tuple[int, ...]
-    """Seeds of the narrower detectors."""
+    """Random seeds of the narrower detectors."""
     navigator_width: float
-    """Width of the navigators. At half width they start from the narrower detectors of the first seed."""
+    """Width of the navigators. If it is not 1, they start from the narrower detectors of the first seed."""
     more: bool
-    """Whether to also train identity-initialised gates on the sparse ground, and transfer from our own network."""
+    """Whether to run two further trainings: identity-initialised gates on the sparse ground, and transfer from our
+    detector of the usual ground."""
     coarse_epochs: int
     """Coarse epochs of the navigators; an epoch has about 30 steps."""
     fine_epochs: int
-    """Fine epochs of the navigators in the reading of the paper."""
+    """Fine epochs of the navigators that estimate poses, as the paper's navigators do."""
     renderings: int = 1
-    """Number of simultaneous renderings, in addition to the trainings."""
+    """Number of simultaneous renderings, if there are several simultaneous trainings."""
     render_workers: int | None = None
     """Processes of each rendering; None for the command's default."""
     trainings: int = 1
-    """Number of simultaneous trainings, in addition to the rendering; with 1, all steps run one after another."""
+    """Number of simultaneous trainings. With 1, all steps, renderings too, run one after another."""
     benchmark_scenes: int = 0
     """Scenes of each part of the locked benchmark; 0 skips the benchmark."""
     settings: dict[str, str] = field(default_factory=dict)
@@ -213,21 +218,21 @@ class Step:
     """One command of the experiment, or one function of this script."""
 
     title: str
-    """What it does."""
+    """What the step does."""
     command: list[str] | Callable[[], None]
     """Program and arguments, or the function."""
     done: Callable[[], bool]
-    """Whether it is finished already."""
+    """Returns whether the step is finished."""
     needs: tuple[str, ...] = ()
-    """Titles of the steps whose results it reads."""
+    """Titles of the steps whose results this step reads."""
     renders: bool = False
-    """Whether it renders frames; renderings and trainings have separate limits."""
+    """Whether the step renders frames. Simultaneous renderings and trainings have separate limits."""
     images: float = 0.0
-    """Training images of a detector, or frames to render."""
+    """Number of training images over all epochs of a detector, or of frames to render."""
     width: float = 1.0
     """Width of the network that is trained."""
     attention: str = "none"
-    """Its attention."""
+    """Attention of the network that is trained."""
 
 
 @dataclass(frozen=True)
@@ -268,7 +273,7 @@ class Experiment:
 
     @property
     def scored(self) -> Path:
-        """Folder of the rendered part of the benchmark, named as `make benchmark SCENES=2` does."""
+        """Folder of the benchmark's first scenes, with the name that `make benchmark SCENES=2` gives it."""
         return self.benchmark.with_name(f"{self.benchmark.name}-{self.sizes.benchmark_scenes}-scenes")
 
     @property
@@ -329,7 +334,7 @@ def _inline(values: Any) -> str:
 
 
 def steps(experiment: Experiment) -> list[Step]:
-    """All steps, the most important first, since a run with a time limit may not reach the last."""
+    """All steps, the most important first, since a run with a time limit may not reach the last steps."""
     sizes, ground = experiment.sizes, "headline"
     curve = (
         [step for share in sizes.curve for step in _on_curve(experiment, share)]
@@ -418,7 +423,7 @@ def _render(experiment: Experiment, ground: str, kind: str, density: dict[str, s
 
 
 def _detector(experiment: Experiment, ground: str, folder: str, attention: str, width: float, **more: str) -> Step:
-    """Training of a detector on a ground, into detect/<folder>."""
+    """Train a detector on a ground; the run is detect/<folder>."""
     width = 0.125 if experiment.preset == "tiny" else width
     settings = {"detect__attention": attention, "detect__width": str(width)}
     options = experiment.options("detect", **settings, **({"detect__epochs": str(experiment.sizes.epochs)} | more))
@@ -444,7 +449,7 @@ def _detector(experiment: Experiment, ground: str, folder: str, attention: str, 
 
 
 def _on_curve(experiment: Experiment, share: str) -> list[Step]:
-    """Rendering of a ground of the curve, and training of YOLOv3 without attention on it."""
+    """Render a ground of the curve, and train YOLOv3 without attention on it."""
     folder = {SPARSE: "sparse-yolov3", LUNAR: "lunar-yolov3"}.get(share, f"curve-{share}")
     width = 1.0 if share == SPARSE else experiment.sizes.curve_width
     longer = {"detect__epochs": str(experiment.sizes.long_epochs)} if share in (SPARSE, LUNAR) else {}
@@ -472,9 +477,9 @@ def _calibration(experiment: Experiment) -> Step:
 
 
 def share_at(ap_by_share: dict[float, float], ap: float) -> float:
-    """Share of the equilibrium density at which the AP has a given value, from 0.1 to 1.7, rounded to two digits.
+    """Share of the equilibrium density (0.1 to 1.7) at which the AP has the value `ap`, rounded to two digits.
 
-    The AP is interpolated linearly in the logarithm of the share, or extrapolated from the nearest two points.
+    The AP is interpolated linearly over the logarithm of the share, or extrapolated from the nearest two points.
     """
     points = sorted(ap_by_share.items())
     if len(points) == 1:
@@ -498,7 +503,7 @@ def headline_share(experiment: Experiment) -> str:
 
 
 def headline_density(experiment: Experiment) -> dict[str, str]:
-    """Settings of the headline ground that differ from the protocol's."""
+    """Settings of the headline ground that differ from the settings of the protocol."""
     chosen = experiment.ground == Ground.LUNAR or (experiment.calibrate and experiment.chosen.is_file())
     return crater_density(headline_share(experiment)) if chosen else {}
 
@@ -521,7 +526,7 @@ def _explanation(experiment: Experiment) -> Step:
 
 
 def _attitude(experiment: Experiment, navigators: list[tuple[str, str, str]]) -> list[Step]:
-    """Navigators over descents with attitude noise; their backbones were trained without it."""
+    """Train navigators over descents with attitude noise; their backbones were trained without this noise."""
     noise = {"dataset__nav__flight__attitude_sigma_deg": str(ATTITUDE_DEG)}
     needs = ("choose the headline ground",) if experiment.calibrate else ()
     rendered = _render(experiment, "attitude", "nav", headline_density(experiment) | noise, needs)
@@ -529,7 +534,7 @@ def _attitude(experiment: Experiment, navigators: list[tuple[str, str, str]]) ->
 
 
 def _navigator(experiment: Experiment, folder: str, detector: str, attention: str, reading: str) -> Step:
-    """Training of a navigator in one of the readings pose, motion, or attitude (the pose with attitude noise)."""
+    """Train a navigator in one of three readings of the paper: pose, motion, or attitude (pose with attitude noise)."""
     name = folder if reading == "pose" else f"{folder}-{reading}"
     sizes = experiment.sizes
     detector = detector if sizes.navigator_width == 1.0 else f"{detector}-half-{sizes.seeds[0]}"
@@ -563,7 +568,10 @@ def _navigator(experiment: Experiment, folder: str, detector: str, attention: st
 
 
 def _transfer(experiment: Experiment) -> list[Step]:
-    """Detectors that start from YOLOv3 of COCO, or from our detector of the usual ground; at first frozen."""
+    """Train detectors that start from YOLOv3 of COCO or from our detector of the usual ground.
+
+    The initial weights are frozen in the first epochs.
+    """
     width = 1.0 if experiment.darknet is not None else experiment.sizes.curve_width
     if experiment.darknet is None and (experiment.ground == Ground.LUNAR or not experiment.sizes.more):
         return []
@@ -578,7 +586,7 @@ def _transfer(experiment: Experiment) -> list[Step]:
 
 
 def _benchmark_steps(experiment: Experiment) -> list[Step]:
-    """Scores of the detectors on the locked benchmark."""
+    """Render a part of the locked benchmark, and score the detectors on it."""
     if experiment.preset != "paper" or not experiment.sizes.benchmark_scenes:
         return []
     command = ["scripts/render-benchmark", "detect", str(experiment.scored), str(experiment.sizes.benchmark_scenes)]
@@ -661,7 +669,7 @@ def estimate(experiment: Experiment, plan: list[Step]) -> dict[str, float]:
             stack = navigate.stack.model_copy(update={"attention": step.attention, "width": step.width})
             seconds = navigate_seconds(navigate.model_copy(update={"stack": stack}))
             pairs = 0.8 * experiment.sizes.nav_trajectories * experiment.sizes.frames
-            # Features of the coarse stage are computed once, forward only.
+            # The coarse stage only computes features, once, by a forward pass: a third of a training step.
             motion = step.title.endswith("motion")
             fine, views = (1, 0) if motion else (experiment.sizes.fine_epochs, navigate.stack.views)
             seconds_by_step[step.title] = seconds * pairs * (fine + (1 + views) / 3)
@@ -691,10 +699,10 @@ def main(
         Part, typer.Option(help="whole (two cores, 20 core-hours), gpu (minutes), full (all frames of the paper).")
     ] = Part.WHOLE,
     ground: Annotated[
-        Ground, typer.Option(help="Headline ground: as difficult as the paper's, or our usual one.")
+        Ground, typer.Option(help="Headline ground: as difficult as the paper's (pangu), or our usual one (lunar).")
     ] = Ground.PANGU,
     calibrate: Annotated[
-        bool, typer.Option("--calibrate", help="Choose the density of the headline ground again by validation AP.")
+        bool, typer.Option("--calibrate", help="Choose the headline ground's crater density again, by validation AP.")
     ] = False,
     attitude: Annotated[
         bool, typer.Option("--attitude", help="Also train navigators over descents with attitude noise.")
@@ -705,7 +713,7 @@ def main(
         float | None, typer.Option(min=0.1, help="Stop after this time, and write the page from the finished steps.")
     ] = None,
 ) -> None:
-    """Run all steps."""
+    """Run all steps of the paper's experiment; run again to resume."""
     if preset not in ("paper", "tiny"):
         raise UserError("--preset", "", preset, "paper or tiny")
     if darknet is not None:
@@ -730,7 +738,7 @@ def main(
 
 @dataclass
 class Running:
-    """A step that runs."""
+    """A step whose command is running."""
 
     step: Step
     process: subprocess.Popen
@@ -739,7 +747,7 @@ class Running:
 
 
 def run_all(experiment: Experiment, expected: dict[str, float], deadline: float) -> None:
-    """Run the remaining steps one after another or, with several simultaneous trainings, as soon as they can start.
+    """Run the remaining steps: one after another, or simultaneously if the sizes allow several trainings.
 
     Raises typer.Exit with the exit code of the first step that fails, after the others have been stopped. At the
     deadline, running steps are stopped as by Ctrl-C, and the page is written.
@@ -830,7 +838,7 @@ def _wait(running: list[Running], failed: dict[str, int], together: bool, deadli
 
 
 def _end(running: list[Running]) -> None:
-    """Wait for steps that were stopped together with this script; stop them if they were not."""
+    """Wait for steps that Ctrl-C has reached together with this script; stop those that do not end."""
     for each in running:
         try:
             each.process.wait(timeout=5)
@@ -879,5 +887,5 @@ if __name__ == "__main__":
 
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(main)
-    # Wait longer than the commands that it starts do: they print how to resume.
+    # Wait longer at Ctrl-C than the commands that this program starts: they print how to resume.
     run_command_line(app, ended_after_s=2.5)

@@ -3,8 +3,9 @@
     python scripts/paper_files.py pack runs/paper-gpu OUT
     python scripts/paper_files.py unpack OUT runs/paper-gpu
 
-`pack` writes at most eight files of at most 16 MiB: metrics.json of all runs, an archive of the page with its pictures,
-settings, curves and logs, and the weights of one network, rounded to 8 bits, in shards. `unpack` puts them back.
+`pack` writes at most eight files of at most 16 MiB: metrics.json of all runs; an archive of the page with its pictures,
+settings, curves and logs; and the weights of one network, rounded to 8 bits and split into shards. `unpack` restores
+the folder of the runs from these files.
 """
 
 import gzip
@@ -28,11 +29,11 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
 from perilune_train.training.runs import load_weights
 
-LARGEST_BYTES = 16 * 2**20
+MAX_BYTES = 16 * 2**20
 METRICS, PAGE, SHARDS = "metrics.json", "page.tar.gz", "weights-*.safetensors.gz"
 NETWORK = "detect/attention-yolov3"
 """Run whose weights are packed."""
-_KEPT = (
+_PACKED_PATTERNS = (
     "*.md",
     "*.png",
     "*.json",
@@ -47,7 +48,10 @@ app = typer.Typer(pretty_exceptions_enable=False, add_completion=False, no_args_
 
 
 def rounded(tensor: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Weights (out, ...) as 8-bit integers with one scale per output channel; small tensors as they are."""
+    """Round weights (out, ...) to 8-bit integers with one scale per output channel; returns tensors by name ending.
+
+    Vectors and integers stay as they are.
+    """
     if tensor.ndim < 2 or not tensor.is_floating_point():
         return {"": tensor.contiguous()}
     flat = tensor.float().flatten(1)
@@ -57,7 +61,7 @@ def rounded(tensor: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def restored(whole: torch.Tensor, scale: torch.Tensor | None) -> torch.Tensor:
-    """The inverse of `rounded`, up to half a step of each channel."""
+    """Reverse `rounded`. The weights differ from the original ones by at most half the scale of their channel."""
     if scale is None:
         return whole
     return whole.float() * scale.view(-1, *[1] * (whole.ndim - 1))
@@ -68,7 +72,7 @@ def pack(
     runs: Annotated[Path, typer.Argument(help="Folder of the experiment's runs.")],
     out: Annotated[Path, typer.Argument(help="Folder for the files.")],
 ) -> None:
-    """Write the files."""
+    """Pack metrics, page, logs and weights of the runs into a few files."""
     if not runs.is_dir():
         raise UserError(runs, "runs", "no such folder", "the folder of the experiment's runs")
     out.mkdir(parents=True, exist_ok=True)
@@ -78,9 +82,9 @@ def pack(
     write_bytes(out / METRICS, json.dumps(metrics_by_run, indent=1).encode())
     with tarfile.open(out / PAGE, "w:gz") as archive:
         for path in sorted(
-            {path for pattern in _KEPT for path in (*runs.glob(pattern), *runs.glob(f"logs/{pattern}"))}
+            {path for pattern in _PACKED_PATTERNS for path in (*runs.glob(pattern), *runs.glob(f"logs/{pattern}"))}
         ):
-            if path.stat().st_size < LARGEST_BYTES / 8:
+            if path.stat().st_size < MAX_BYTES / 8:
                 archive.add(path, path.relative_to(runs))
     best = runs / NETWORK / "checkpoints" / "best.ckpt"
     if best.is_file():
@@ -96,7 +100,7 @@ def _pack_weights(best: Path, out: Path) -> None:
     for name, tensor in content["state_dict"].items():
         parts = {f"{name}{key}": value for key, value in rounded(tensor).items()}
         n_bytes = sum(value.numel() * value.element_size() for value in parts.values())
-        if size + n_bytes > 0.99 * LARGEST_BYTES:
+        if size + n_bytes > 0.99 * MAX_BYTES:
             shards.append({})
             size = 0
         shards[-1] |= parts
@@ -114,7 +118,7 @@ def unpack(
     files: Annotated[Path, typer.Argument(help="Folder of the files that `pack` wrote.")],
     runs: Annotated[Path, typer.Argument(help="Folder for the runs.")],
 ) -> None:
-    """Put page, metrics and weights where `pack` found them."""
+    """Restore page, metrics and weights in the folder of the runs."""
     if not (files / METRICS).is_file():
         raise UserError(files, METRICS, "no such file", "the folder that `pack` wrote")
     for run, metrics in json.loads((files / METRICS).read_text()).items():

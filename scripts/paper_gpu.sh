@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
-# The paper's experiment on one GPU within minutes: frames are rendered on all cores while networks train on those that
-# are ready. Leaves at most eight files of 16 MiB in OUT.
+# Run the paper's experiment on one GPU within minutes. All cores render frames while networks train on finished
+# datasets. Writes at most eight files of 16 MiB into OUT.
 #
-#   scripts/paper_gpu.sh wheels                fetch into .wheels what a bare machine lacks (Python 3.12, own torch)
-#   MINUTES=8 OUT=out scripts/paper_gpu.sh     run; PRESET=tiny is a trial, on the processor too; CALIBRATE=1 chooses the ground
+#   scripts/paper_gpu.sh wheels                download the packages that a bare machine with Python 3.12 and torch lacks
+#   MINUTES=8 OUT=out scripts/paper_gpu.sh     run the experiment
 #
-# On a machine without packages of this project, the folder .wheels is installed beside, and the code is used in place.
+# PRESET=tiny: a trial run, which also works without a GPU. CALIBRATE=1: choose the density of the headline ground again.
+# If there is no .venv, the packages in .wheels are installed into a temporary folder, and the code of this checkout is
+# used without installing it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 minutes=${MINUTES:-8} out=${OUT:-runs/paper-gpu-files} preset=${PRESET:-paper}
@@ -27,7 +29,7 @@ elif ls .wheels/*.whl >/dev/null 2>&1; then
 fi
 export PYTHONPATH="${site:+$site:}$PWD/shared:$PWD/render:$PWD/train${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
 [ "$preset" = tiny ] && runs=runs/paper-tiny || runs=runs/paper-gpu
-# What is done by then is packed, whatever happened.
+# Pack the finished runs even if the experiment fails.
 "$python" scripts/paper.py --preset "$preset" --part gpu --attitude ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
 "$python" scripts/paper_files.py pack "$runs" "$out"
 exit "${code:-0}"

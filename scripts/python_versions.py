@@ -1,12 +1,11 @@
-"""Write the requirements for a Python version, and check what pip resolved.
+"""Write the requirements for a Python version, and check the packages that pip resolved (for scripts/test-resolves).
 
-Used by scripts/test-resolves.
+    python scripts/python_versions.py write 3.13 FOLDER    # write requirements.txt and constraints.txt
+    python scripts/python_versions.py check 3.13 FOLDER    # check report.json, which pip wrote
 
-    python scripts/python_versions.py write 3.13 FOLDER    # requirements.txt of all packages, constraints.txt of pins
-    python scripts/python_versions.py check 3.13 FOLDER    # report.json of pip
-
-When pip resolves for another Python version, it still compares markers such as `python_version < "3.12"`, and the
-Python that a package requires, with the Python that runs pip. This script therefore checks both.
+When pip resolves for another Python version, it still evaluates markers such as `python_version < "3.12"` and
+`Requires-Python` for the Python that runs pip. `write` therefore evaluates the markers of constraints.txt itself, and
+`check` compares `Requires-Python` of each package with the other version.
 """
 
 import json
@@ -25,11 +24,11 @@ from packaging.specifiers import SpecifierSet
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("shared", "render", "train", "perilune")
 ONLY_ON = {"bpy": "3.11"}
-"""Dependencies of extras that exist for one Python version."""
+"""Dependencies that exist for one Python version only; for other versions their extras are left out."""
 
 
 def requirements_of(version: str) -> list[str]:
-    """Requirements of all packages and extras for a Python version, except on perilune's packages."""
+    """Requirements of all packages and extras for a Python version, without perilune's packages."""
     requirements = set()
     for package in PACKAGES:
         project = tomllib.loads((ROOT / package / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -50,7 +49,7 @@ def constraints_of(version: str) -> list[str]:
 
 
 def write(version: str, folder: Path) -> None:
-    """Write both files."""
+    """Write requirements.txt and constraints.txt into a folder."""
     for name, lines in (("requirements", requirements_of(version)), ("constraints", constraints_of(version))):
         (folder / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 

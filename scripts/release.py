@@ -1,11 +1,11 @@
-"""Change the version, or release it: check, build, try the wheels in a new environment, tag, upload on request.
+"""Change the version, or release it: check, build, try the wheels in a new environment, tag, and upload on request.
 
-    python scripts/release.py version 0.2.0 # write the version into every file that states it
+    python scripts/release.py version 0.2.0 # write the new version into every file that states the version
     make release VERSION=0.1.0              # all but the upload; needs no network
     make release VERSION=0.1.0 UPLOAD=1     # all steps, then upload with twine (TWINE_REPOSITORY chooses the index)
 
-The distributions are built from the commit, so files that are ignored or left over from other builds cannot get into
-them. They are written to dist/VERSION. The tag is vVERSION; a second run on the tagged commit builds again.
+The distributions are built from the commit, so they contain no ignored files and no leftovers of other builds. They are
+written to dist/VERSION. The tag is vVERSION; a second run on the tagged commit builds again.
 """
 
 import os
@@ -90,7 +90,7 @@ def stated_versions(root: Path = ROOT) -> dict[Path, list[str]]:
 
 
 def check_version(version: str) -> None:
-    """Raise UserError unless this is a version such as 0.1.0 or 1.0.0rc1."""
+    """Raise UserError if the text is not a version such as 0.1.0 or 1.0.0rc1."""
     if not VERSION.fullmatch(version):
         raise UserError("VERSION", "version", version, "three numbers, such as 0.1.0, or a candidate, such as 0.1.0rc1")
 
@@ -140,7 +140,7 @@ def check(version: str, root: Path, today: date) -> None:
 
 
 def _check_changelog(version: str, path: Path, today: date) -> None:
-    """The section must exist, have a date that is not in the future, and have text."""
+    """Raise UserError if the version's section is missing, has no text, or has a date in the future."""
     text = path.read_text(encoding="utf-8")
     heading = f"## [{version}] - {today}"
     section = re.search(rf"^## \[{re.escape(version)}\](.*)\n((?:(?!## ).*\n?)*)", text, re.MULTILINE)
@@ -171,7 +171,7 @@ def build(version: str) -> list[Path]:
     """Wheels and source distributions of the current commit, in dist/VERSION, with checked metadata."""
     out = ROOT / "dist" / version
     shutil.rmtree(out, ignore_errors=True)
-    # Wheels of one commit are equal byte for byte.
+    # With the date of the commit, repeated builds of a commit give wheels that are equal byte for byte.
     times = {"SOURCE_DATE_EPOCH": git(ROOT, "log", "-1", "--format=%ct")}
     with tempfile.TemporaryDirectory() as folder:
         archive = subprocess.run(["git", "-C", str(ROOT), "archive", "HEAD"], check=True, capture_output=True).stdout
@@ -189,10 +189,10 @@ def distributions(root: Path) -> list[Path]:
 
 
 def try_installed(version: str, wheels: list[Path]) -> None:
-    """Use the wheels in a new environment.
+    """Install the wheels in a new environment and use them there.
 
-    Only the wheels are installed there. Their dependencies come from the current environment, so no network is
-    needed. scripts/test-wheels also installs the dependencies.
+    The dependencies come from the current environment, so no network is needed. scripts/test-wheels also installs the
+    dependencies.
     """
     packages = [wheel.name.split("-")[0] for wheel in wheels]
     with tempfile.TemporaryDirectory() as folder:
@@ -200,8 +200,8 @@ def try_installed(version: str, wheels: list[Path]) -> None:
         programs = Path(folder) / "bin"
         run(str(programs / "python"), "-m", "pip", "install", "-q", "--no-index", "--no-deps", *map(str, wheels))
         ours, (new,) = Path(typer.__file__).parents[1], Path(folder).glob("lib/python*/site-packages")
-        # A folder named in a .pth file comes after the wheels, and Python ignores the .pth files (editable installs) in
-        # it.
+        # A folder that a .pth file names comes after the wheels on the path. Python ignores the .pth files in that
+        # folder, so the editable installs of this checkout are not found.
         (new / "dependencies.pth").write_text(f"{ours}\n")
         run(str(programs / "python"), "-c", _IMPORTED, version, *packages, cwd=folder)
         for program, argument in _PROGRAMS:
@@ -213,9 +213,9 @@ def try_installed(version: str, wheels: list[Path]) -> None:
 
 
 def run(*command: str, cwd: str | Path = ROOT, **variables: str) -> None:
-    """Run a command of the release.
+    """Run a command without PYTHONPATH, so that it does not import the sources of this checkout.
 
-    The sources of this checkout are not on its path. Raises UserError if it fails.
+    Raises UserError if the command fails.
     """
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"} | variables
     print(f"$ {' '.join(Path(word).name if word == command[0] else word for word in command)[:150]}", flush=True)

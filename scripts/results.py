@@ -3,11 +3,11 @@
     python scripts/results.py record runs/bench/labels.json runs/detect/small/metrics.json
     python scripts/results.py write
 
-`record` keeps the JSON of a run or a benchmark as results/<name>.json, with the commit, hardware and command that the
-run recorded itself, and with hashes of that commit's sources: they stay valid in a shallow clone and after a squash of
-the history, where the commit is missing. `write` (`make results`) puts the tables and sentences of
-results/headline.toml, with their figures from these records, into the pages. tests/test_results.py fails if they do not
-agree.
+`record` stores the JSON of a run or a benchmark as results/<name>.json, with the commit, hardware and command that the
+run recorded itself, and with hashes of the commit's sources. The hashes identify the code even in a shallow clone or
+after a squash of the history, where the commit is missing. `write` (`make results`) writes the tables and sentences of
+results/headline.toml into the pages, with their figures from these records. tests/test_results.py fails if pages and
+records do not agree.
 """
 
 import json
@@ -37,7 +37,7 @@ RESULTS_PAGE, README = ROOT / "docs/results.md", ROOT / "README.md"
 """Pages with generated text between BEGIN and END."""
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 SOURCES = ("shared", "render", "train", "benchmarks", "scripts")
-"""Folders with the code that makes figures."""
+"""Folders with the code that computes the figures."""
 _COMMIT = re.compile(r"[0-9a-f]{7,40}")
 _TREE = re.compile(r"[0-9a-f]{40}")
 _NEEDED = "a file that a run or a benchmark of this version wrote"
@@ -55,8 +55,8 @@ class Record(BaseModel):
     commit: str = Field(pattern=f"^{_COMMIT.pattern}$")
     """Commit of the code that made the figures; for a transcribed record, the commit that added them to the page."""
     sources: dict[str, Annotated[str, Field(pattern=f"^{_TREE.pattern}$")]]
-    """Hash of each folder with code in this commit, as `git rev-parse COMMIT:FOLDER` prints it: it depends on the names
-    and bytes of the files alone, so it also identifies the code in a history that lacks the commit."""
+    """Hash of each folder with code in this commit, as `git rev-parse COMMIT:FOLDER` prints it. The hash depends only
+    on the names and bytes of the files, so it identifies the code even in a history that lacks the commit."""
     date: str = Field(pattern=r"^\d{4}-\d\d-\d\d$")
     """UTC day of the run."""
     hardware: str
@@ -68,7 +68,7 @@ class Record(BaseModel):
     figures: dict[str, Any]
     """What the run wrote, unchanged."""
     quotes: tuple[str, ...] = ()
-    """For a transcribed record, the text of the page with the figures."""
+    """For a transcribed record, the passages of the page that state the figures."""
 
     @field_validator("sources")
     @classmethod
@@ -91,7 +91,8 @@ class Figure(BaseModel):
     record: str
     """Name of the record in results/, without .json."""
     keys: tuple[str, ...] = Field(min_length=1)
-    """The figure in the record, from the outermost key inwards; <key>_low and <key>_high beside it are its interval."""
+    """Keys of the figure in the record, the outermost key first. If the record also has <last key>_low and
+    <last key>_high, they are the interval."""
     unit: str = ""
     """Unit of value, interval and goal."""
     digits: int = 2
@@ -111,8 +112,8 @@ class Row(Figure):
     metric: str
     """What was measured, with any caveat that changes how the figure reads."""
     groups: tuple[str, ...] = ()
-    """Names that replace {group} in the keys: the row has the least favourable of their figures, which an average over
-    the groups would hide. Such a row needs a goal, since the goal says which figure is the least favourable."""
+    """Names that replace {group} in the keys. The row then shows the least favourable figure of all groups, which an
+    average would hide. A row with groups needs a goal, since the goal says which figure is the least favourable."""
     at_most: float | None = None
     """Goal: the figure is at most this."""
     at_least: float | None = None
@@ -141,7 +142,7 @@ class Table(BaseModel):
 
 
 class Headline(BaseModel):
-    """results/headline.toml."""
+    """Content of results/headline.toml."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -156,7 +157,7 @@ def record(
     files: Annotated[list[Path], typer.Argument(help="JSON files that runs or benchmarks wrote.")],
     results: Annotated[Path, typer.Option(help="Folder of the records.")] = RESULTS,
 ) -> None:
-    """Keep the figures of runs or benchmarks as records."""
+    """Store the figures of runs or benchmarks as records."""
     for file in files:
         record = _record_of(file)
         path = results / f"{record_name(file)}.json"
@@ -173,9 +174,10 @@ def write() -> None:
 
 
 def record_name(file: Path) -> str:
-    """Name of a file's record: `labels` of bench/labels.json, `detect-small` of detect/small/metrics.json.
+    """Name of a file's record.
 
-    `benchmark-small` of benchmark/small/benchmark.json.
+    Examples: `labels` for bench/labels.json, `detect-small` for detect/small/metrics.json, `benchmark-small` for
+    benchmark/small/benchmark.json.
     """
     parts = file.resolve().parts
     if file.name == "benchmark.json":
@@ -186,7 +188,7 @@ def record_name(file: Path) -> str:
 def _record_of(file: Path) -> Record:
     """The record of a file.
 
-    Raises UserError if it does not record how it was made, or was made by uncommitted code.
+    Raises UserError if the file does not state how it was made, or was made by uncommitted code.
     """
     try:
         figures = json.loads(file.read_text(encoding="utf-8"))
@@ -205,7 +207,7 @@ def _record_of(file: Path) -> Record:
             date=run["date"],
             hardware=hardware,
             load=run["load"],
-            # A run in another working tree may name files of this one by absolute paths.
+            # A run in another working tree may name files of this working tree by absolute paths.
             command=command.replace(f"{ROOT}/", ""),
             figures=figures,
         )
@@ -250,19 +252,19 @@ def read_headline() -> Headline:
 
 
 def generated_texts(headline: Headline, records: dict[str, Record]) -> dict[Path, str]:
-    """The text that each page has between its marks."""
+    """The text that each page has between the marks BEGIN and END."""
     strengths = [f"- {each.text.format(value(each, records))}\n" for each in headline.strength]
     return {RESULTS_PAGE: "\n".join(section(each, records) for each in headline.table), README: "".join(strengths)}
 
 
 def with_text(page: str, text: str) -> str:
-    """A page with the text between its marks replaced."""
+    """Return a page with the text between its marks BEGIN and END replaced."""
     before, rest = page.split(BEGIN)
     return f"{before}{BEGIN}\n\n{text}\n{END}{rest.split(END)[1]}"
 
 
 def section(table: Table, records: dict[str, Record]) -> str:
-    """A heading, the terms, and the Markdown table, whose figures link to their records."""
+    """A section in Markdown: the heading, the terms, and the table, whose figures link to their records."""
     lines = [["Quantity", "Measured", "Goal", "Status"], ["---"] * 4]
     for row in table.row:
         bounds = interval(row, records)
@@ -286,7 +288,7 @@ def interval(row: Figure, records: dict[str, Record]) -> str:
 
 
 def goal_and_status(row: Row, records: dict[str, Record]) -> tuple[str, str]:
-    """The cells of the goal, and of whether the figure meets it."""
+    """Two cells: the goal, and whether the figure meets the goal."""
     limit = row.at_most if row.at_most is not None else row.at_least
     if limit is None:
         return "—", "no goal"
@@ -297,7 +299,7 @@ def goal_and_status(row: Row, records: dict[str, Record]) -> tuple[str, str]:
 
 
 def _unbroken(text: str) -> str:
-    """A figure that stays on one line in a narrow cell, with no-break spaces."""
+    """Replace spaces by no-break spaces, so that a figure stays on one line in a narrow cell."""
     return text.replace(" ", "\u00a0")
 
 

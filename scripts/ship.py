@@ -4,10 +4,11 @@
     make benchmark
     python scripts/ship.py card --name crater-detector --benchmark runs/benchmark/crater-detector/benchmark.json
 
-The benchmark scores the installed weights as they are stored: in half precision, or in half of that size with
-`install --eight-bits`, where the validation split loses no AP. `install` writes train/perilune_train/shipped/NAME/ with
-weights.safetensors, config.yaml and metrics.json. `card` adds benchmark.json and card.md, and writes
-docs/reference/models/NAME.md, a copy of the card, and NAME-benchmark.md, the page of the benchmark.
+`install` writes train/perilune_train/shipped/NAME/ with weights.safetensors, config.yaml and metrics.json. The weights
+are stored in half precision, or with `--eight-bits` in half of this size; use `--eight-bits` only if the AP on the
+validation split does not fall. The benchmark scores the weights as they are stored. `card` adds benchmark.json and
+card.md to the folder, and writes docs/reference/models/NAME.md, a copy of the card, and NAME-benchmark.md, the page of
+the benchmark.
 """
 
 import json
@@ -36,7 +37,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED, PAGES = ROOT / "train/perilune_train/shipped", ROOT / "docs/reference/models"
 MAX_MB = {"crater-detector": 8.0, "lander-navigator": 1.0}
-"""Largest size of the weights, MB. Every clone and every wheel carries them."""
+"""Largest size of the weights, MB. Every clone and every wheel contains the weights."""
 MANIFESTS = {"crater-detector": "shipped-detect", "lander-navigator": "shipped-nav"}
 """Shared manifests of the training data."""
 
@@ -50,10 +51,7 @@ def install(
     name: Name,
     eight_bits: Annotated[bool, typer.Option("--eight-bits", help="Store 8 bits per weight.")] = False,
 ) -> None:
-    """Write weights, configuration and metrics of a run into the package.
-
-    A card of an earlier network is removed.
-    """
+    """Write weights, configuration and metrics of a run into the package; the card of an earlier network is removed."""
     folder, source = _folder(name), RunFolder(run)
     content, metrics = load_weights(source.best), read_metrics(run)
     folder.mkdir(parents=True, exist_ok=True)
@@ -63,11 +61,11 @@ def install(
     size = (folder / WEIGHTS).stat().st_size / 1e6
     if size > MAX_MB[name]:
         (folder / WEIGHTS).unlink()
-        expected = f"at most {MAX_MB[name]:g} MB; --eight-bits stores half of it"
+        expected = f"at most {MAX_MB[name]:g} MB; --eight-bits halves the size"
         raise UserError(folder / WEIGHTS, "size", f"{size:.1f} MB", expected)
-    # The command may have paths of the machine that trained it.
-    kept = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
-    write_text(folder / METRICS_FILE, json.dumps(kept, indent=2) + "\n")
+    # The command may contain paths of the machine on which the network was trained.
+    public_metrics = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
+    write_text(folder / METRICS_FILE, json.dumps(public_metrics, indent=2) + "\n")
     shutil.copyfile(source.config, folder / "config.yaml")
     (folder / COVARIANCE).unlink(missing_ok=True)
     if (run / COVARIANCE).is_file():
@@ -79,8 +77,12 @@ def install(
 def card(
     name: Name,
     benchmark: Annotated[Path, typer.Option(help="benchmark.json of the installed network.")],
-    other: Annotated[list[Path] | None, typer.Option(help="benchmark.json of a training with another seed.")] = None,
-    note: Annotated[list[str] | None, typer.Option(help="Caveat of the network or of its benchmark.")] = None,
+    other: Annotated[
+        list[Path] | None, typer.Option(help="benchmark.json of a run with another random seed. Repeatable.")
+    ] = None,
+    note: Annotated[
+        list[str] | None, typer.Option(help="Caveat about the network or its benchmark. Repeatable.")
+    ] = None,
 ) -> None:
     """Write the card of the installed network and the page of its benchmark, both with the notes."""
     folder, manifest = _folder(name), MANIFESTS[name]

@@ -1,7 +1,8 @@
-"""Import every module of perilune-shared and perilune-train and train one step of `tiny` for each network.
+"""Import every module of perilune-shared and perilune-train, train one epoch of `tiny`, and find craters.
 
-Usage: try_lowest.py FOLDER, an empty folder for datasets and runs. Used by scripts/test-lowest and
-scripts/test-wheels.
+    python scripts/try_lowest.py FOLDER
+
+FOLDER is an empty folder for datasets and runs. scripts/test-lowest and scripts/test-wheels use this program.
 """
 
 import importlib
@@ -24,7 +25,7 @@ _OPTIONAL = {"rasterio", "onnx", "onnxruntime", "openvino", "datasets"}
 
 
 def import_all() -> int:
-    """Import every module; returns their number. A missing optional dependency is ignored."""
+    """Import every module; returns the number of modules. A missing optional dependency is ignored."""
     count = 0
     for package in (perilune_shared, perilune_train):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):

@@ -1,4 +1,4 @@
-"""Find lunar craters, render labelled lunar scenes, read datasets of lunar landings, and fly a landing filter.
+"""Find lunar craters, render labelled scenes, read datasets, and run a filter over a landing.
 
     import perilune
 
@@ -15,8 +15,8 @@
 
     estimates = perilune.fly("descent", detector=my_function)
 
-The detector, `torch` and `fly` need the extra `train`, scenes the extra `render`. Each part is imported when a name of
-it is first used.
+The detector, `dataset.torch` and `fly` need the extra `train`; scenes need the extra `render`. A part is imported when
+one of its names is first used.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -69,7 +69,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import the part that has a name. Raises MissingPart if it is not installed."""
+    """Import the part that defines a name, and return the object. Raises MissingPart."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(part(_MODULE_OF[name], name), name)

@@ -18,10 +18,11 @@ class Dataset(manifest.Dataset):
     """
 
     def torch(self, split: str = "train", selection: str = "visible") -> "LabelledFrames":
-        """Load the frames and labels of a split into memory; return a PyTorch Dataset that has the method `collate`.
+        """Load the frames and labels of a split into memory, and return them as a PyTorch Dataset.
 
-        `split` is train, val or test; `selection` is all, paper or visible. Raises UserError on other names and if the
-        frames do not fit into memory. Raises MissingPart if the extra `train` is not installed.
+        `split` is train, val or test; `selection` is all, paper or visible. Pass the method `collate` of the result to
+        a DataLoader. Raises UserError if the split or the selection is unknown, or if the frames do not fit into
+        memory. Raises MissingPart if the extra `train` is not installed.
 
             frames = dataset.torch(split="train")
             DataLoader(frames, batch_size=8, collate_fn=frames.collate)

@@ -11,7 +11,7 @@ class MissingPart(UserError, ImportError):
 
 
 def part(module: str, what: str) -> Any:
-    """Import a module of an optional part; `what` names the feature that needs it.
+    """Import and return a module of an optional part; `what` is the name that the user requested.
 
     Raises MissingPart if the part, or a library that it needs, is missing.
     """

@@ -6,15 +6,15 @@ from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 
 HEAD = f"""# Columns of the manifest
 
-Six tables, schema version {SCHEMA_VERSION}. Every Parquet file also stores unit and meaning of its columns (field
-metadata `unit` and `meaning`). O_L and O_S are [frames of reference](frames.md). Columns in px use the frame's image
-coordinates: origin at the outer corner of the top-left pixel, x right, y down.
+A manifest has six tables, schema version {SCHEMA_VERSION}. Every Parquet file also stores unit and meaning of its
+columns (field metadata `unit` and `meaning`). O_L and O_S are [frames of reference](frames.md). Columns in px use the
+frame's image coordinates: origin at the outer corner of the top-left pixel, x right, y down.
 """
 PACKED = """## shards
 
-Only in packed datasets: one row per frame, in `shards/<split>-00000-of-00012.parquet`. The columns of `frames`, then
-`image`, a struct of `bytes` (the PNG file) and `path` (the frame's `png_path`), and `labels`, a list of structs: the
-columns of `labels` that are not in `frames`.
+Only packed datasets have shards, such as `shards/<split>-00000-of-00012.parquet`, with one row per frame. A shard has
+the columns of `frames`, then `image` and `labels`. `image` is a struct of `bytes` (the PNG file) and `path` (the
+frame's `png_path`). `labels` is a list of structs with the columns of the table `labels` that are not in `frames`.
 """
 
 

@@ -19,7 +19,7 @@ def command_page(program: str, app: typer.Typer) -> str:
 
 
 def commands(program: str, app: typer.Typer) -> dict[str, Any]:
-    """Return every command by its full name, for example "perilune-train detect train", without former names."""
+    """Return every command by its full name, for example "perilune-train detect train". Former names are left out."""
     return dict(_leaves(program, typer.main.get_command(app)))
 
 
@@ -60,7 +60,7 @@ def _text(text: str) -> str:
 
 
 def _meaning(parameter: Any) -> tuple[str, str]:
-    """Split a help text into meaning and default; some help texts end with [default: ...] in words."""
+    """Split a help text into its meaning and the default that it may state at its end as [default: ...]."""
     text = " ".join((parameter.help or "").split())
     words = re.search(r" ?\[default: (.*)\]$", text)
     return _text(text[: words.start()] if words else text), _text(words[1]) if words else ""

@@ -1,4 +1,4 @@
-"""Generate the reference page of the configuration keys from the pydantic models, as `config --show` does."""
+"""Generate the reference page of the configuration keys from the pydantic models."""
 
 import typing
 from collections.abc import Iterator
@@ -64,14 +64,14 @@ def _allowed(key: Key) -> str:
 def _inner_limits(kind: Any) -> list[Any]:
     """Return the limits of the first number within a union or a tuple."""
     for inner in typing.get_args(kind):
-        found = [limit for field in getattr(inner, "__metadata__", ()) for limit in field.metadata]
-        if found := found or _inner_limits(inner):
-            return found
+        limits = [limit for field in getattr(inner, "__metadata__", ()) for limit in field.metadata]
+        if limits := limits or _inner_limits(inner):
+            return limits
     return []
 
 
 def _presets(section: str, presets: dict[str, list[Key]]) -> Iterator[str]:
-    """Yield a table of the keys that have no default or differ from it in any preset, with the value of each preset."""
+    """Yield a table with the values in all presets, for keys whose value differs from the default in any preset."""
     yield f"## Presets of {section}\n\n| Key | {' | '.join(PRESETS)} |\n|---|{'---|' * len(PRESETS)}"
     for same in zip(*presets.values(), strict=True):
         if any(key.value != key.default for key in same):

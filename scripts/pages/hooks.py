@@ -44,12 +44,12 @@ SEARCH = {
     "reference/configuration/": {"boost": 0.5},
     "notebook/": {"exclude": True},
 }
-"""Rank of a folder's pages in the site's search: recipes come first; the notebook, a record of earlier states, is
-excluded. It is not in the front matter of the pages, because the repository's web view would show it."""
+"""Rank of a folder's pages in the site's search. Recipes come first; the notebook, a record of earlier states, is
+excluded. The pages do not state their rank in their front matter, because the repository's web view would show it."""
 
 
 def on_config(config: Any) -> Any:
-    """Append the pages of the notebook (docs/notebook) to the navigation, the latest first."""
+    """Append the pages of the notebook (docs/notebook) to the navigation, the latest page first."""
     dated = [f"notebook/{path.name}" for path in sorted((DOCS / "notebook").glob("2*.md"), reverse=True)]
     config.nav = [*config.nav, {"Notebook": ["notebook/index.md", *dated]}]
     return config
@@ -72,7 +72,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Rank the page in the search, set its width, and redirect links whose targets have another place in the site."""
+    """Rank the page in the search, hide the navigation of top pages, and correct links to moved files."""
     for folder, rank in SEARCH.items():
         if page.file.src_uri.startswith(folder):
             page.meta.setdefault("search", rank)

@@ -4,9 +4,9 @@ from perilune_render.server.pangu.messages import FIRST_SETTING, MESSAGES
 
 _HEAD = """# PANGU's messages
 
-How `perilune-render serve` responds to each message of PANGU's wire protocol 1.20. *answered*: with an effect or a
-value; *read*: acknowledged without effect; *refused*: an error, and the session goes on. How to use it:
-[Serve images](../how-to/serve.md).
+This page lists how `perilune-render serve` responds to each message of PANGU's wire protocol 1.20. *answered*: the
+message has an effect or returns a value. *read*: the server acknowledges the message without effect. *refused*: the
+server returns an error, and the session continues. See also [Serve images](../how-to/serve.md).
 
 """
 

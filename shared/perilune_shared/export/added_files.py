@@ -35,7 +35,7 @@ class Target:
 
     @classmethod
     def of(cls, dataset: Dataset, out: str | os.PathLike[str] | None, name: str) -> "Target":
-        """Return the file at the path or address `out`; if `out` is None, the file `name` in the dataset."""
+        """Return the target at the path or address `out`, or the file `name` in the dataset if `out` is None."""
         if out is None:
             return cls(dataset.store, name)
         prefix, _, last = os.fspath(out).rpartition("/")
@@ -66,41 +66,41 @@ class Target:
         """Write the file, or replace it."""
         if self.store.folder is None or files.is_plain(self.name):
             self.store.replace(self.name, content)
-        else:  # outside of datasets, names may have blanks and other letters
+        else:  # outside of datasets, names may have blanks and other characters
             files.write_bytes(self.store.folder / self.name, content)
 
 
 def check_index(dataset: Dataset, targets: Iterable[Target], progress: Progress = NO_PROGRESS) -> DatasetInfo | None:
-    """Check that files may be written.
+    """Check that the files `targets` may be written; return dataset.json if the index will change.
 
-    Returns dataset.json, or None if index and dataset.json need no change. The index changes if one of the files is
-    directly in a complete dataset; an incomplete dataset has no index yet. Raises UserError if another file differs
-    from the index, since a new index would hide the difference, or if a name is not allowed in a dataset
-    (perilune_shared.validation.files).
+    The index changes if one of the files is directly in a complete dataset. Returns None if the index does not change:
+    if all files are elsewhere, or if the dataset is incomplete and has no index yet. Raises UserError if another file
+    differs from the index, since a new index would hide the difference, or if a dataset may not contain a file of this
+    name (perilune_shared.validation.files).
     """
     for target in targets:
         if _is_below(target.store, dataset.store):
             expected = "a file directly in the dataset, or outside of it"
             raise UserError(target.address, "--out", "a file in a folder of the dataset", expected)
-    own_names = _own_names(dataset, targets)
-    for name in sorted(own_names - EXTRA_NAMES):
+    names_in_dataset = _names_in_dataset(dataset, targets)
+    for name in sorted(names_in_dataset - EXTRA_NAMES):
         raise UserError(dataset.store.at(name), "--out", name, f"{', '.join(sorted(EXTRA_NAMES))}, or another folder")
-    if not own_names or not dataset.info.complete:
+    if not names_in_dataset or not dataset.info.complete:
         return None
     info = read_info(dataset.store)
-    check_files(dataset, progress, replaced=own_names)
+    check_files(dataset, progress, replaced=names_in_dataset)
     return info
 
 
 def add_files(
     dataset: Dataset, contents: Mapping[Target, bytes], info: DatasetInfo | None, licence: str | None = None
 ) -> None:
-    """Write files atomically, and the index unless `info`, the result of `check_index`, is None.
+    """Write files atomically, and add them to the index unless `info` is None.
 
-    If the index is written, `licence` replaces the licence of the dataset.
+    `info` is the result of `check_index`. If the index is written, `licence` replaces the licence of the dataset.
 
-    If the process is killed, `validate` finds the old dataset, the new one, or files that are not in the index; the
-    next call adds or removes such files. Only in a local folder do simultaneous calls exclude each other. Raises
+    If the process is killed, `validate` finds the old dataset, the new dataset, or files that are not in the index. The
+    next call adds or removes these files. Simultaneous calls exclude each other only in a local folder. Raises
     UserError if the dataset changed since it was checked.
     """
     store = dataset.store
@@ -111,36 +111,35 @@ def add_files(
     with locked(store.folder) if store.folder is not None else contextlib.nullcontext():
         if read_info(store) != info:
             raise UserError(store.at(INFO_NAME), "content", "changed meanwhile", "no other writer; run it again")
-        own_names = _own_names(dataset, contents)
+        names_in_dataset = _names_in_dataset(dataset, contents)
         rows = read_index(store, info)
-        others = rows.filter(pc.invert(pc.is_in(rows["path"], pa.array(sorted(own_names), pa.string()))))
+        others = rows.filter(pc.invert(pc.is_in(rows["path"], pa.array(sorted(names_in_dataset), pa.string()))))
         # Never overwrite a file that the index lists: remove the old files from the index first.
         info = info if len(others) == len(rows) else seal(store, info, others)
         for target, content in contents.items():
             target.write(content)
-        known = {*others["path"].to_pylist(), *own_names}
+        known = {*others["path"].to_pylist(), *names_in_dataset}
         extra = sorted(name for name in EXTRA_NAMES - known if store.exists(name))
-        added = {target.name: content for target, content in contents.items() if target.name in own_names}
+        added = {target.name: content for target, content in contents.items() if target.name in names_in_dataset}
         added |= {name: store.read(name, most_bytes=_LARGEST_BYTES) for name in extra}
         written = index_rows(WrittenFile.of(name, content) for name, content in added.items())
         info = info if licence is None else info.model_copy(update={"licence": licence})
         seal(store, info, pa.concat_tables([others, written]))
 
 
-def _own_names(dataset: Dataset, targets: Iterable[Target]) -> set[str]:
+def _names_in_dataset(dataset: Dataset, targets: Iterable[Target]) -> set[str]:
     """Return the names of the files that are directly in the dataset."""
     return {target.name for target in targets if target.store is dataset.store}
 
 
 def _is_same(store: Store, other: Store) -> bool:
-    """Whether two stores are the same folder or prefix."""
     if store.folder is None or other.folder is None:
         return store == other
     return store.folder.resolve() == other.folder.resolve()
 
 
 def _is_below(store: Store, other: Store) -> bool:
-    """Whether a store is within a folder of another one."""
+    """Whether `store` is a folder or prefix below `other`."""
     if _is_same(store, other):
         return False
     if store.folder is None or other.folder is None:

@@ -1,7 +1,7 @@
 """Write the dataset card: README.md and card.png, for readers and for dataset repositories.
 
 The page is Markdown with a YAML head in Hugging Face's format (https://huggingface.co/docs/hub/datasets-cards).
-Datasets are untrusted: each text from a dataset is put in a code span, with only letters, digits and safe punctuation.
+Datasets are untrusted, so each text from a dataset is written as a code span, in which unsafe characters are replaced.
 """
 
 import os
@@ -43,14 +43,12 @@ _IMAGES = {
 def write_card(
     dataset: Dataset, out: str | os.PathLike[str] | None, progress: Progress, licence: str | None = None
 ) -> tuple[str, str]:
-    """Write the page and the picture beside it, and update the dataset's index.
+    """Write the page and the picture beside it, and add files in the dataset to its index.
 
-    Returns their paths or addresses.
-
-    `out` is by default README.md in the dataset. `licence`, an SPDX expression, replaces the licence of the dataset on
-    the page, and also in dataset.json if the page is in the dataset. Raises UserError if a file that is not a card
-    would be overwritten, if the dataset has no frames or differs from its index, or if the licence is not an SPDX
-    expression.
+    Returns the path or address of the page, then of the picture. The page is `out`, by default README.md in the
+    dataset. `licence`, an SPDX expression, replaces the licence of the dataset on the page, and also in dataset.json if
+    the page is in the dataset. Raises UserError if a file that is not a card would be overwritten, if the dataset has
+    no frames or differs from its index, or if the licence is not an SPDX expression.
     """
     if licence is not None:
         licence = joined_licence([("--licence", licence)])
@@ -67,7 +65,7 @@ def write_card(
                 raise UserError(target.address, "--out", "a file that is not a card", expected)
     info = check_index(dataset, (page, picture), progress)
     gathered = gather(dataset, progress)
-    # Create the page before the picture: it checks the keys and takes much less time.
+    # Create the page before the picture: this checks the keys of the tables and takes much less time.
     text = card_of(dataset, gathered, picture.name).encode()
     # Write the page first: its mark shows a later run that it may overwrite the picture.
     add_files(dataset, {page: text, picture: draw(dataset, gathered)}, info, licence)
@@ -75,7 +73,7 @@ def write_card(
 
 
 def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
-    """Return the page as Markdown."""
+    """Return the text of the page, Markdown with a YAML head."""
     info = dataset.info
     state = "" if info.complete else "\n\n**Not complete**: rendering is in progress or was interrupted."
     parts = [
@@ -112,7 +110,6 @@ def _history(info: DatasetInfo) -> str:
 
 
 def _purpose(info: DatasetInfo) -> str:
-    """Describe the purpose of the dataset, and state the numbers of trajectories and terrains."""
     n_scenes, n_trajectories = info.counts.scenes, info.counts.trajectories
     terrains = f"{n_scenes:,} terrains" if n_scenes != 1 else "one terrain"
     trajectories = f"{n_trajectories:,} trajectories" if n_trajectories != 1 else "one trajectory"
@@ -121,7 +118,7 @@ def _purpose(info: DatasetInfo) -> str:
 
 def _counts(dataset: Dataset) -> str:
     frame = summary(dataset).set_index("split").astype(object).T
-    rows = [[str(name).replace("_", " "), *map(_shown, values)] for name, values in frame.iterrows()]
+    rows = [[str(name).replace("_", " "), *map(_cell_text, values)] for name, values in frame.iterrows()]
     total = ", ".join(f"{number:,} {name}" for name, number in dataset.info.counts.model_dump().items())
     return f"{total}.\n\n" + _table(["", *map(str, frame.columns)], rows)
 
@@ -197,7 +194,7 @@ def _camera(camera: CameraRecord) -> str:
 
 
 def _remake(key: str, recipe: Recipe) -> str:
-    """Return the commands that reproduce the data of a recipe; names are quoted for the shell."""
+    """Return the text about a recipe, and the commands that reproduce its data."""
     settings = f"json.load(open('{INFO_NAME}'))['recipes']['{key}']['config']"
     unpack = f"python -c \"import json; json.dump({{'dataset': {settings}}}, open('recipe.yaml', 'w'))\""
     if recipe.developed_from is None:
@@ -221,7 +218,7 @@ def _table(head: list[str], rows: Iterable[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _shown(value: object) -> str:
+def _cell_text(value: object) -> str:
     if value is None or value is pd.NA or (isinstance(value, float) and np.isnan(value)):
         return ""
     return f"{value:,}" if isinstance(value, int | float) else code_span(value)

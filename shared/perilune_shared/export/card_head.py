@@ -1,8 +1,8 @@
 """The YAML head of a dataset card, in Hugging Face's format.
 
-Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration. huggingface_hub's
-`DatasetCardData` would write the same mapping, but would add 13 packages (30 MB, including an HTTP client) to every
-installation. The tests read the head with it.
+Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration. `DatasetCardData` of
+huggingface_hub writes the same mapping, but huggingface_hub would add 13 packages (30 MB, including an HTTP client) to
+every installation. The tests read the head with `DatasetCardData`.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000
 
 
 def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
-    """Return the YAML head: licence, name, tags, and the files of each split of each configuration."""
+    """Return the YAML head: licence, name, tags, size, and `configs`, the result of `table_configs`."""
     info = dataset.info
     head = {
         **_licence(info.licence),
@@ -43,7 +43,7 @@ def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
 
 
 def _licence(licence: str) -> dict[str, str]:
-    """Return the entries for a licence, under the hub's name for it if there is one."""
+    """Return the entries for a licence; if the hub has an identifier for the licence, it is used."""
     if licence == NOT_STATED:
         return {"license": "unknown"}
     if licence in _HUB_LICENCES:
@@ -52,13 +52,13 @@ def _licence(licence: str) -> dict[str, str]:
 
 
 def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
-    """Return the configurations of the dataset: one for packed frames, if there are any, and one per table with rows.
+    """Return the configurations: one per table with rows, and one for packed frames if there are any.
 
-    If there are packed frames, their configuration is the default and has the splits of the dataset.
-
-    Without configurations `datasets` treats every image in the folder as training data. A part of a table may contain
-    rows of all splits, so each table has the single split `mixed`; the column `split` of frames states the split of
-    each frame. The Hugging Face export writes frames that are not packed to separate files for each split.
+    A configuration states which files `datasets.load_dataset` loads for each split. Without configurations, `datasets`
+    treats every image in the folder as training data. The configuration of packed frames is the default and has the
+    splits of the dataset. A part of a table may contain rows of all splits, so each table has the single split `mixed`;
+    the column `split` of frames states the split of each frame. For frames in separate files, use `export_hugging_face`
+    to write files for each split.
     """
     counts = dataset.info.counts.model_dump()
     names = ["frames", *(name for name in TABLES if name != "frames")]

@@ -53,11 +53,12 @@ class Gathered:
     measures: dict[str, dict[str, NDArray[np.float32]]]
     """Values by measure and split; see `TITLES` for names and units."""
     samples: list[tuple[dict, pd.DataFrame]] = field(default_factory=list)
-    """Rows of the frames to show, each with labels whose column `visible` states whether they are in that selection."""
+    """Frames to show: the row of each frame, and its labels. Their column `visible` states whether the selection
+    `visible` contains the label."""
 
 
 def gather(dataset: Dataset, progress: Progress) -> Gathered:
-    """Collect the data in one pass over the scenes. Raises UserError if there are no frames."""
+    """Collect the data of a card in one pass over the scenes. Raises UserError if there are no frames."""
     ids = dataset.scene_ids()
     if not ids:
         raise UserError(dataset.store, "scenes", "none", "a dataset with frames")
@@ -83,7 +84,10 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
 
 
 def draw(dataset: Dataset, gathered: Gathered) -> bytes:
-    """Draw the picture as PNG. Raises UserError if matplotlib is missing or a frame does not match the manifest."""
+    """Return the picture as the bytes of a PNG.
+
+    Raises UserError if matplotlib is missing or a frame does not match the manifest.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

@@ -13,8 +13,8 @@ from perilune_shared.dataset.schema import TABLES
 def citation_of(dataset: Dataset) -> str:
     """Return a BibTeX entry that identifies this dataset by the hash of its tables.
 
-    The tables contain the hashes of the frames. Cards and other added files do not change the hash. To print it in a
-    shell: `sha256sum manifest/*/*.parquet | sha256sum`.
+    The tables contain the hashes of the frames. Cards and other added files do not change the hash. To print the hash
+    in a shell: `sha256sum manifest/*/*.parquet | sha256sum`.
     """
     lines = "".join(f"{sha256}  {path}\n" for path, sha256 in sorted(table_hashes(dataset).items()))
     sha256 = hashlib.sha256(lines.encode()).hexdigest()
@@ -25,7 +25,10 @@ def citation_of(dataset: Dataset) -> str:
 
 
 def table_hashes(dataset: Dataset) -> dict[str, str]:
-    """Return the SHA-256 of each part of all tables, from the index or, if there is none yet, computed."""
+    """Return the SHA-256 of each part of all tables, by path.
+
+    The hashes come from the index. An incomplete dataset has no index, so its hashes are computed.
+    """
     if not dataset.info.complete:
         return {path: dataset.store.sha256(path) for table in TABLES for path in dataset.parts(table)}
     rows = read_index(dataset.store, read_info(dataset.store))

@@ -42,9 +42,9 @@ _POLYGON *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 def export_coco(
     dataset: Dataset, out: Address, progress: Progress, split: str | None = None, choose: Choice | None = None
 ) -> int:
-    """Write `out`/instances_<split>.json for one split or each.
+    """Write `out`/instances_<split>.json for one split, or for all splits if `split` is None.
 
-    Returns the number of annotations that are not crowds. `file_name` is the frame's png_path, so give COCO tools the
+    Returns the number of selected labels that were written. `file_name` is the frame's png_path, so give COCO tools the
     dataset's folder as the image folder. Raises UserError if `out` is not empty, the dataset is a plan, a png_path is
     outside the dataset or the split has no frames.
     """
@@ -68,7 +68,10 @@ def export_coco(
 
 
 def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
-    """Return polygons (N, 32, 2), pixels, with the same areas as the labels' ellipses; not clipped to the image."""
+    """Return a polygon for the ellipse of each label (N, 32, 2), pixels.
+
+    A polygon has the same area as its ellipse. It is not clipped to the image.
+    """
     cos, sin = np.cos(labels["ellipse_theta_rad"].to_numpy()), np.sin(labels["ellipse_theta_rad"].to_numpy())
     along = labels["ellipse_a_px"].to_numpy()[:, None] * _POLYGON[:, 0]
     across = labels["ellipse_b_px"].to_numpy()[:, None] * _POLYGON[:, 1]
@@ -86,17 +89,17 @@ def clip_to_image(polygon: NDArray[np.float64], width_px: float, height_px: floa
         if not len(polygon):
             break
         inside = sign * (polygon[:, axis] - edge)
-        kept = []
-        for here, there, d_here, d_there in zip(
+        corners = []
+        for start, end, d_start, d_end in zip(
             polygon, np.roll(polygon, -1, axis=0), inside, np.roll(inside, -1), strict=True
         ):
-            if d_here >= 0:
-                kept.append(here)
-            if d_here * d_there < 0:
-                crossing = here + (there - here) * (d_here / (d_here - d_there))
+            if d_start >= 0:
+                corners.append(start)
+            if d_start * d_end < 0:
+                crossing = start + (end - start) * (d_start / (d_start - d_end))
                 crossing[axis] = edge
-                kept.append(crossing)
-        polygon = np.array(kept).reshape(-1, 2)
+                corners.append(crossing)
+        polygon = np.array(corners).reshape(-1, 2)
     return polygon
 
 
@@ -141,9 +144,9 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
 
 
 def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_]:
-    """Whether box and outline of each label, clipped to its image, have an area.
+    """Return whether each label (N,) has a box and an outline with an area after clipping to its image.
 
-    Other labels are not exported.
+    Labels without an area in the image are not exported.
     """
     boxes, size = clipped_boxes(labels, frames), frame_sizes(labels, frames)
     inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
@@ -156,7 +159,7 @@ def are_in_image(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.bool_
 
 
 class _SplitFile:
-    """Writer of one JSON file: writes annotations as they are added, and the images when it is closed."""
+    """Writes the JSON file of one split: annotations when they are added, the images when it is closed."""
 
     def __init__(self, path: Path, dataset: Dataset):
         info = dataset.info

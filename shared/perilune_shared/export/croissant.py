@@ -82,9 +82,10 @@ _DATA_TYPES = {
 def export_croissant(
     dataset: Dataset, out: str | os.PathLike[str] | None = None, progress: Progress = NO_PROGRESS
 ) -> str:
-    """Write croissant.json, or `out`, into the dataset and update the index; return its path or address.
+    """Write croissant.json, or the file `out`, into the dataset and add it to the index.
 
-    Raises UserError if `out` is outside the dataset, or if the dataset is incomplete or differs from its index.
+    Returns the path or address of the file. Raises UserError if `out` is outside the dataset, or if the dataset is
+    incomplete or differs from its index.
     """
     target = Target.of(dataset, out, CROISSANT_NAME)
     if target.store is not dataset.store or not target.name.endswith(".json"):
@@ -105,11 +106,11 @@ def export_croissant(
 
 
 def metadata_of(dataset: Dataset) -> dict[str, Any]:
-    """Return the JSON-LD object.
+    """Return the description of a dataset as a JSON-LD object.
 
-    A table with one part is a FileObject with a hash. A table with several parts is a FileSet; the index has the hashes
-    of the parts. dataset.json is a FileSet too, since its hash depends on this file: dataset.json contains the hash of
-    the index, and the index contains the hash of this file.
+    A table with one part is a FileObject with a hash. A table with several parts is a FileSet without a hash; the index
+    has the hashes of the parts. dataset.json is a FileSet too, since the description cannot contain its hash:
+    dataset.json contains the hash of the index, and the index contains the hash of the description.
     """
     info, hashes = dataset.info, table_hashes(dataset)
     distribution: list[dict[str, Any]] = [
@@ -172,9 +173,9 @@ def _description(dataset: Dataset) -> str:
 
 
 def _licence(expression: str) -> dict[str, str]:
-    """Return the licence entry: SPDX's page for a single licence, otherwise the expression.
+    """Return the licence entry: the address of SPDX's page for a single licence, or the expression.
 
-    The result is empty if not stated.
+    The result is empty if the licence is not stated.
     """
     if expression == NOT_STATED:
         return {}
@@ -237,7 +238,7 @@ def _images(*, packed: bool) -> dict[str, Any]:
 
 
 def _image_records(*, packed: bool) -> dict[str, Any]:
-    """Describe the frames: keyed by frame_id if packed, otherwise by png_path."""
+    """Return the record set of the images; its key is frame_id for packed frames and png_path for files."""
     source = {"@type": "cr:FileSet", "@id": "image-files"}
     if packed:
         key, name = "frame_id", _source(source, {"column": "frame_id"})

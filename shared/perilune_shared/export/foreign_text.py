@@ -1,7 +1,7 @@
 """Make untrusted text safe to write to Markdown, Markdown code spans and CSV.
 
-Untrusted text includes names of files, runs, datasets and classes, licences and messages of other libraries. For
-terminals, `terminal` passes all text through `errors.one_line`, which the functions here call too. Jinja2 escapes HTML.
+Names of files, runs, datasets and classes, licences, and messages of other libraries are untrusted. The functions call
+`errors.one_line`, which also makes text safe to print in a terminal. They do not escape HTML for reports; Jinja2 does.
 """
 
 import os
@@ -24,9 +24,9 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "|", "%")
 
 
 def for_markdown(value: object) -> str:
-    """Return text as one line that Markdown shows literally: no markup, HTML, link or picture.
+    """Return text as one line that Markdown shows literally, without markup, HTML, links or pictures.
 
-    Vertical bars are kept, since callers that write tables escape them in all cells.
+    Vertical bars are not escaped; callers that write tables escape them in every cell.
     """
     return _LINK.sub(r"\\\1", one_line(value).translate(_MARKUP))
 
@@ -41,16 +41,21 @@ def code_span(value: object) -> str:
 
 
 def for_csv(value: str) -> str:
-    """Return text as a CSV cell; an apostrophe prevents spreadsheet programs from reading it as a formula."""
+    """Return text as a CSV cell that spreadsheet programs do not read as a formula.
+
+    Text that begins like a formula is prefixed with an apostrophe.
+    """
     text = one_line(value)
-    # Spreadsheet programs also accept full-width signs, and skip blanks before them.
+    # Spreadsheet programs also accept full-width signs, and skip blanks and quotes before a sign.
     first = unicodedata.normalize("NFKC", text.lstrip("'\" "))[:1]
     return f"'{text}" if first in _FORMULA and first else text
 
 
 def write_csv(table: "pd.DataFrame", path: str | os.PathLike[str], **options: Any) -> None:
-    """Write a table as CSV without the index, with text and column names made safe by `for_csv`; `options` go to
-    pandas."""
+    """Write a table as CSV without the index; `for_csv` makes texts and column names safe.
+
+    `options` are passed to `DataFrame.to_csv`.
+    """
     safe = table.rename(columns=for_csv)
     for index, kind in enumerate(safe.dtypes):
         if str(kind) in ("object", "str", "string"):

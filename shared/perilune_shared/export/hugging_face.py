@@ -1,7 +1,7 @@
-"""Export to Hugging Face: one row per frame with its image, pose and labels, in Parquet files for each split.
+"""Export to Hugging Face: Parquet files of each split; a row has a frame's image, pose and labels.
 
-The tables of a dataset mix frames of all splits and keep labels separate from frames; the library `datasets` would read
-all of them as training data. With this export, `datasets.load_dataset(folder)` loads all splits and
+The tables of a dataset mix frames of all splits and keep labels separate from frames. The library `datasets` would read
+all tables as training data. From this export, `datasets.load_dataset(folder)` loads all splits and
 `load_dataset(folder, split="test")` loads one. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
 """
 
@@ -39,8 +39,9 @@ def export_hugging_face(
 ) -> int:
     """Write data/<split>/*.parquet and a README.md that lists the splits into `out`.
 
-    Returns the number of frames. The field `chosen` of each label states whether it is selected. Raises UserError if
-    `out` is not empty, an image is missing or the split has no frames.
+    Returns the number of frames. All labels are written; the field `chosen` of a label states whether `choose` selects
+    it. `shard_mb` is the approximate maximum size of a Parquet file, 10^6 bytes. Raises UserError if `out` is not
+    empty, an image is missing or the split has no frames.
     """
     task = progress.add_task("huggingface", total=count_frames(dataset, split), unit="frames")
     writers: dict[str, _Shards] = {}
@@ -77,7 +78,7 @@ test = load_dataset("FOLDER", split="test")
 
 
 def schema_of() -> pa.Schema:
-    """Return the schema of the files: the columns of frames, the image, and the labels as a list of structs."""
+    """Return the schema of the files: columns of the table frames, the image, and the list of labels."""
     columns = [TABLES["frames"].field("frame_id"), IMAGE]
     columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_OMITTED)]
     columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))
@@ -85,7 +86,7 @@ def schema_of() -> pa.Schema:
 
 
 def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]]:
-    """Yield split and rows of the frames of a scene, in batches."""
+    """Yield batches of a scene's frames: the split, and rows in the schema of the files."""
     schema = schema_of()
     for split, frames in scene.frames.groupby("split"):
         for start in range(0, len(frames), _FRAMES_PER_GROUP):
@@ -103,7 +104,7 @@ def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]
 
 
 def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
-    """Return the list of labels of each frame; labels and frames are sorted by frame_id."""
+    """Return one list of labels per frame. Needs labels and frames that are sorted by frame_id."""
     of_frames = labels[labels["frame_id"].isin(frame_ids)]
     counts = of_frames["frame_id"].value_counts().reindex(frame_ids, fill_value=0).to_numpy()
     offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]), pa.int32())
@@ -112,7 +113,7 @@ def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
 
 
 class _Shards:
-    """Writer of the Parquet files of one split, each of about `shard_bytes`."""
+    """Writes the Parquet files of one split, each of at most about `shard_bytes` bytes."""
 
     def __init__(self, folder: Path, shard_bytes: int):
         self._folder, self._shard_bytes = folder, shard_bytes

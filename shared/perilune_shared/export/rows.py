@@ -1,4 +1,4 @@
-"""Read the rows of a dataset scene by scene; used by all exports.
+"""Read the frames and labels of a dataset scene by scene, for exports and dataset cards.
 
 Use:
 
@@ -25,7 +25,7 @@ Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]
 """Function that selects labels: takes the dataset, a scene_id and the scene's labels (N rows, all columns); returns
 bool (N,)."""
 LABEL_MEASURES = ("visible_fraction", "sunlit_fraction", "contrast")
-"""Columns by which users select labels; exports include those that the dataset has."""
+"""Columns by which users select labels; an export to COCO includes them if the dataset has them."""
 
 
 def by_selection(selection: Selection) -> Choice:
@@ -54,11 +54,10 @@ class SceneRows:
 def scenes_of(
     dataset: Dataset, split: str | None = None, choose: Choice | None = None, *, with_labels: bool = True
 ) -> Iterator[SceneRows]:
-    """Yield the scenes in order, with one scene in memory at a time.
+    """Yield the scenes of a dataset in order; only one scene is in memory at a time.
 
     `image_id` and `label_id` number the frames and labels of the whole dataset from 1, in order, so they do not depend
-    on the requested split and choice. Raises UserError if no frame belongs to the split, or a frame has an unknown
-    split.
+    on `split` and `choose`. Raises UserError if no frame belongs to the split, or a frame has an unknown split.
     """
     n_frames = n_labels = n_yielded = 0
     for scene_id in dataset.scene_ids():
@@ -94,7 +93,7 @@ def count_scenes(dataset: Dataset, split: str | None = None) -> int:
 
 
 def count_frames(dataset: Dataset, split: str | None = None) -> int:
-    """Return the number of frames in the scenes that `scenes_of` yields, as the total of a progress bar."""
+    """Return the number of frames that `scenes_of` yields, as the total of a progress bar."""
     return dataset.info.counts.frames if split is None else len(_scene_of_each_frame(dataset, split))
 
 
@@ -105,13 +104,13 @@ def _scene_of_each_frame(dataset: Dataset, split: str) -> list[str]:
 
 
 def clipped_boxes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
-    """Return the boxes (N, 4) of labels as x0, y0, x1, y1, pixels, clipped to their frames."""
+    """Return the boxes of N labels, clipped to their frames: x0, y0, x1, y1 (N, 4), pixels."""
     size = frame_sizes(labels, frames)
     boxes = labels[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     return np.clip(boxes, 0.0, np.hstack([size, size]))
 
 
 def frame_sizes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
-    """Return width and height (N, 2) of the frame of each label, pixels."""
+    """Return width and height of the frame of each of N labels (N, 2), pixels."""
     by_id = frames.set_index("frame_id")[["width_px", "height_px"]]
     return by_id.loc[labels["frame_id"]].to_numpy(np.float64).reshape(-1, 2)

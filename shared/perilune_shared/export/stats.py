@@ -10,12 +10,12 @@ from perilune_shared.errors import UserError
 
 
 def summary(dataset: Dataset) -> pd.DataFrame:
-    """Compute counts and quantiles, one row per split.
+    """Return a table of counts and quantiles, with one row per split.
 
     Columns: scenes, trajectories, frames, labels, labels per frame, quantiles of the radius in pixels, mean visible
     fraction, craters in view that are too large for a label (None if not known) and size of the PNGs (10^6 bytes).
 
-    Raises UserError if there are no frames or keys are inconsistent.
+    Raises UserError if there are no frames, or if the keys of labels and frames are inconsistent.
     """
     frames = dataset.table("frames", [*FRAME_COLUMNS, "split", "png_bytes", "n_craters_above_max_radius"])
     keys = KeyCheck(dataset, frames)

@@ -1,11 +1,12 @@
-"""Export trajectories to TUM and KITTI, one file per trajectory, for evo and the tools of both benchmarks.
+"""Export trajectories to the formats of TUM and KITTI, one file per trajectory.
 
-Poses are camera poses: the position of the centre of projection, and the rotation from O_C (x right, y down, z along
-the viewing direction) to the reference frame, e.g. rotation_site_from_camera for O_L.
+evo and the tools of both benchmarks read these files. A pose is the pose of the camera: the position of the centre of
+projection, and the rotation from O_C (x right, y down, z along the viewing direction) to the reference frame. For the
+reference frame O_L, this is rotation_site_from_camera.
 
 - TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): `timestamp tx ty tz qx qy qz qw`, reference O_L.
-- KITTI (https://www.cvlibs.net/datasets/kitti/eval_odometry.php): the upper 3x4 of the pose, row by row; the reference
-is the first camera pose of the file, so the first line is the identity. Times are in a second file.
+- KITTI (https://www.cvlibs.net/datasets/kitti/eval_odometry.php): the upper 3x4 of the pose matrix, row by row; the
+reference is the first camera pose of the file, so the first line is the identity. Times are in a second file.
 """
 
 from collections.abc import Iterator
@@ -32,13 +33,13 @@ _TUM_HEADER = (
 def export_tum(dataset: Dataset, out: Address, progress: Progress, split: str | None = None) -> int:
     """Write `out`/<scene_id>/<trajectory_id>.txt for each trajectory, in TUM's format.
 
-    Returns their number. With `split`, writes only frames of that split. Raises UserError if `out` is not empty or the
-    split has no frames.
+    Returns the number of trajectories. With `split`, writes only frames of that split. Raises UserError if `out` is not
+    empty or the split has no frames.
     """
     n_trajectories = 0
     with new_files(out) as folder:
         for scene_id, trajectory_id, frames in _trajectories(dataset, progress, "tum", split):
-            # Conjugate: the manifest contains rotation_camera_from_site.
+            # The manifest contains rotation_camera_from_site; TUM needs its inverse, the conjugate quaternion.
             w, x, y, z = np.stack(frames["rotation_wxyz"].to_list()).T
             rows = np.column_stack([frames["time_s"], np.stack(frames["position_m"].to_list()), -x, -y, -z, w])
             path = files.inside(folder, f"{scene_id}/{trajectory_id}.txt")
@@ -66,7 +67,7 @@ def export_kitti(dataset: Dataset, out: Address, progress: Progress, split: str 
 
 
 def poses_site_from_camera(frames: pd.DataFrame) -> Array:
-    """Return homogeneous matrices (N, 4, 4) from O_C to O_L, metres, for rows of the table frames."""
+    """Return the camera poses of N rows of the table frames: matrices (N, 4, 4) from O_C to O_L, metres."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = matrix_from_quaternion(np.stack(frames["rotation_wxyz"].to_list())).swapaxes(1, 2)
     poses[:, :3, 3] = np.stack(frames["position_m"].to_list())

@@ -1,8 +1,8 @@
-"""Export to YOLO: one text file per image, with a line `class cx cy w h` per crater, in fractions of its size.
+"""Export to YOLO: one text file per image, with a line `class cx cy w h` per crater.
 
-Format: https://docs.ultralytics.com/datasets/detect (read by all tools derived from Darknet). Trainers expect the
-labels of `images/a/b.png` in `labels/a/b.txt`. Boxes are clipped to the image. The format has no ignored objects:
-labels that are not selected are omitted.
+Centre and size of the box are fractions of the image size. Boxes are clipped to the image. The format has no ignored
+objects, so labels that are not selected are omitted. Trainers expect the labels of `images/a/b.png` in
+`labels/a/b.txt`. Format: https://docs.ultralytics.com/datasets/detect (read by all tools derived from Darknet).
 """
 
 from collections import defaultdict
@@ -35,8 +35,8 @@ def export_yolo(
 ) -> int:
     """Write images/, labels/, <split>.txt and data.yaml into `out`; return the number of boxes.
 
-    Images are copied, or with `link` hard-linked where the file system allows it. An image without craters has an empty
-    label file. Raises UserError if `out` is not empty, an image is missing or the split has no frames.
+    Images are copied. With `link`, they are hard links if the file system allows it. An image without craters has an
+    empty label file. Raises UserError if `out` is not empty, an image is missing or the split has no frames.
     """
     task = progress.add_task("yolo", total=count_scenes(dataset, split), unit="scenes")
     lists: dict[str, list[str]] = defaultdict(list)
@@ -63,14 +63,13 @@ def export_yolo(
             progress.advance(task)
         for name, entries in lists.items():
             files.write_text(folder / f"{name}.txt", "".join(entries))
-        # Without `path`, readers look for the lists next to this file, so the folder can be moved.
+        # Without the key `path`, readers look for the lists next to data.yaml, so the folder can be moved.
         present = [f"{name}: {name}.txt\n" for name in SPLITS if name in lists]
         files.write_text(folder / "data.yaml", "".join(present) + f"names:\n  {CRATER_CLASS}: crater\n")
     return n_boxes
 
 
 def _write_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
-    """Write the PNGs of frames as images/<frame_id>.png."""
     rows = frames[["frame_id", "png_path"]]
     if dataset.info.images == "files" and dataset.store.is_local:
         for row in rows.to_dict("records"):

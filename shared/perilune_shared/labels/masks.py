@@ -1,8 +1,8 @@
-"""Crater masks of a frame, computed on demand: the whole interior of the rim (amodal) and its visible part.
+"""Compute the masks of the craters in a frame: the interior of the rim (amodal) and its visible part.
 
 A pixel belongs to a crater if the ray through the pixel's centre intersects the disc inside the rim circle. This is
 exact, with and without lens distortion. The pixel is visible unless the terrain in the frame's EXR (depth, channel Z)
-is nearer than the disc; the crater's floor lies behind the disc. Since the terrain around the disc is rough, terrain
+is nearer than the disc; the crater's floor lies behind the disc. The terrain around the disc is rough. Therefore it
 hides a pixel only if it is nearer than the disc by more than a tenth of the radius and by more than two pixel widths,
 as for `visible_fraction`. Use:
 
@@ -33,7 +33,7 @@ _CRATER = ["crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z",
 
 @dataclass(frozen=True, slots=True)
 class CraterMask:
-    """Masks of one crater in a window of the image; the window ends at the image edge."""
+    """Masks of one crater in a window: a rectangle around the crater, cut off at the image edge."""
 
     crater_id: int
     """Id of the crater in the frame's scene."""
@@ -42,9 +42,9 @@ class CraterMask:
     column: int
     """First column of the window, pixels from the left of the image."""
     amodal: NDArray[np.bool_]
-    """Whether each pixel's centre is inside the rim, hidden or not (h, w)."""
+    """Whether each pixel's centre is inside the rim, even if terrain hides it (h, w)."""
     visible: NDArray[np.bool_] | None
-    """Whether each pixel is in `amodal` and no nearer terrain hides it (h, w); None if no depth was given."""
+    """Whether each pixel is in `amodal` and no terrain hides it (h, w); None if no depth was given."""
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -60,12 +60,14 @@ def frame_masks(
     depth_m: NDArray[np.floating] | None = None,
     image: Literal["png", "exr"] = "png",
 ) -> list[CraterMask]:
-    """Compute the masks of a frame's labelled craters, in the order of the labels, or of the given `crater_ids`.
+    """Return the masks of craters in a frame, in the order of `crater_ids`.
 
-    With `image` "png" the masks, like the labels, are in pixels of `camera` in dataset.json. With "exr" they are in
-    pixels of `exr_camera`, which differ if the lens has distortion. depth_m (h, w) is always the EXR's channel Z,
-    infinite where no terrain is hit; for "png" it is sampled at the nearest pixel. Raises UserError on an unknown frame
-    or crater and on a depth of another size.
+    Without `crater_ids`, returns the masks of the frame's labelled craters, in the order of the labels.
+
+    With `image` "png", the masks are in pixels of `camera` in dataset.json, like the labels. With "exr", they are in
+    pixels of `exr_camera`; the two differ if the lens has distortion. `depth_m` (h, w) is always the EXR's channel Z,
+    infinite where no terrain is hit; for "png" it is sampled at the nearest pixel. Raises UserError if the frame or a
+    crater is unknown, or if `depth_m` has another size than the EXR.
     """
     scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
     columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz", "velocity_mps", "camera", *ANGULAR_VELOCITY]
@@ -115,19 +117,20 @@ def crater_masks(
     radii_m: Array,
     depth_m: NDArray[np.floating] | None = None,
 ) -> list[CraterMask]:
-    """Compute the masks of N rim circles in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3).
+    """Return the masks of the craters with the given rim circles.
 
-    Masks and depth_m (h, w) are in the pixels of `camera`; depth is along its optical axis. A mask has no pixels
-    if the rim is outside the image or not wholly in front of the camera.
+    The N circles are in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3). Masks and `depth_m` (h, w)
+    are in the pixels of `camera`; the depth is measured along the optical axis, metres. A mask has no pixels if the rim
+    is outside the image or not wholly in front of the camera.
     """
     rays = camera.rays(camera.pixel_centres())
     size = np.array([camera.width_px, camera.height_px])
     boxes = project_circles(camera, centres_camera_m, normals_camera, radii_m).bounding_boxes()
-    # Under distortion the ellipse is a fit and may differ from the rim's image.
+    # With distortion, the ellipse is only fitted to the rim's image, which may reach beyond the ellipse's box.
     margin = 1 if any(camera.distortion) else 0
-    none = np.isnan(boxes).any(axis=1, keepdims=True)
-    first = np.clip(np.where(none, 0, np.floor(boxes[:, :2]) - margin), 0, size).astype(int)
-    last = np.clip(np.where(none, 0, np.ceil(boxes[:, 2:]) + margin), first, size).astype(int)
+    without_box = np.isnan(boxes).any(axis=1, keepdims=True)
+    first = np.clip(np.where(without_box, 0, np.floor(boxes[:, :2]) - margin), 0, size).astype(int)
+    last = np.clip(np.where(without_box, 0, np.ceil(boxes[:, 2:]) + margin), first, size).astype(int)
     masks = []
     for k, crater_id in enumerate(crater_ids):
         (x0, y0), (x1, y1) = first[k], last[k]
@@ -147,7 +150,7 @@ def crater_masks(
 
 
 def _resampled(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
-    """Resample a depth image from camera `source` to camera `camera` in the same pose, by nearest pixel."""
+    """Resample a depth image of camera `source` to the pixels of `camera`, which has the same pose."""
     pixel = np.floor(source.project(camera.rays(camera.pixel_centres())))
     column = np.clip(pixel[..., 0], 0, source.width_px - 1).astype(int)
     row = np.clip(pixel[..., 1], 0, source.height_px - 1).astype(int)

@@ -24,21 +24,21 @@ _CRATER = ["scene_id", "crater_id", "depth_m", "diameter_m"]
 
 
 def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
-    """Return whether each label (N,) is selected.
+    """Return whether each label is in a selection, bool (N,).
 
     Needs the columns radius_px, visible_fraction, sunlit_fraction, contrast, depth_m and diameter_m (see
-    `read_labels`). An unknown contrast (NaN, in migrated datasets) passes the threshold; any other unknown value fails
-    it.
+    `read_labels`). A label without a known contrast (NaN, in migrated datasets) passes the threshold of contrast. A
+    label without another value fails the threshold of this value.
     """
     radius_px = np.asarray(labels["radius_px"])
     chosen = np.ones(len(radius_px), np.bool_)
     if selection.radius_px is not None:
-        least_px, largest_px = selection.radius_px
-        chosen &= (radius_px >= least_px) & (radius_px <= (np.inf if largest_px is None else largest_px))
+        min_px, max_px = selection.radius_px
+        chosen &= (radius_px >= min_px) & (radius_px <= (np.inf if max_px is None else max_px))
     for column in ("visible_fraction", "sunlit_fraction"):
-        least = getattr(selection, f"min_{column}")
-        if least is not None:
-            chosen &= np.asarray(labels[column]) >= least
+        minimum = getattr(selection, f"min_{column}")
+        if minimum is not None:
+            chosen &= np.asarray(labels[column]) >= minimum
     if selection.min_contrast is not None:
         contrast = limited_contrast(np.asarray(labels["contrast"]), radius_px, selection.contrast_pixels)
         chosen &= (contrast >= selection.min_contrast) | np.isnan(contrast)
@@ -48,9 +48,9 @@ def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
 
 
 def limited_contrast(contrast: NDArray, radius_px: NDArray, pixels: float | None) -> NDArray:
-    """Return the contrast (N,) if at most `pixels` pixels per crater count as independent.
+    """Return the contrast (N,) of labels, computed as if from at most `pixels` independent pixels.
 
-    None sets no limit.
+    `radius_px` (N,) determines how many pixels are around each crater. `pixels` None sets no limit.
     """
     if pixels is None:
         return contrast
@@ -59,7 +59,10 @@ def limited_contrast(contrast: NDArray, radius_px: NDArray, pixels: float | None
 
 
 def label_bound_px(info: DatasetInfo) -> float:
-    """Return a dataset's maximum label radius, pixels: from the recipes, or the default if they do not state it."""
+    """Return a dataset's maximum label radius, pixels.
+
+    It is the largest `labels.max_radius_px` of the recipes, or the default for the widest camera if no recipe sets it.
+    """
     stated = [recipe.config.get("labels") for recipe in info.recipes.values()]
     bounds = [labels.get("max_radius_px") for labels in stated if isinstance(labels, dict)]
     numbers = [float(bound) for bound in bounds if isinstance(bound, int | float) and bound > 0]
@@ -68,10 +71,10 @@ def label_bound_px(info: DatasetInfo) -> float:
 
 
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:
-    """Read the labels of one split or all, with the columns that `selected` needs and the additional `columns`.
+    """Return the labels of one split or all, with the columns that `selected` needs and `columns`.
 
     Rows are in the order of the table labels. Depth and diameter (metres) come from the table craters, joined by
-    scene_id and crater_id. Raises UserError if a part cannot be read or keys are broken.
+    scene_id and crater_id. Raises UserError if a part cannot be read, or if keys of labels and frames are inconsistent.
     """
     names = list(dict.fromkeys(["frame_id", "scene_id", "crater_id", *_THRESHOLDED, *columns]))
     rows = dataset.table("labels", list(dict.fromkeys([*names, "split"])))

@@ -29,9 +29,9 @@ class Selection(Section):
     """Minimum contrast: the shading of the crater itself in the frame, divided by its standard error from noise and
     clutter."""
     contrast_pixels: Positive | None = None
-    """Maximum number of pixels that count as independent in the contrast. In a larger neighbourhood the contrast is
-    divided by the square root of the ratio, since neighbouring pixels of a blurred, cluttered frame are alike. null
-    counts all."""
+    """Maximum number of pixels around a crater that count as independent in the contrast. If there are k times as many
+    pixels, the contrast is divided by the square root of k, since neighbouring pixels of a blurred, cluttered frame are
+    alike. null: all pixels count."""
 
 
 SELECTIONS: dict[str, Selection] = {
@@ -46,14 +46,17 @@ SELECTIONS: dict[str, Selection] = {
         contrast_pixels=250.0,
     ),
 }
-"""`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (true of every label).
-`visible`: craters above a threshold of contrast, for training and evaluation (docs/explanation/labels.md)."""
+"""`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (every label's centre is).
+`visible`: craters that can be seen in the frame, for training and evaluation (docs/explanation/labels.md)."""
 
 
 REACH_RADII = 1.5
-"""The contrast is measured within this distance of the crater's centre, in radii."""
+"""Distance from the crater's centre within which the contrast is measured, in radii."""
 
 
 def default_label_bound_px(width_px: int) -> float:
-    """Return the default maximum radius of a label, pixels: 50 up to 256 px width, proportional to the width above."""
+    """Return the default maximum radius of a label in an image of a given width, pixels.
+
+    It is 50 px up to a width of 256 px, and proportional to the width of wider images.
+    """
     return max(50.0, width_px * 50 / 256)

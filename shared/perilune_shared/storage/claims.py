@@ -1,7 +1,7 @@
 """Claim an address of an object store, so that only one run writes a whole dataset there.
 
-An object store has no locks. A claim is an object that its holder renews. A claim is ignored if it was not renewed for
-60 seconds, or if its process ran on this machine and has ended.
+An object store has no locks. A claim is an object that the process of the run renews. A claim is ignored if it was not
+renewed for 60 seconds, or if its process ran on this machine and has ended.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _LARGEST_BYTES = 10_000
 
 @contextlib.contextmanager
 def claimed(store: Store, folder: str) -> Iterator[None]:
-    """Hold a claim below `folder` of a store within the block.
+    """Hold a claim, a file below `folder` of a store, within the block.
 
     Raises UserError if another process holds a claim.
     """
@@ -61,7 +61,7 @@ def claimed(store: Store, folder: str) -> Iterator[None]:
 def _check_ended(store: Store, claim: dict[str, Any]) -> None:
     """Raise UserError unless the holder of a claim has ended."""
     left_s = _EXPIRY_S - (time.time() - claim["updated"])
-    if left_s <= 0 or (claim["system"] == _system() and not _runs_elsewhere(claim["pid"])):
+    if left_s <= 0 or (claim["system"] == _system() and not _is_other_process(claim["pid"])):
         return
     found = f"written by PID {claim['pid']} on host {claim['host']}"
     raise UserError(store, "--out", found, f"another address; if that process was killed, wait {left_s:.0f} s")
@@ -72,7 +72,7 @@ def _write(store: Store, path: str, claim: dict[str, Any]) -> None:
 
 
 def _read(store: Store, path: str, size_bytes: int) -> dict[str, Any] | None:
-    """Read a claim; None if it has just been removed, or is damaged."""
+    """Return the content of a claim; None if the file was removed meanwhile or is damaged."""
     try:
         content = json.loads(store.read(path)) if size_bytes <= _LARGEST_BYTES else {}
         fields = (("pid", int), ("host", str), ("system", str), ("updated", float))
@@ -81,8 +81,8 @@ def _read(store: Store, path: str, size_bytes: int) -> dict[str, Any] | None:
         return None
 
 
-def _runs_elsewhere(pid: int) -> bool:
-    """Whether a process other than this one has this id."""
+def _is_other_process(pid: int) -> bool:
+    """Whether another running process has this id."""
     if pid == os.getpid():
         return False
     try:

@@ -97,7 +97,10 @@ def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: Non
 
 
 def is_plain(relative: object) -> bool:
-    """Whether `relative` is a relative POSIX path of plain names; does not check links."""
+    """Whether `relative` is a relative POSIX path of plain names (letters, digits, ".", "_" and "-").
+
+    Does not check links.
+    """
     short = isinstance(relative, str) and len(relative) <= _LONGEST_PATH
     parts = PurePosixPath(str(relative)).parts if short else ()
     return bool(parts) and all(_PLAIN_NAME.fullmatch(part) for part in parts)
@@ -152,9 +155,9 @@ def _without_links(path: Path) -> Path:
 
 
 def check_plain_file(path: Path) -> int:
-    """Return the size of a file, bytes.
+    """Return the size of a regular file, bytes.
 
-    Raises UserError on pipes, devices and other types: opening them may block.
+    Raises UserError if the file is missing, a link, a folder, a pipe or a device; opening a pipe may block.
     """
     try:
         state = path.lstat()
@@ -170,8 +173,8 @@ def check_plain_file(path: Path) -> int:
 def new_folder(out: Path) -> Iterator[Path]:
     """Yield a hidden folder beside `out`; rename it to `out` on success, remove it on any failure.
 
-    Files are synchronised to disk before the rename. Folders that killed writers left for the same `out` are removed.
-    Raises UserError if `out` is not empty or another process is writing it.
+    Files are synchronised to disk before the rename. Hidden folders that killed writers left for the same `out` are
+    removed. Raises UserError if `out` is not empty or another process is writing to it.
     """
     check_free(out)
     out = out.absolute()  # "." has no name from which to form a temporary name
@@ -203,7 +206,7 @@ def check_free(out: Path) -> None:
 
 
 def copy_or_link(path: Path, to: Path, *, link: bool) -> None:
-    """Copy a frame's file to `to`; with `link`, make a hard link where the file system allows it.
+    """Copy a frame's file to `to`; with `link`, make a hard link if the file system allows it.
 
     Copies are reflinks (copy-on-write) where the file system supports them. Raises UserError if the file is missing.
     """

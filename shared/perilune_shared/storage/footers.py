@@ -1,7 +1,4 @@
-"""Check the sizes in the footer of a Parquet file, before anything is decompressed.
-
-The footer is untrusted.
-"""
+"""Check the sizes in the untrusted footer of a Parquet file, before anything is decompressed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +8,9 @@ from perilune_shared.errors import UserError
 
 _MAX_BYTES = 8 * 2**30
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
-"""Bound on compression: no data compresses by a larger factor."""
+"""Limits of compression: n bytes may become _SPARE_BYTES + _MAX_COMPRESSION n bytes. Real data compresses less."""
 _NESTED_ROWS = "labels."
-"""Prefix of the columns of a shard that contain rows of another table: any number of rows for each frame."""
+"""Prefix of the columns of a shard that contain rows of the table labels: any number of rows for each frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +33,11 @@ DATASET_LIMITS = FooterLimits()
 def check_footer(
     footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, address: str, limits: FooterLimits | None = None
 ) -> None:
-    """Check the numbers of rows and values, and the bytes after decompression, of a file of `n_bytes` bytes.
+    """Check the numbers of rows and values and the decompressed size that a footer states.
 
-    `footer` is pyarrow's metadata of the file, `columns` has index and path of each column that will be read. Without
-    `limits`, the limits of a dataset apply. Raises UserError about `address` if a number exceeds its limit, ValueError
-    if a row group has other columns than the file.
+    `footer` is pyarrow's metadata of the file, `n_bytes` the size of the file, and `columns` has index and path of each
+    column that will be read. Without `limits`, the limits of a dataset apply. Raises UserError about `address` if a
+    number exceeds its limit, and ValueError if a row group has another number of columns than the file.
     """
     limits = limits or DATASET_LIMITS
     max_rows = min(limits.rows, limits.spare_rows + n_bytes // limits.bytes_per_row)

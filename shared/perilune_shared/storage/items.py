@@ -26,8 +26,8 @@ def local_items(folder: Path, prefix: str) -> Iterator[Item]:
     """
     try:
         with os.scandir(folder) as scanned:
-            # The slash sorts "a-b" before "a/b", as in the listing of an object store. Directory entries of millions
-            # of files would fill memory, so only names are kept.
+            # With a slash, the folder "a" comes after the file "a-b", as in the listing of an object store. Keep only
+            # names, since directory entries of millions of files would fill memory.
             names = sorted(entry.name + ("/" if entry.is_dir(follow_symlinks=False) else "") for entry in scanned)
     except FileNotFoundError:
         return
@@ -60,9 +60,9 @@ def object_items(objects: Mapping[str, Any], prefix: str, address: str) -> Itera
 
 
 def checked_size(size: object, where: str) -> int:
-    """Return the size that a store states for an object, bytes.
+    """Return `size`, which a store states for an object, in bytes.
 
-    Raises UserError if it is not a valid size.
+    Raises UserError about `where` if it is not a valid size.
     """
     if isinstance(size, bool) or not isinstance(size, int) or not 0 <= size < 2**53:
         raise UserError(where, "size", repr(size), "the size of an object, bytes")

@@ -61,7 +61,7 @@ def remove_temporary_files(folder: Path) -> None:
 
 @contextlib.contextmanager
 def lock(path: Path, folder: Path) -> Iterator[None]:
-    """Hold the lock file `path`, which protects `folder`. Raises UserError if another process holds it."""
+    """Lock the file `path`, which protects `folder`. Raises UserError if another process holds the lock."""
     file_lock, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
         try:
@@ -79,7 +79,7 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
             yield
     finally:
         if file_lock.is_locked:
-            # Remove the file before releasing the lock: later it may be the lock of another process.
+            # Remove the file before releasing the lock: after the release, it may be the lock of another process.
             if not held_elsewhere:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
@@ -87,10 +87,9 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
 
 
 def _seconds_left(record: Path) -> float:
-    """Return the seconds until the record of a process on another machine expires.
+    """Return the seconds until the record of a process on another machine expires; 0 without a record.
 
-    Returns 0 if there is no such record. A record from this machine is ignored: since the lock was free, that process
-    has ended.
+    A record from this machine is ignored: since the lock was free, its process has ended.
     """
     holder = _read(record)
     if holder is None or holder.get("boot_id") == _boot_id():
@@ -138,7 +137,10 @@ def _locked_error(folder: Path, holder: dict[str, Any] | None, expected: str) ->
 
 
 def _boot_id() -> str:
-    """Return an id of the running kernel: equal in all containers of a machine, different after each boot."""
+    """Return an id of the running kernel.
+
+    It is equal in all containers of a machine, and different after each boot.
+    """
     with contextlib.suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return platform.node()

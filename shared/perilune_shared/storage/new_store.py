@@ -1,4 +1,4 @@
-"""Write a new dataset to a local folder or an object store so that it appears as a whole or not at all."""
+"""Write a new dataset to a folder or an object store so that it appears as a whole or not at all."""
 
 import contextlib
 import secrets
@@ -15,11 +15,12 @@ _NONCE_BITS = 64
 
 @contextlib.contextmanager
 def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
-    """Yield a store for new files; remove what was written on any failure.
+    """Yield a store for the files of a new dataset; on any failure, remove the written files.
 
-    A local folder is renamed to `out` at the end. In an object store, the file `claim` excludes other writers, since it
-    is written only if it does not exist. `content` is its content, the JSON of an unfinished dataset; the caller
-    replaces this file last. Raises UserError if `out` is not empty or another process is writing to it.
+    For a local `out`, the store is a hidden folder, which is renamed to `out` at the end. In an object store, the file
+    `claim` is written first, and only if it does not exist, so it excludes other writers. `content`, the JSON of an
+    unfinished dataset, is the content of this file; the caller replaces the file last. Raises UserError if `out` is not
+    empty or another process is writing to it.
     """
     store = open_store(out)
     if store.folder is not None:
@@ -45,11 +46,12 @@ def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
 
 @contextlib.contextmanager
 def new_files(out: Address) -> Iterator[Path]:
-    """Yield a local folder for new files, which become the files at `out` when the block ends without an error.
+    """Yield a local folder for new files; at the end of the block, move the files to `out`.
 
-    The folder is renamed to a local `out`. Into an object store the files are copied; existing objects are not
-    overwritten, and on any failure the copies are removed. Raises UserError if `out` is not empty or another process is
-    writing to it.
+    If the block raises an error, nothing is written to `out`. For a local `out`, the folder is renamed. If `out` is in
+    an object store, the files are copied, and a failed copy removes the copied files. Existing objects are never
+    overwritten: if another process writes there at the same time, the copy stops with a UserError and removes nothing,
+    since objects of equal content may belong to that process. Raises UserError too if `out` is not empty.
     """
     store = open_store(out)
     if store.folder is not None:

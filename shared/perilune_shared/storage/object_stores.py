@@ -1,4 +1,4 @@
-"""Open object stores with fsspec, and convert its exceptions to one-line errors that name the address."""
+"""Open object stores with fsspec, and convert their exceptions to errors that name the address."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ from typing import Any
 from perilune_shared.errors import UserError, one_line
 
 OBJECT_STORES = {"s3": "s3", "gs": "gcs", "memory": ""}
-"""The extra of perilune-shared that each kind of object store needs."""
+"""Kinds of object stores, with the extra of perilune-shared that each kind needs; empty if it needs no extra."""
 _TIMEOUTS_S = {"connect_timeout": 10, "read_timeout": 60}
 _LIBRARIES = ("aiohttp", "aiobotocore", "botocore", "fsspec", "gcsfs", "google", "requests", "s3fs", "urllib3")
 """Packages whose exceptions `store_faults` converts, besides OSError."""
@@ -22,9 +22,9 @@ _CREDENTIALS = {
 
 
 def file_system(kind: str, address: str) -> Any:
-    """Return fsspec's file system for a kind of store.
+    """Return fsspec's file system for a kind of store; `address` is for messages.
 
-    Listings are not cached, since other processes may write.
+    Listings are not cached, since other processes may write. Raises UserError if the library of the store is missing.
     """
     import fsspec
 
@@ -49,8 +49,8 @@ def is_missing_bucket(error: Exception) -> bool:
 def store_faults(address: str) -> Iterator[None]:
     """Convert any exception of an object store to a UserError that names `address`.
 
-    The library has already retried the request. FileExistsError and FileNotFoundError about a single object are not
-    converted, since callers handle them.
+    Requests are not repeated, since the library has already done so. FileExistsError and FileNotFoundError about a
+    single object are not converted, since callers handle them.
     """
     try:
         yield

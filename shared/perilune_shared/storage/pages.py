@@ -1,7 +1,7 @@
 """Compute the decompressed size of a Parquet column from its page headers.
 
-The sizes in the footer are untrusted: a Parquet reader allocates what the page headers state. Headers are in Thrift's
-compact protocol, with the fields of parquet.thrift.
+A Parquet reader allocates the sizes that the page headers state, and the footer of an untrusted file may state smaller
+sizes. Headers are in Thrift's compact protocol, with the fields of parquet.thrift.
 """
 
 from dataclasses import dataclass
@@ -27,10 +27,7 @@ class Pages:
 
 
 def range_of(column: Any) -> tuple[int, int]:
-    """Return the byte range (start, end) of a column's pages in the file.
-
-    `column` is pyarrow's column metadata.
-    """
+    """Return the byte range (start, end) of a column's pages; `column` is pyarrow's column metadata."""
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
         start = column.dictionary_page_offset
@@ -38,7 +35,7 @@ def range_of(column: Any) -> tuple[int, int]:
 
 
 def pages_of(stream: BinaryIO, column: Any) -> Pages:
-    """Read all page headers of a column from an open file; `column` is pyarrow's column metadata.
+    """Return totals from all page headers of a column; `column` is pyarrow's column metadata.
 
     Raises ValueError if a header is damaged.
     """

@@ -7,7 +7,7 @@ from typing import Any
 
 _BLOCK_BYTES = 2**22
 _MAX_GAP_BYTES = 2**18
-"""Ranges this close to each other are read with one request: a request costs more than these bytes."""
+"""Maximum gap between ranges that share a request: a further request takes longer than reading this many bytes."""
 _MARGIN_BYTES = 2**14
 """Bytes read beyond each range, for readers that do not know where a header ends."""
 
@@ -15,7 +15,7 @@ _MARGIN_BYTES = 2**14
 class Ranges(io.RawIOBase):
     """A stored object as a read-only file.
 
-    Bytes that are neither kept nor fetched are read in blocks of 4 MiB.
+    Bytes that were read ahead by `keep` or `fetched` come from memory; others are read in blocks of 4 MiB.
     """
 
     def __init__(self, read: Callable[[int, int], bytes], size_bytes: int):
@@ -31,7 +31,7 @@ class Ranges(io.RawIOBase):
 
     @contextlib.contextmanager
     def fetched(self, ranges: Iterable[tuple[int, int]]) -> Iterator[None]:
-        """Keep ranges (start, end) inside the `with` block; neighbouring ranges share a request."""
+        """Read ranges (start, end), and keep them within the block; neighbouring ranges share a request."""
         joined: list[list[int]] = []
         for start, end in sorted(ranges):
             first, last = max(start, 0), min(end + _MARGIN_BYTES, self.size_bytes)

@@ -1,10 +1,10 @@
 """Open untrusted rasters with rasterio, in a few documented formats and without reading other files.
 
 GDAL, which rasterio calls, opens more than a user expects. It recognises about a hundred formats whatever the suffix,
-among them text that refers to other files or to addresses, and it reads files beside a raster or named in its tags.
-Therefore this module recognises the format, permits only the driver of that format, and opens the raster through a
-temporary folder that contains links to the raster's files alone. rasterio is optional in some packages, so it is
-imported where it is used.
+among them text that refers to other files or to addresses. It also reads files that are beside a raster or named in the
+raster's tags. Therefore this module recognises the format itself, permits only the driver of this format, and opens the
+raster in a temporary folder that contains links to the raster's files and no other files. rasterio is optional in some
+packages, so it is imported where it is used.
 """
 
 import contextlib
@@ -71,8 +71,8 @@ class RasterFiles:
     driver: str
     """GDAL's short name of the driver."""
     named: tuple[tuple[str, Path], ...]
-    """Name and path of each file: first the file that GDAL opens, then data named by a label, then a world file. A
-    label may name its data file in different letter case."""
+    """Name and path of each file: first the file that GDAL opens, then data named by a label, then a world file. The
+    name of a data file is written as in the label; in the path, the letter case may differ."""
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -86,12 +86,13 @@ def raster_files(
     field: str = "raster",
     tiles: Sequence[str] | None = None,
 ) -> RasterFiles:
-    """Return the files of a raster in one of the formats of `drivers`; GDAL opens only the tiles of a VRT here.
+    """Return the files of a raster in one of the formats of `drivers`.
 
-    A VRT, GDAL's text format that joins several rasters, is permitted only with `tiles`: all files that it may refer
-    to, as paths relative to its folder. Raises UserError if the file is missing or has another format, if a label names
-    a file outside its folder, if a VRT refers to files not in `tiles` or does more than join them, or if one of the
-    files is not a regular file.
+    A VRT, GDAL's text format that joins several rasters, is permitted only with `tiles`: all files to which it may
+    refer, as paths relative to its folder. GDAL opens these tiles, so that they are checked; it does not open the
+    raster itself. `field` is the name of the setting in messages. Raises UserError if the file is missing or has
+    another format, if a label names a file outside its folder, if a VRT refers to files not in `tiles` or does more
+    than join them, or if one of the files is not a regular file.
     """
     if not path.is_file():
         found = "no such file" if not path.exists() else "a folder, a pipe or a device"
@@ -119,8 +120,8 @@ def raster_files(
 def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
     """Open a raster and yield it as a `rasterio.DatasetReader`. Needs rasterio.
 
-    Other files beside the raster (.aux.xml, .ovr, .msk) are not read. Raises UserError if reading fails, here or in the
-    body of the `with` statement, if tags or projection refer to other files, or if a block of the raster is too large.
+    Other files beside the raster (.aux.xml, .ovr, .msk) are not read. Raises UserError if the raster cannot be opened
+    or read, also within the `with` block; if tags or projection refer to other files; or if a block is too large.
     """
     import rasterio
     from rasterio._err import CPLE_BaseError
@@ -131,9 +132,8 @@ def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
         for name, file in files.named:
             (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
             if files.driver == "VRT" and file == path:
-                shutil.copyfile(
-                    file, Path(folder) / name
-                )  # a copy, since GDAL would follow a link to a VRT and look for the tiles there
+                # GDAL would follow a link to a VRT and look for the tiles in the original folder, so copy the VRT.
+                shutil.copyfile(file, Path(folder) / name)
             else:
                 (Path(folder) / name).symlink_to(file.resolve())
         try:
@@ -152,7 +152,7 @@ def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
 
 
 def label_text(files: RasterFiles) -> str:
-    """Return the text of a PDS label, without what follows its end."""
+    """Return the text of a PDS label, without the data after the label."""
     with files.paths[0].open("rb") as stream:
         return _label_in(stream.read(_LARGEST_LABEL_BYTES), files.driver)
 
@@ -165,7 +165,7 @@ def _label_in(head: bytes, driver: str) -> str:
 
 
 def _driver_of(head: bytes) -> str:
-    """Return GDAL's driver for a file that begins with `head`; empty if the format is not supported."""
+    """Return GDAL's driver for a file that begins with `head`, or "" if the format is not supported."""
     for magic, driver in _MAGIC.items():
         if head.startswith(magic):
             return driver
@@ -183,7 +183,7 @@ def _expected(drivers: Sequence[str]) -> str:
 
 
 def _hint(path: Path, head: bytes) -> str:
-    """Return advice for a file of another format."""
+    """Return advice on an unsupported file, to append to a message; "" if there is none."""
     if b"<VRTDataset" in head[: 2**16]:
         return f"; convert it with: gdal_translate {path.name} {path.stem}.tif, or list its tiles in vrt_files"
     for suffix in (".lbl", ".LBL", ".xml"):
@@ -194,7 +194,7 @@ def _hint(path: Path, head: bytes) -> str:
 
 
 def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[str]:
-    """Return the names of the files to which the label of a PDS or ISIS file points."""
+    """Return the names of the files that the label of a PDS or ISIS file names. Raises UserError."""
     label = _label_in(head, driver)
     complete = len(head) < _LARGEST_LABEL_BYTES or (driver != "PDS4" and _END.search(head) is not None)
     if driver == "PDS4":
@@ -243,18 +243,18 @@ def _vrt_files(path: Path, head: bytes, field: str, tiles: Sequence[str]) -> Ras
 
 
 def _beside(path: Path, name: str, field: str) -> Path | None:
-    """Return the file that a label names, in the folder of the label, ignoring letter case.
+    """Return the file `name` in the folder of the label `path`; None if it is missing.
 
-    Returns None if it is missing.
+    Ignores letter case. Raises UserError if it is not a regular file in this folder.
     """
     folder = path.resolve().parent
     beside = path.parent / name
     if not beside.exists():
-        # The letter case in labels often differs from the files.
+        # The letter case in labels often differs from the letter case of the file names.
         same = (entry for entry in path.parent.iterdir() if entry.name.lower() == name.lower())
         beside = next(same, beside)
     if not beside.exists():
-        return None  # GDAL reports missing data; other pointers may name documents that were not downloaded
+        return None  # GDAL reports missing data; a label may also name documents that were not downloaded
     if not beside.is_file():
         raise UserError(beside, field, "a folder, a pipe or a device", f"a regular file, which {path.name} names")
     if not beside.resolve().is_relative_to(folder):
@@ -273,7 +273,7 @@ def _world_file(path: Path) -> list[Path]:
 
 
 def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> None:
-    """Raise UserError if an open raster refers to other files, or if one of its blocks is too large."""
+    """Raise UserError if an open raster refers to other files, or if its blocks are too large."""
     if tags := raster.tags(ns="OVERVIEWS"):
         raise UserError(path, field, f"tags that name another file: {tags}", "a raster that refers to no other file")
     if any(not Path(file).is_relative_to(folder) for file in raster.files):
@@ -288,6 +288,6 @@ def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> Non
 
 
 def refuse_grids(where: object, crs: Any) -> None:
-    """Raise UserError if a coordinate reference system (`rasterio.crs.CRS`) names files, which PROJ would open."""
+    """Raise UserError if a `rasterio.crs.CRS` names files, which PROJ would open."""
     if grid := re.search(r"nadgrids|geoidgrids|\+grids|PARAMETERFILE", crs.to_wkt(), re.I):
         raise UserError(where, "projection", f"{grid[0]}, which names a file", "a projection without grids")

@@ -24,11 +24,13 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 def replaceable(
     out: Out, known_by: tuple[str, ...], *, overwrite: bool, inputs: tuple[str | Path, ...] = ()
 ) -> Iterator[Out]:
-    """Yield where a command should write: `out`, or with `overwrite` a new folder that replaces `out` at the end.
+    """Yield the path to which a command should write: `out`, or a new folder that will replace `out`.
 
-    The old folder stays until the new one is complete; an interrupted command leaves one of the two. `known_by` has
-    patterns of files that the command always writes. The folder is replaced only if each pattern matches a file in it,
-    so that a wrong `out` deletes no other data. `inputs` are the paths or addresses that the command reads.
+    With `overwrite`, the new folder replaces `out` at the end of the block. The old folder stays until the new folder
+    is complete, so an interrupted command leaves one of the two. `known_by` has patterns of files that the command
+    always writes. The folder is replaced only if each pattern matches a file in it, so that a wrong `out` deletes no
+    other data. `inputs` are the paths or addresses that the command reads.
+
     Without `overwrite`, raises UserError if the folder is not empty. With `overwrite`, raises UserError if a pattern
     has no match, if the folder contains an input or the current folder, or if `out` is in an object store.
     """
@@ -73,7 +75,7 @@ def _check_replaceable(
 
 
 def _replace(folder: Path, new: Path) -> None:
-    """Replace a folder by another one and delete the old one."""
+    """Replace `folder` by the folder `new`, and delete the old content."""
     with interrupts_held():
         if not _exchanged(folder, new):
             old = new.with_suffix(".old")
@@ -88,7 +90,10 @@ def _replace(folder: Path, new: Path) -> None:
 
 
 def _exchanged(folder: Path, other: Path) -> bool:
-    """Exchange two folders atomically if the system can (Linux), so that a killed process leaves both intact."""
+    """Try to exchange two folders atomically; return whether it succeeded.
+
+    A killed process then leaves both folders intact. Only Linux supports this, and not on all file systems.
+    """
     renameat2 = getattr(ctypes.CDLL(None), "renameat2", None) if os.name == "posix" else None
     names = os.fsencode(folder), os.fsencode(other)
     return (

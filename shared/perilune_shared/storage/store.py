@@ -1,4 +1,4 @@
-"""Read and write the files of a dataset by relative path, in a local folder or below a prefix of an object store.
+"""Read and write the files of a dataset in a local folder or below a prefix of an object store.
 
 Use:
 
@@ -6,8 +6,8 @@ Use:
     store.write("frames/s000/t000/000000.png", png) # atomic
     store.read("dataset.json")
 
-All paths are relative POSIX paths of plain names. Every fault of an object store raises a UserError that names the
-address.
+All paths are relative to the folder or prefix: POSIX paths of plain names. Every fault of an object store raises a
+UserError that names the address.
 """
 
 import abc
@@ -75,7 +75,10 @@ class Store(abc.ABC):
         return size
 
     def sha256(self, path: str, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
-        """Return the SHA-256 of a file (hexadecimal); calls `advance` with the bytes read since the last call."""
+        """Return the SHA-256 of a file (hexadecimal).
+
+        Calls `advance` with the number of bytes read since the last call.
+        """
         digest = hashlib.sha256()
         with self.open(path) as stream:
             while chunk := stream.read(_CHUNK_BYTES):
@@ -89,7 +92,7 @@ class Store(abc.ABC):
 
     @abc.abstractmethod
     def list(self, prefix: str = "") -> Iterator[Item]:
-        """Yield all files below a prefix, sorted by path; in a folder also links, pipes and devices."""
+        """Yield all files below a prefix, sorted by path; for a local folder also links, pipes and devices."""
 
     @abc.abstractmethod
     def size(self, path: str) -> int | None:
@@ -107,9 +110,9 @@ class Store(abc.ABC):
 
     @abc.abstractmethod
     def open(self, path: str) -> BinaryIO:
-        """Open a file for reading; only the ranges that are read are fetched.
+        """Open a file for reading. Raises UserError if it is missing.
 
-        Raises UserError if it is missing.
+        From an object store, only the ranges that are read are fetched, in blocks of 4 MiB.
         """
 
     @abc.abstractmethod
@@ -129,7 +132,7 @@ class Store(abc.ABC):
 
     @abc.abstractmethod
     def sync(self, paths: Iterable[str]) -> None:
-        """Synchronise files that were written without `durable` to disk; objects are durable once written."""
+        """Synchronise local files that were written with durable=False to disk; does nothing for objects."""
 
     @abc.abstractmethod
     def delete(self, path: str) -> None:
@@ -190,7 +193,7 @@ class LocalStore(Store):
         return (self.folder / path).open("rb")
 
     def _plain_or_linked(self, path: str) -> int:
-        """Return the size of a file, bytes; it may be a link within the folder.
+        """Return the size of a regular file or of the file to which a link within the folder leads, bytes.
 
         Raises UserError if it is missing.
         """
@@ -221,7 +224,10 @@ class LocalStore(Store):
 
 
 class ObjectStore(Store):
-    """A prefix of an object store, accessed through fsspec; works in forked processes and in several threads."""
+    """A prefix of an object store, accessed through fsspec.
+
+    The instance can be used in forked processes and in several threads.
+    """
 
     def __init__(self, address: str):
         self.address = address
@@ -234,7 +240,7 @@ class ObjectStore(Store):
 
     @property
     def _system(self) -> Any:
-        """fsspec's file system; opened again in a forked process, since connections do not survive a fork."""
+        """fsspec's file system; opened again after a fork, since connections do not survive a fork."""
         if self._pid != os.getpid():
             self._opened, self._pid = file_system(self._kind, self.address), os.getpid()
         return self._opened
@@ -301,7 +307,8 @@ class ObjectStore(Store):
             try:
                 self._system.pipe_file(self._key(path), content, mode="create")
             except Exception:
-                # If the answer to a first request was lost, its repetition finds the object that the first one wrote.
+                # The library repeats a request whose answer was lost. The repetition fails if the first request wrote
+                # the object, which then has the right content.
                 size = self.size(path)
                 if size is None:
                     raise
@@ -332,10 +339,8 @@ class ObjectStore(Store):
 def open_store(address: Address) -> Store:
     """Open the store at a path, s3://bucket/prefix, gs://bucket/prefix or memory://name.
 
-    Nothing is read or written.
-
-    An open store is returned unchanged. Raises UserError on another kind of address and if its library is not
-    installed.
+    Does not read or write files. An open store is returned unchanged. Raises UserError if the kind of address is
+    unknown, or if the library of the object store is not installed.
     """
     if isinstance(address, Store):
         return address

@@ -6,12 +6,13 @@ from typing import Any
 _BOOLS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, (9, 10), 12
 _MAX_DEPTH = 8
 _LONG = 15
+"""In the head of a list, this length means that the actual length follows."""
 Fields = dict[int, Any]
 """Field values of a struct, by field number in parquet.thrift; texts are bytes."""
 
 
 def parse(buffer: bytes, start: int = 0) -> tuple[Fields, int]:
-    """Parse the struct at an offset; return it and the offset after it.
+    """Return the struct at the offset `start`, and the offset of its end.
 
     Raises ValueError if the struct is damaged.
     """
@@ -23,7 +24,7 @@ def parse(buffer: bytes, start: int = 0) -> tuple[Fields, int]:
 
 
 def items_of(buffer: bytes, number: int) -> Iterator[Fields]:
-    """Yield the structs in the list with a given field number, one at a time to limit memory.
+    """Yield the structs of the list in field `number` of a struct, one at a time to limit memory.
 
     Raises ValueError if the struct is damaged.
     """
@@ -76,7 +77,7 @@ def _signed(value: int) -> int:
 
 
 def _value(kind: int, buffer: bytes, at: int, depth: int) -> tuple[Any, int]:
-    """Parse a value; return it and the offset after it. Raises IndexError past the end of the buffer."""
+    """Return a value and the offset of its end. Raises IndexError if it extends beyond the buffer."""
     if kind in _INTEGERS:
         value, at = _varint(buffer, at)
         return _signed(value), at

@@ -1,4 +1,4 @@
-"""Check frames of several cameras on one body: camera names, and poses at one instant against the mountings."""
+"""Check frames of several cameras on one body: names of trajectories, and poses at one instant."""
 
 from collections.abc import Iterator
 
@@ -16,10 +16,10 @@ _COLUMNS = ["frame_id", "trajectory_id", "frame_index", "time_s", "split", "posi
 
 
 def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault]:
-    """Yield the faults of the frames of one scene in a dataset of several cameras; `where` is their file.
+    """Yield the faults of a scene's frames in a dataset with several cameras; `where` is their file.
 
     The pose of the body is computed from the pose and the mounting of each camera. Body pose, time and split must be
-    equal for all cameras at one instant. Frames of unknown cameras are reported with their trajectory.
+    equal for all cameras at one instant. Frames of unknown cameras are skipped; `trajectory_faults` reports them.
     """
     cameras = dataset.info.cameras or {}
     rows = dataset.table("frames", _COLUMNS, scene_id=scene_id).to_pandas()
@@ -47,7 +47,7 @@ def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault
 
 
 def _body_poses(dataset: Dataset, rows: pd.DataFrame) -> np.ndarray:
-    """Return body poses (N, 12) from each row's camera: position in O_L, metres, then rotation_site_from_body."""
+    """Return the body pose of each row (N, 12): position in O_L, metres, then rotation_site_from_body."""
     position = np.stack(rows["position_m"].to_list())
     rotation = matrix_from_quaternion(np.stack(rows["rotation_wxyz"].to_list()))
     records = [dataset.info.camera_of(name) for name in rows["camera"]]

@@ -82,7 +82,7 @@ _UNIT_VECTORS = ("rotation_wxyz", "sun_direction", "beam_in_body")
 MAX_PER_COLUMN = 1000
 """Maximum number of listed faults of one column; further faults are only counted."""
 _MAX_PLAUSIBLE = 1e12
-"""Largest plausible value of any length, time or size, far above the values of any trajectory."""
+"""Upper bound of plausible values of any column except seeds, far above the values of any trajectory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,11 +100,11 @@ class Fault:
     expected: str
     """Value expected."""
     n_faults: int = 1
-    """Number of faults that this object represents; above 1 only for the summary of faults that are not listed."""
+    """Number of faults that this object represents; above 1 only in a summary of faults that are not listed."""
 
     @classmethod
     def of(cls, file: object, row: int | None, column: object, found: object, expected: object) -> "Fault":
-        """Create a fault from untrusted values: shortened, on one line, without control characters."""
+        """Create a fault from untrusted values; they are shortened to one line without control characters."""
         return cls(
             shortened(one_line(file), 300),
             row,
@@ -120,9 +120,10 @@ class Fault:
 
 
 class FaultList:
-    """Collects the first fault of each file and column, at most MAX_PER_COLUMN per column, and counts the others.
+    """Collects faults: lists the first fault of each file and column, and counts the others.
 
-    This limits memory for datasets with a fault in each of millions of files.
+    At most MAX_PER_COLUMN faults of a column are listed. This limits memory for datasets with a fault in each of
+    millions of files.
     """
 
     def __init__(self) -> None:
@@ -130,7 +131,7 @@ class FaultList:
         self._n_of_column: dict[str, int] = {}
 
     def add(self, fault: Fault) -> None:
-        """Add a fault, unless the list has a fault of the same file and column."""
+        """Add a fault, unless a fault of this file and column is listed already."""
         key = fault.file, fault.column, fault.row is None
         if key in self._first:
             return
@@ -140,7 +141,7 @@ class FaultList:
             self._first[key] = fault
 
     def add_made(self, column: str, make: Callable[[], Fault]) -> None:
-        """Add a fault of a column; `make` creates it and is called only if the fault is listed."""
+        """Count a fault of a column; `make` creates the fault and is called only if it can be listed."""
         if self._n_of_column.get(column, 0) < MAX_PER_COLUMN:
             self.add(make())
         else:
@@ -169,7 +170,7 @@ def more_faults(column: str, n_faults: int) -> Fault:
 
 
 def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
-    """Yield the faults that can be found without reading other parts."""
+    """Yield the faults of a part of a table that can be found without reading other parts."""
     path, stem = dataset.store.folder and dataset.store.folder / where, PurePosixPath(where).stem
     if path is not None and path.is_symlink():
         yield Fault.of(where, None, "part", "a link", "a regular file")
@@ -205,13 +206,13 @@ def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
 
 
 def _definition(field: pa.Field) -> tuple[object, ...]:
-    """Return the properties of a column that must agree; its description may differ between versions."""
+    """Return the properties of a column that must agree; the description may differ between versions."""
     metadata = {key: value for key, value in (field.metadata or {}).items() if key != b"meaning"}
     return field.type, field.nullable, metadata
 
 
 def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
-    """Yield a fault if a part has rows that its name excludes, since readers select parts by name."""
+    """Yield a fault if a part has rows that do not fit its name, since readers select parts by name."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem):
         return
@@ -228,7 +229,7 @@ def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Itera
 
 
 def _value_faults(where: str, first_row: int, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
-    """Check one column for nulls, non-finite values, ranges, lengths and patterns."""
+    """Check one column for nulls, non-finite values, ranges, lengths of vectors and patterns of text."""
     present = ~np.asarray(column.is_null(), bool)
     if not field.nullable and not present.all():
         yield Fault.of(where, first_row + int(np.argmin(present)), field.name, "null", "a value")

@@ -1,4 +1,4 @@
-"""Compare the files of a dataset with its index, and find files that do not belong to it.
+"""Compare the files of a dataset with the index, and find files that do not belong to the dataset.
 
 Other tools may read files that this package ignores: any file below manifest/, and any Parquet file or image in the
 folder. Therefore every unknown file is a fault. A file that does not belong to the dataset format is a fault even if
@@ -41,16 +41,16 @@ _RECORDS = "work"
 """Folder for the records of a rendering in progress."""
 _LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
 _READ_FOLDERS = ("manifest/", "shards/")
-"""Folders whose files are read although no row names them."""
+"""Folders in which readers read all files, although no row of a table names them."""
 _ROWS_AT_A_TIME = 10_000
 _IN_INDEX = "as in the index"
 _HASH = "SHA-256"
 
 
 def check_files(dataset: Dataset, progress: Progress = NO_PROGRESS, replaced: Container[str] = ()) -> None:
-    """Raise UserError about the first fault of the files, since a new index would hide it.
+    """Raise UserError about the first fault of the files, since writing a new index would hide it.
 
-    Faults are ignored in files that will be `replaced`, in frames, and in unknown files that nothing reads.
+    Faults of frames are ignored, and faults of files that will be `replaced` or that no program reads.
     """
     for fault in file_faults(dataset, progress):
         unread = fault.column == "file" and not fault.file.startswith(_READ_FOLDERS)
@@ -61,10 +61,10 @@ def check_files(dataset: Dataset, progress: Progress = NO_PROGRESS, replaced: Co
 
 
 def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[Fault]:
-    """Yield faults of dataset.json, of the index and of all files. The content of frames is not read.
+    """Yield the faults of dataset.json, of the index and of all files. The content of frames is not read.
 
-    A writer's lock file is not a fault. An incomplete dataset has no index, and may also have temporary files and the
-    records of its rendering.
+    A writer's lock file is not a fault. An incomplete dataset has no index, so hashes are not checked; temporary files
+    and the records of its rendering are not faults either.
     """
     try:
         frames = _named_files(dataset, "frames", IMAGE_KINDS)
@@ -108,14 +108,14 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
 
 
 def _named_files(dataset: Dataset, table: str, kinds: Sequence[ImageKind | SceneFileKind]) -> pa.Table:
-    """Return path, bytes and sha256 of the files that are named in the table frames or scenes."""
+    """Return path, bytes and sha256 of the files that the table frames or scenes names."""
     pieces = [pa.schema([field.with_nullable(True) for field in INDEX]).empty_table()]
     if dataset.info.images == "files":
         columns = [f"{kind}_{name}" for kind in kinds for name in ("path", "bytes", "sha256")]
         rows = dataset.table(table, columns)
         for kind in kinds:
             of_kind = rows.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
-            # Files of other types remain faults, even if a row names them.
+            # Keep only files of the expected type, so that other files remain faults even if a row names them.
             fits = pc.and_(
                 pc.ends_with(of_kind["path"], SUFFIXES[kind]),
                 pc.invert(pc.match_substring_regex(of_kind["path"], "^(manifest|shards|index)/")),
@@ -125,14 +125,14 @@ def _named_files(dataset: Dataset, table: str, kinds: Sequence[ImageKind | Scene
 
 
 def _named_by_format(dataset: Dataset) -> set[str]:
-    """Return the paths of all files that a dataset may have, except files of frames and scenes."""
+    """Return the paths of all files that the dataset may have, except files of frames and scenes."""
     parts = {path for table in TABLES for path in dataset.parts(table)}
     shards = set(dataset.shards()) if dataset.info.images == "packed" else set()
     return parts | shards | EXTRA_NAMES
 
 
 def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[str, int], list[Fault]]:
-    """List all files; return the sizes of known files, bytes, and a fault for each unknown file or folder.
+    """Return the sizes of known files, bytes, and a fault for each unknown file or folder.
 
     Memory does not grow with the number of unknown files.
     """
@@ -141,7 +141,8 @@ def _listed(dataset: Dataset, info: DatasetInfo, known: set[str]) -> tuple[dict[
     folders |= {index.FOLDER, *(f"manifest/{table}" for table in TABLES)}
     folders |= {str(parent) for folder in folders for parent in PurePosixPath(folder).parents}
     sizes: dict[str, int] = {}
-    # Separate lists, so that many files elsewhere cannot hide unknown files in folders that are read.
+    # The number of listed faults is limited. Use two lists, so that many unknown files elsewhere cannot displace
+    # unknown files in folders that are read.
     in_read_folders, elsewhere = FaultList(), FaultList()
     last = ""
     for item in dataset.store.list():
@@ -169,7 +170,7 @@ def _is_of_rendering(path: str) -> bool:
 
 
 def _top_unknown(folder: str, folders: set[str]) -> str:
-    """Return the topmost folder that is not in `folders`: this folder or one above it."""
+    """Return the topmost folder of the path `folder` that is not in `folders`."""
     above = [*reversed(PurePosixPath(folder).parents)][1:]
     return next((str(parent) for parent in above if str(parent) not in folders), folder)
 
@@ -187,9 +188,9 @@ def _cure(path: str) -> str:
 
 
 def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]:
-    """Compare path, size and hash in the index with the table frames or scenes.
+    """Compare the index with the files that the table frames or scenes names.
 
-    Yields the first difference of each. These faults name the index folder as their file.
+    Yields the first difference in path, in size and in hash. These faults name the index folder as their file.
     """
     rows_in_index = pc.index_in(named["path"], rows["path"].combine_chunks())
     if rows_in_index.null_count:
@@ -235,6 +236,6 @@ def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progre
 
 
 def _rows_of(rows: pa.Table) -> Iterator[tuple[str, int, str]]:
-    """Yield path, size and hash of each row; converts few rows to Python objects at a time."""
+    """Yield path, size and hash of each row; convert few rows at a time, to limit memory."""
     for batch in rows.to_batches(max_chunksize=_ROWS_AT_A_TIME):
         yield from zip(*(batch[name].to_pylist() for name in INDEX.names), strict=True)

@@ -15,7 +15,7 @@ from perilune_shared.validation.faults import Fault
 
 
 def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
-    """Yield a fault for each missing frame file and each wrong size, header or hash."""
+    """Yield a fault for each frame file that is missing or has a wrong size, header or hash."""
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
     columns = [
         "frame_id",
@@ -62,7 +62,10 @@ def _file_faults(dataset: Dataset, frame: dict, kind: str, row: int, where: str)
 
 
 def png_faults(dataset: Dataset, png: bytes, frame: dict, row: int, where: str) -> Iterator[Fault]:
-    """Check size, hash and header of a PNG against its row of `frames`; `where` is the file to report."""
+    """Yield the faults of a PNG in size, hash and header; `where` is the file to report.
+
+    `frame` is the row of the PNG in the table frames, and `row` its number to report.
+    """
     if len(png) != frame["png_bytes"]:
         yield Fault.of(where, row, "png_bytes", len(png), frame["png_bytes"])
     if hashlib.sha256(png).hexdigest() != frame["png_sha256"]:

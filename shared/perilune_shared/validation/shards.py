@@ -17,9 +17,10 @@ from perilune_shared.validation.images import png_faults
 
 
 def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
-    """Yield faults of packed frames: each frame must occur once, in a shard of its split, and match the manifest.
+    """Yield the faults of packed frames.
 
-    Reads one row group at a time, together with the tables of its trajectories.
+    Each frame of the manifest must occur once, in a shard of its split, and be equal to its row there. Reads one row
+    group at a time, together with the rows of its trajectories in the manifest.
     """
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
     missing = set(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
@@ -55,7 +56,7 @@ def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
 
 
 def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_row: int) -> Iterator[Fault]:
-    """Compare a row group with the manifest; rows of unknown frames are reported by the caller."""
+    """Compare a row group with the manifest; the caller reports rows of unknown frames."""
     frames, labels = _manifest_rows(dataset, rows)
     known = rows.filter(pc.is_in(rows["frame_id"], frames["frame_id"].combine_chunks()))
     frames = frames.take(pc.index_in(known["frame_id"], frames["frame_id"].combine_chunks()))
@@ -77,7 +78,7 @@ def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_
 
 
 def _manifest_rows(dataset: Dataset, rows: pa.Table) -> tuple[pa.Table, pa.Table]:
-    """Return the rows of frames and labels of the trajectories in a row group."""
+    """Return the rows of the tables frames and labels for all trajectories in a row group."""
     keys = rows.group_by(["scene_id", "trajectory_id"]).aggregate([]).to_pylist()
     tables = []
     for name in ("frames", "labels"):

@@ -1,4 +1,4 @@
-"""Check one trajectory: frames against scene and camera, labels against craters and poses, measurement times."""
+"""Check one trajectory: its frames, its labels, and the times of its measurements."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from perilune_shared.validation.faults import Fault
 
 _LABEL_TOLERANCE_PX = 1e-6
 _LABEL_ROUNDING = 2.0**-23
-"""Maximum relative rounding error of a float32, times 2 as a margin."""
+"""Tolerance for labels that were rounded to float32, relative: twice the maximum rounding error."""
 _SUN_TOLERANCE = 1e-9
 _FARTHEST_M = 1e9
 _TIME_TOLERANCE_S = 1e-6
@@ -44,7 +44,10 @@ class TrajectoryRows:
 
 
 def trajectory_faults(info: DatasetInfo, rows: TrajectoryRows) -> Iterator[Fault]:
-    """Yield the faults of a trajectory: frames against scene and camera, labels against craters and poses."""
+    """Yield the faults of a trajectory's frames and labels.
+
+    Frames are compared with the scene and the camera, labels with craters and poses.
+    """
     frames, where = rows.frames, rows.where
     names = frames["camera"].unique().to_pylist()
     if info.cameras is not None and (len(names) != 1 or names[0] not in info.cameras):
@@ -112,7 +115,7 @@ def _labels(
     labels: pa.Table,
     files: dict[str, str],
 ) -> Iterator[Fault]:
-    """Check the references of labels, and compare their ellipses with ellipses projected from crater and pose."""
+    """Check the keys of labels, and compare their ellipses with ellipses projected from crater and pose."""
     where = files["labels"]
     frame_of = _row_numbers(labels["frame_id"], frames["frame_id"])
     crater_of = _row_numbers(labels["crater_id"], craters["crater_id"])
@@ -145,7 +148,7 @@ def _labels(
             row = int(known[wrong[0]])
             expected = f"{values[wrong[0]]}, projected from crater and pose"
             yield Fault.of(where, row, name, labels[name][row].as_py(), expected)
-    # If all labels of a frame with several labels are wrong, the pose is probably wrong: report it too.
+    # If a frame has several labels and all are wrong, the pose is probably wrong: report the pose too.
     n_labels = np.bincount(frame_of[known], minlength=len(frames))
     n_misfits = np.bincount(frame_of[known[misfit]], minlength=len(frames))
     odd = np.flatnonzero((n_labels > 1) & (n_misfits == n_labels))
@@ -168,10 +171,10 @@ def _projected(
     crater_of: np.ndarray,
     frame_of: np.ndarray,
 ) -> dict[str, Array]:
-    """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames.
+    """Return the geometric columns of M labels, each (M,), computed from craters and poses.
 
-    With a rolling shutter (`row_s` seconds from row to row), each crater is projected from the camera pose at which the
-    row of its centre is exposed.
+    `crater_of` and `frame_of` (M,) are row numbers in `craters` and `frames`. With a rolling shutter (`row_s` seconds
+    from row to row), a crater is projected from the camera pose at the exposure of the row that shows its centre.
     """
     rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
     centre = np.stack([craters[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
@@ -216,9 +219,9 @@ def _vectors(column: pa.ChunkedArray) -> Array:
 def measurement_faults(table: str, rows: pa.Table, trajectory: dict) -> Iterator[Fault]:
     """Yield the faults of a trajectory's rows of a table of measurements.
 
-    `trajectory` is the row of the trajectory. For each grade of an inertial unit and each beam of a lidar, times must
-    increase and lie between 0 and the duration of the trajectory. The intervals of inertial measurements must follow
-    each other without gaps.
+    `trajectory` is the row of the trajectory. For each grade of inertial unit and each beam of a lidar, times must
+    increase and must not exceed the duration of the trajectory. The intervals of inertial measurements must follow each
+    other without gaps.
     """
     where, key = f"manifest/{table}", f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
     series = next((name for name in ("grade", "beam") if name in rows.column_names), None)

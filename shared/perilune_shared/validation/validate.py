@@ -31,10 +31,10 @@ _EMPTY_IN_PLANS = ("craters", "boulders", "labels", *OPTIONAL_TABLES)
 
 
 def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
-    """Return all faults of a dataset; an empty list means that all checks passed.
+    """Return the faults of a dataset; an empty list means that all checks passed.
 
-    Faults of the same file and column are reported once, at their first row. All labels are compared with ellipses
-    projected from crater and pose.
+    Faults of one file and column are reported once, with the first row. Every file is read, and all labels are compared
+    with ellipses projected from crater and pose.
     """
     # Values that overflow are reported as faults; NumPy's warnings would clutter the output.
     with np.errstate(all="ignore"), dataset.parts_kept_open():
@@ -132,7 +132,7 @@ def _table_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
 def _scene_faults(
     dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], reported: set[tuple[str, str]]
 ) -> Iterator[Fault]:
-    """Check one scene's row, craters and boulders, then each of its trajectories; count the rows seen."""
+    """Check a scene's row, craters, boulders and trajectories; add the numbers of rows to `seen`."""
     where = {name: _file_of(dataset, name, scene_id) for name in TABLES}
     craters = dataset.table("craters", scene_id=scene_id)
     boulders = dataset.table("boulders", scene_id=scene_id)
@@ -180,10 +180,10 @@ def _scene_faults(
 
 
 def _in_file(dataset: Dataset, faults: Iterator[Fault], name: str, reported: set[tuple[str, str]]) -> Iterator[Fault]:
-    """Convert row numbers within a scene or trajectory to row numbers of the file.
+    """Convert row numbers of faults within a scene or trajectory to row numbers of the file.
 
-    `name` is the scene_id, or the beginning of the trajectory's frame_ids. Skips faults of files and columns already in
-    `reported`.
+    `name` is the scene_id, or the beginning of the trajectory's frame_ids. Only the first fault of a file and column is
+    yielded; `reported` has the pairs of file and column that have been reported.
     """
     for fault in faults:
         if (fault.file, fault.column) in reported:

@@ -160,7 +160,7 @@ def test_a_lost_server_ends_with_a_saved_state_that_resumes_to_the_same_weights(
         taken.append((self.current_epoch, batch_idx))
         if taken[-1] == (1, 1):
             lost.stop()
-            leave_the_error(self.sequences._ahead._made)
+            leave_the_error(self.sequences._ahead._results)
         return step(self, batch, batch_idx)
 
     monkeypatch.setattr(NavigationTask, "training_step", stops)

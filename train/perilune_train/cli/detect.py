@@ -44,8 +44,8 @@ TileSide = Annotated[
 BoxMargin = Annotated[
     float,
     typer.Option(
-        help="Margin added to every side of the detected boxes, pixels. They end at the crest of the rim; use 0.5 to"
-        " compare them with labels that are boxes of whole pixels around a crater."
+        help="Margin added to every side of the detected boxes, pixels. Without it, boxes end at the crest of the rim."
+        " Use 0.5 to compare them with labels that are boxes of whole pixels."
     ),
 ]
 NoData = Annotated[
@@ -111,7 +111,9 @@ def evaluate(
             help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<name of the run>/detect]"
         ),
     ] = None,
-    split: Annotated[str, typer.Option(help="train, val or test; with --images of a source that has splits.")] = "test",
+    split: Annotated[
+        str, typer.Option(help="train, val or test. With --images, only for images that have splits.")
+    ] = "test",
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -161,7 +163,7 @@ def evaluate(
     overlap: Overlap = Tiling.overlap_px,
     box_margin: BoxMargin = Tiling.box_margin_px,
 ) -> None:
-    """Evaluate a run's best weights: report.md, metrics.json, detections.parquet and pictures.
+    """Evaluate a run's best weights; writes report.md, metrics.json, detections.parquet and pictures.
 
     The run chose its score threshold on the validation split of its training dataset. --threshold sets another one,
     and --choose-threshold chooses a new one.
@@ -253,13 +255,13 @@ def benchmark(
 
     if detections is not None and threshold is not None:
         folder = out or Path("runs/benchmark", detections.stem)
-        made = score_submission(detections, detections.stem, threshold, data, manifests, folder)
+        scores = score_submission(detections, detections.stem, threshold, data, manifests, folder)
     else:
         run = run or shipped_run("detect")
         folder = out or Path("runs/benchmark", run.resolve().name)
         check_output(folder, run)
-        made = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
-    selection, rule, value = made.least("ap50_paper")
+        scores = score_run(run, config_of_run(run), data, manifests, folder, allow_overlap)
+    selection, rule, value = scores.least("ap50_paper")
     chosen = f"labels by {selection}, {rule}"
     say(f"AP {value:.3f} by the least favourable scoring rule ({chosen}); {folder}: {PAGE}, {FIGURES}")
 
@@ -299,7 +301,9 @@ def predict(
     min_radius_px: Annotated[
         float, typer.Option(help="Minimum radius sqrt(w h) / 2 of a crater in the results, pixels.")
     ] = 0.0,
-    min_size: Annotated[float, typer.Option(help="Twice --min-radius-px: minimum sqrt(w h), pixels.")] = 0.0,
+    min_size: Annotated[
+        float, typer.Option(help="Minimum size sqrt(w h) of a crater, pixels; in place of --min-radius-px.")
+    ] = 0.0,
     top: Annotated[
         int | None, typer.Option(min=1, help="Maximum number of craters in an image; the highest scores are kept.")
     ] = None,
@@ -314,7 +318,7 @@ def predict(
 
     Writes detections.parquet and detections.csv with one row per crater, <image>.overlay.png, and detections.geojson if
     an image has a georeference. Coordinates are pixels of the upright image, from the outer corner of its top-left
-    pixel. The image names of video frames are <file>.<index, six digits>.png, and those of TIFF pages end in .tif.
+    pixel. In the tables, video frames are named <file>.<index, six digits>.png; the names of TIFF pages end in .tif.
     """
     if min_score is not None and not 0 < min_score <= 1:
         raise UserError("--min-score", "", min_score, "above 0, at most 1")
@@ -349,7 +353,7 @@ def deploy(
     size_px: Annotated[int, typer.Option(help="Side of the square images, a multiple of 32.")] = 256,
     dataset: Annotated[
         str | None,
-        typer.Option(help="Dataset (folder or address); the files are compared with torch on its validation frames."),
+        typer.Option(help="Dataset (folder or address) on whose validation frames the files are compared with torch."),
     ] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Also try 8-bit integers; needs --dataset.")] = False,
     allow_overlap: AllowOverlap = False,
@@ -357,8 +361,8 @@ def deploy(
 ) -> None:
     """Write a trained detector as ONNX and OpenVINO files, for flight.
 
-    Writes detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. First
-    runs every file and compares its output with torch. --int8 quantises the network on training frames and writes
+    Writes detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. Runs
+    every file once and compares its output with torch. --int8 quantises the network on training frames and writes
     detector-int8.onnx if that file is faster and loses at most 0.005 of AP on the validation frames.
     """
     asked = tuple(part.strip() for part in formats.split(","))
@@ -384,7 +388,8 @@ add_renamed(app, "export", "deploy", deploy)
 @app.command("weights")
 def weights(
     checkpoint: Annotated[
-        Path, typer.Argument(help="best.ckpt of a detect run; for a Darknet file of width 1 with 3 input channels.")
+        Path,
+        typer.Argument(help="best.ckpt of a detect run. A Darknet file needs a network of width 1, 3 input channels."),
     ],
     out: Annotated[
         Path,
@@ -397,7 +402,7 @@ def weights(
     """Write the weights of a run as a file to share, or as a Darknet file; `detect.init_from` reads both.
 
     NAME.safetensors stores the weights in half precision and contains no code. Rename it to weights.safetensors and put
-    it beside config.yaml and metrics.json: this folder is a run.
+    it beside config.yaml and metrics.json: this folder is then a run.
 
     NAME.conv.74 contains the 52 convolutions of the backbone. NAME.weights contains all 75 convolutions; the network
     must have no attention and the strides 8 16 32. Its output layers have 15 filters: x, y, width, height and

@@ -50,10 +50,10 @@ def explain(
     allow_overlap: AllowOverlap = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Test what attention gates show: nulls, interventions, localisation, stability.
+    """Test what attention gates show: comparison with null maps, interventions, localisation, stability.
 
     Computes the paper's correlations PCC1 to PCC4 of each gate and of null maps. A gate is evidence only if it
-    beats every null. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
+    beats every null map. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
     Writes runs/explain/<name>/ with claims.json, metrics.json, the tables of all values and pictures. Leaves a finished
     run of the same settings, datasets and checkpoints unchanged; --overwrite replaces it.
@@ -64,9 +64,9 @@ def explain(
     from perilune_train.training.runs import NamedRun, RunFolder
 
     name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
-    for given, option, other in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
-        if given is not None and task == other:
-            raise UserError(option, "", str(given), f"no {option} with --task {other}")
+    for checkpoint, option, other_task in ((detector, "--detector", "navigate"), (navigator, "--navigator", "detect")):
+        if checkpoint is not None and task == other_task:
+            raise UserError(option, "", str(checkpoint), f"no {option} with --task {other_task}")
     if task != "navigate" and detector is None:
         run_folder = runs / "detect" / name
         detector = RunFolder(shipped_run("detect") if task == "detect" and not run_folder.is_dir() else run_folder).best
@@ -92,11 +92,13 @@ def causal(
     counterfactual: Annotated[
         str | None,
         typer.Option(
-            help="The same frames without some craters, from `perilune-render counterfactual`."
+            help="Dataset of the same frames without some craters, from `perilune-render counterfactual`."
             " [default: data/<preset>/causal]"
         ),
     ] = None,
-    turned: Annotated[str | None, typer.Option(help="The same frames under another Sun, with all craters.")] = None,
+    turned: Annotated[
+        str | None, typer.Option(help="Dataset of the same frames under another Sun, with all craters.")
+    ] = None,
     split: Annotated[str, typer.Option(help="Split of the frames.")] = "test",
     runs: RunsFolder = Path("runs"),
     name: Annotated[
@@ -112,9 +114,11 @@ def causal(
             help="Gate of the headline, such as B_22. [default: the gate chosen by runs/explain/<name>, else B_11]"
         ),
     ] = None,
-    nav_dataset: Annotated[str | None, typer.Option(help="Navigation dataset with all craters, for poses.")] = None,
+    nav_dataset: Annotated[
+        str | None, typer.Option(help="Navigation dataset with all craters, to measure the effect on poses.")
+    ] = None,
     nav_counterfactual: Annotated[
-        str | None, typer.Option(help="The same descents without some craters, with all their frames.")
+        str | None, typer.Option(help="Dataset of the same descents, with all their frames, without some craters.")
     ] = None,
     navigator: Annotated[
         Path | None,
@@ -125,7 +129,7 @@ def causal(
 ) -> None:
     """Measure the effect of single craters on attention masks, detections and poses.
 
-    Compares frames rendered with and without some craters, everything else equal. Writes runs/explain/<name>-causal/
+    Compares frames rendered with and without some craters; everything else is equal. Writes runs/explain/<name>-causal/
     with the tables of all effects, pictures, claims.json and metrics.json. Leaves a finished run of the same inputs
     unchanged; --overwrite replaces it.
     """
@@ -151,8 +155,8 @@ def causal(
     )
     gate = gate or _chosen_gate(runs / "explain" / name)
     with held(causal_folder(named)):
-        made = causal_run(settings, named, RunFolder(run_folder).best, gate, inputs, allow_overlap)
-    say(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
+        finished_run = causal_run(settings, named, RunFolder(run_folder).best, gate, inputs, allow_overlap)
+    say(f"{finished_run.root}: metrics.json, claims.json, *.parquet, *.png")
 
 
 def _chosen_gate(explained: Path) -> str:

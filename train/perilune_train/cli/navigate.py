@@ -123,7 +123,8 @@ def benchmark_landing(
     data: Annotated[str, typer.Option(help="Folder or address of the rendered benchmark.")] = "data/benchmark",
     manifests: Annotated[str, typer.Option(help="Folder or address of the shared manifests.")] = "data_manifests",
     maps: Annotated[
-        Path | None, typer.Option("--maps", help="Folder with one map by `navigate map` for each part, by its name.")
+        Path | None,
+        typer.Option("--maps", help="Folder with a map by `navigate map` for each part of the benchmark, named as it."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="New folder. [default: runs/benchmark/<name of the run>-landing]")
@@ -158,8 +159,8 @@ def calibrate(
 ) -> None:
     """Fit the covariance of a warp network to its errors on validation descents; writes covariance.json.
 
-    Test terrain is refused. Training runs this step at its end. Use the command for runs of earlier versions, or for
-    another camera.
+    Descents over test terrain are refused. Training runs this step at its end. Use the command for runs of earlier
+    versions, or for another camera.
     """
     if split not in SPLITS:
         raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
@@ -207,7 +208,7 @@ def deploy(
     dataset: Annotated[
         str | None,
         typer.Option(
-            help="Dataset (folder or address): write for its camera, and compare with torch on its validation frames."
+            help="Dataset (folder or address). The file is for its camera, and is compared on its validation frames."
         ),
     ] = None,
     overwrite: OverwriteFolder = False,
@@ -215,8 +216,9 @@ def deploy(
     """Write a trained navigator as an ONNX file, for flight.
 
     The file maps one pair of frames and a state to the motion and the new state. Writes navigator.onnx, navigator.json
-    (sizes, camera, normalisation) and README.md with an example program. First runs the file pair by pair and compares
-    it with torch on the whole sequence: on validation frames, or on noise without a dataset.
+    (sizes, camera, normalisation) and README.md with an example program. Runs the file pair by pair and compares the
+    result with torch, which runs over the whole sequence at once. Both use validation frames, or noise if no dataset is
+    given.
     """
     # torch takes seconds to load.
     from perilune_train.motion.deploy.export import export_navigator
@@ -245,12 +247,12 @@ def methods(
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/methods"),
     maps: Annotated[
-        Path | None, typer.Option("--map", help="Folder of a map by `navigate map`, a further catalogue.")
+        Path | None, typer.Option("--map", help="Folder of a map by `navigate map`, used as a further catalogue.")
     ] = None,
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Run all methods on a split: learned and classical motion, poses from craters, lost in space, the filter.
+    """Run all methods on a split: learned and classical motion, poses from craters (with and without a prior), filter.
 
     Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
     frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
@@ -279,12 +281,13 @@ def monte_carlo(
     ] = None,
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     scenario: Annotated[str, typer.Option(help="What goes wrong: " + ", ".join(SCENARIOS) + ".")] = "nominal",
-    draws: Annotated[int, typer.Option(min=1, max=100_000, help="Draws of each descent.")] = 200,
+    draws: Annotated[int, typer.Option(min=1, max=100_000, help="Number of random draws for each descent.")] = 200,
     attitude_deg: Annotated[
-        float, typer.Option(min=0.001, max=10, help="Standard deviation of the attitude at the start, on each axis.")
+        float,
+        typer.Option(min=0.001, max=10, help="Standard deviation of the initial attitude error on each axis, degrees."),
     ] = 0.5,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all draws.")] = 0,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes. [default: one per core]")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of all draws.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes. [default: one per core]")] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/monte-carlo"),
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
@@ -335,10 +338,12 @@ def make_map(
 
 @app.command("fly")
 def fly(
-    frames: Annotated[Path, typer.Option(help="Folder of images with frames.csv: file, time_s.")],
+    frames: Annotated[Path, typer.Option(help="Folder of images with frames.csv (columns file, time_s).")],
     camera: Annotated[Path, typer.Option(help="Intrinsics and mounting: camera.yaml.")],
     catalogue: Annotated[Path, typer.Option(help="Craters of the landing site, Parquet or CSV.")],
-    prior: Annotated[Path, typer.Option(help="Expected state at the first frame, and errors of all: prior.yaml.")],
+    prior: Annotated[
+        Path, typer.Option(help="Expected state at the first frame, and standard deviations of all inputs: prior.yaml.")
+    ],
     imu: Annotated[Path | None, typer.Option(help="Inertial measurements: imu.csv.")] = None,
     no_imu: Annotated[bool, typer.Option("--no-imu", help="Fly without inertial measurements.")] = False,
     ranges: Annotated[Path | None, typer.Option(help="Ranges of a laser altimeter: ranges.csv.")] = None,
@@ -411,16 +416,23 @@ def descent(
     out: Annotated[Path, typer.Option(help="New folder for the files.")] = Path("descent"),
     grade: Annotated[str, typer.Option(help="Grade of the inertial unit.")] = "tactical",
     exact: Annotated[bool, typer.Option("--exact", help="Write the catalogue without errors.")] = False,
-    position_m: Annotated[float, typer.Option(help="Deviation of the prior's position on each axis.")] = 60.0,
-    velocity_mps: Annotated[float, typer.Option(help="Deviation of the prior's velocity on each axis.")] = 1.0,
-    attitude_deg: Annotated[float, typer.Option(help="Deviation of the prior's attitude on each axis.")] = 0.5,
-    seed: Annotated[int, typer.Option(help="Seed of the prior and of the errors of the catalogue.")] = 0,
+    position_m: Annotated[
+        float, typer.Option(help="Standard deviation of the prior's position error on each axis, m.")
+    ] = 60.0,
+    velocity_mps: Annotated[
+        float, typer.Option(help="Standard deviation of the prior's velocity error on each axis, m/s.")
+    ] = 1.0,
+    attitude_deg: Annotated[
+        float, typer.Option(help="Standard deviation of the prior's attitude error on each axis, degrees.")
+    ] = 0.5,
+    seed: Annotated[int, typer.Option(help="Random seed of the errors of the prior and the catalogue.")] = 0,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Write a descent as frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv.
+    """Write a descent of a dataset as the input files of `navigate fly`.
 
-    The prior has random errors. The catalogue has the errors of a catalogue made from orbit: 1 m in position, 3 % in
-    diameter, one in ten craters missing, one in twenty false.
+    Writes frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv. The prior has random
+    errors. The catalogue has the errors of a catalogue made from orbit: 1 m in position, 3 % in diameter, one in ten
+    craters missing, one in twenty false.
     """
     ids = tuple(trajectory.split("/"))
     if len(ids) != 2:

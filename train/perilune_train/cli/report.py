@@ -16,16 +16,18 @@ USUAL_MB = 15
 def report(
     kind: Annotated[
         Literal["demo", "paper", "benchmark"],
-        typer.Option(help="What to show: a demo, the paper's experiment, a score."),
+        typer.Option(help="What to show: a demo, the paper's experiment, or scores on the locked benchmark."),
     ] = "demo",
     name: Annotated[
-        str | None, typer.Option(help="Name of the runs and of the report. [default: small, paper or benchmark]")
+        str | None,
+        typer.Option(help="Name of the runs and of the report. [default: small, paper or benchmark, by --kind]"),
     ] = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="Folder that holds the datasets. [default: data/<name>; data/benchmark]")
+        Path | None,
+        typer.Option(help="Folder that holds the datasets. [default: data/<name>; for benchmark, data/benchmark]"),
     ] = None,
     runs: Annotated[
-        Path | None, typer.Option(help="Folder that holds all runs. [default: runs; runs/<name> for paper]")
+        Path | None, typer.Option(help="Folder that holds all runs. [default: runs; for paper, runs/<name>]")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report. [default: runs/report/<name>]")] = None,
 ) -> None:
@@ -63,11 +65,12 @@ def paper(
     headline_share: Annotated[
         str | None,
         typer.Option(
-            help="equilibrium_share of the headline ground. Default: on the curve, the AP nearest to the paper's."
+            help="Crater density (equilibrium_share) of the headline ground."
+            " [default: the density on the curve whose AP is nearest to the paper's]"
         ),
     ] = None,
 ) -> None:
-    """Write the page that compares the paper's experiment with ours.
+    """Write the page that compares the results of our experiment with the paper's.
 
     It shows the paper's tables and figures beside ours, and a verdict on each claim of the paper. The section of an
     unfinished run states that the run is unfinished.

@@ -52,11 +52,12 @@ def batch_loader(
     workers: int,
     pinned: bool,
 ) -> torch_data.DataLoader:
-    """Load batches in `workers` processes, which live as long as the loader, or with 0 in the calling process.
+    """Return a loader of batches; it loads in `workers` processes that live as long as the loader.
 
-    With workers, OpenCV uses one thread from now on, in this process and in the workers; the workers together use all
-    cores anyway. OpenCV is set before the workers are forked, because a worker that stops inherited threads would wait
-    forever. `pinned` puts the batches into page-locked memory, from which a GPU copies them while the process goes on.
+    With 0 workers, it loads in the calling process. With workers, OpenCV uses one thread from now on, in this process
+    and in the workers; the workers together use all cores anyway. OpenCV is set before the workers are forked, because
+    a worker that stops inherited threads would wait forever. `pinned` puts the batches into page-locked memory, from
+    which a GPU copies them while the process continues.
     """
     if workers:
         one_thread()

@@ -54,7 +54,7 @@ class LabelledFrames(torch_data.Dataset[tuple[Tensor, Target]]):
         self.frames = load_frames(dataset, split)
         labels = read_labels(dataset, ["crater_id", *_BOX_COLUMNS, *ELLIPSE_COLUMNS], split)
         labels = labels[selected(labels, SELECTIONS[selection])]
-        row_of_frame = {frame_id: row_of_label for row_of_label, frame_id in enumerate(self.frames.table["frame_id"])}
+        row_of_frame = {frame_id: row for row, frame_id in enumerate(self.frames.table["frame_id"])}
         row_of_label = labels["frame_id"].map(row_of_frame).to_numpy(np.int64)
         order = np.argsort(row_of_label, kind="stable")
         self._bounds = np.searchsorted(row_of_label[order], np.arange(len(row_of_frame) + 1))

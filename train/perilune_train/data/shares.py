@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Share:
-    """The share of one process: every n-th frame or trajectory, the same in every epoch."""
+    """The share of one of n processes: every n-th frame or trajectory, the same ones in every epoch."""
 
     process: int = 0
     """Rank of the process, from 0."""
@@ -20,7 +20,7 @@ class Share:
         return range(self.process, count, self.processes)
 
     def owns(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the numbers (N,) belong to this share (N,)."""
+        """For each of the numbers (N,), whether it belongs to this share (N,)."""
         return numbers % self.processes == self.process
 
 

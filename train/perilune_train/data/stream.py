@@ -11,7 +11,8 @@ Use:
 
 The order depends only on the seed, the epoch, and the numbers of processes and workers. The row groups of all shards
 are permuted and cut into equal shares. Each share is read in windows of a few row groups, and the frames of a window
-are permuted. So a position is enough to resume, and each frame occurs exactly once in an epoch.
+are permuted. So each frame occurs exactly once in an epoch, and the epoch and the number of the batch are enough to
+resume.
 
 Each worker, or the process itself without workers, holds two windows in memory: one in use and one being read. `pack`
 limits a row group to 64 frames and 8 MiB (more only for a single frame), so a window takes at most 64 MiB.
@@ -96,7 +97,7 @@ def _unchanged(frames: list[StreamedFrame], epoch: int) -> list[StreamedFrame]:
 
 
 class FrameStream(torch_data.IterableDataset):
-    """Batches of one process's share of the frames of a split; see the module.
+    """Batches of one process's share of the frames of a split, in the order that the module describes.
 
     All processes have the same number of batches, `len(stream)`, of `batch_size` frames each. The last batch of an
     epoch has the remaining frames: at least one, at most batch_size + 1.
@@ -121,7 +122,7 @@ class FrameStream(torch_data.IterableDataset):
         self.make = _unchanged
         self._nested = _NESTED if content.images else _NESTED[1:]
         self.epoch = self.batches = self.workers = 0
-        # Workers live longer than an epoch: they read here the epoch and the first batch of the current iteration.
+        # Workers live longer than an epoch. They read the epoch and the first batch of the iteration from this tensor.
         self._begun = torch.zeros(2, dtype=torch.int64).share_memory_()
         self._groups = _groups_of(dataset, split)
         self.n_frames = int(self._groups.n_frames.sum())
@@ -166,7 +167,7 @@ class FrameStream(torch_data.IterableDataset):
         if worker is not None:
             self.epoch, self.batches = self._begun.tolist()
         try:
-            # The loader asks worker 0 first, also when it resumes.
+            # The loader always asks worker 0 first, so when it resumes, worker 0 must have the next batch.
             yield from self._batches((self.batches + number) % workers, workers)
         except UserError as error:
             if worker is None:
@@ -174,7 +175,7 @@ class FrameStream(torch_data.IterableDataset):
             yield error
 
     def _batches(self, lane: int, lanes: int) -> Iterator[Any]:
-        """Yield batches lane, lane + lanes, ... of this process; skip batches before `batches`."""
+        """Yield the batches lane, lane + lanes, ... of this process, without those before `self.batches`."""
         share = self.share
         start, stop = (self.n_frames * rank // share.processes for rank in (share.process, share.process + 1))
         sizes = np.full(len(self), self.batch_size)

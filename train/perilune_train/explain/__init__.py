@@ -1,1 +1,1 @@
-"""Attention of the trained networks, in pictures and correlations."""
+"""Evidence on what the attention gates of trained networks do: tables, pictures and claims."""

@@ -19,19 +19,20 @@ class ExplainConfig(Section):
     n_frames: _Several = 32
     """Number of test frames, evenly spaced through the split, for correlations."""
     n_pairs: _Several = 48
-    """Number of test pairs for correlations, in runs of at most 8 consecutive pairs; at least one run."""
+    """Number of test pairs for correlations. Only whole runs of at most 8 consecutive pairs are used, at least one."""
     n_validation: _Several = 16
-    """Number of validation frames, and of validation pairs, on which signs and gates are chosen."""
+    """Number of validation frames, and of validation pairs. The expected sign of each correlation, and the gate whose
+    pixels are removed, are chosen on them."""
     n_changed: _Several = 16
-    """Number of these test frames for interventions: gates forced, pixels removed, weights randomised."""
+    """Number of the `n_frames` test frames that interventions use: gates forced, pixels removed, weights randomised."""
     n_changed_pairs: _Several = 24
-    """Number of these test pairs for interventions."""
+    """Number of the `n_pairs` test pairs that interventions use."""
     n_attributed: Annotated[int, Field(ge=1, le=100_000)] = 4
-    """Number of these test frames for Grad-CAM, integrated gradients and occlusion."""
+    """Number of the `n_frames` test frames that Grad-CAM, integrated gradients and occlusion use."""
     n_drawn: Annotated[int, Field(ge=1, le=8)] = 3
-    """Number of frames, and of pairs, whose masks are drawn, at high, middle and low altitude."""
+    """Number of frames, and of pairs, whose masks are drawn, evenly spaced from the highest to the lowest altitude."""
     removed_share: Annotated[float, Field(gt=0, lt=0.5)] = 0.2
-    """Share of the pixels that removal replaces."""
+    """Share of the pixels of an image that are removed (replaced)."""
     integration_steps: Annotated[int, Field(ge=1, le=10_000)] = 8
     """Number of integration points of integrated gradients."""
     occlusion_px: Annotated[int, Field(ge=8, le=4096)] = 32

@@ -1,4 +1,4 @@
-"""Compute evidence on the detector's gates: correlations, nulls, interventions, localisation, stability."""
+"""Compute evidence on the detector's gates: correlations with nulls, interventions, localisation, stability."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,7 +32,7 @@ from perilune_train.models.yolo import YOLOv3
 
 TASK = "detect"
 SHALLOW_STAGES = "123"
-"""Stages with strides up to 8."""
+"""Numbers of the stages with strides up to 8."""
 
 
 def explain_detector(
@@ -40,34 +40,36 @@ def explain_detector(
 ) -> tuple[Evidence, Masks]:
     """All evidence tables of the detector, and its masks for the test frames (N, height, width).
 
-    Signs, and the gate whose pixels are removed, are chosen on the validation frames. Raises UserError if the network
-    has no attention.
+    The signs of correlations, and the gate whose pixels are removed, are chosen on the validation frames. Raises
+    UserError if the network has no attention; the message names the checkpoint `where`.
     """
     network = detector.network
     rng = np.random.default_rng([settings.seed, 1])
     masks, known = (detector_masks(network, subset.images, where) for subset in (frames, validation))
     untrained = untrained_detector(detector, validation.images, settings.seed)
-    blank, known_blank = (detector_masks(untrained, subset.images, where) for subset in (frames, validation))
+    untrained_masks, known_untrained_masks = (
+        detector_masks(untrained, subset.images, where) for subset in (frames, validation)
+    )
     say("detector: masks and null maps")
-    before = _values(validation, known, known_blank, rng)
-    signs = validation_signs(before)
-    plain = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
-    strongest = strongest_gate(before, plain)
-    values = _values(frames, masks, blank, rng)
+    validation_values = _values(validation, known, known_untrained_masks, rng)
+    signs = validation_signs(validation_values)
+    sign_of_map = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
+    strongest = strongest_gate(validation_values, sign_of_map)
+    values = _values(frames, masks, untrained_masks, rng)
     permutations = detector_permutations(masks, _targets(frames), signs, rng)
     differences = pd.concat([null_differences(values, signs, rng), permutations], ignore_index=True)
 
     some = evenly_spaced(len(frames.images), settings.n_attributed)
     attributed = attributions(settings, network, frames.images[some])
-    plain |= dict.fromkeys(attributed, 1)
-    nulls = baseline_maps(frames.images) | renamed("untrained", blank)
+    sign_of_map |= dict.fromkeys(attributed, 1)
+    nulls = baseline_maps(frames.images) | renamed("untrained", untrained_masks)
     nulls |= renamed("other frame", of_other_rows(masks, frames.scene_ids, rng))
     chosen = pd.DataFrame({"frame_id": frames.frame_ids, "scene_id": frames.scene_ids})
     located = pd.concat(
         [
-            localisation(masks, frames.craters, plain, chosen, TASK, "gate"),
-            localisation(nulls, frames.craters, plain, chosen, TASK, "null"),
-            localisation(attributed, frames.craters[some], plain, chosen.iloc[some], TASK, "attribution"),
+            localisation(masks, frames.craters, sign_of_map, chosen, TASK, "gate"),
+            localisation(nulls, frames.craters, sign_of_map, chosen, TASK, "null"),
+            localisation(attributed, frames.craters[some], sign_of_map, chosen.iloc[some], TASK, "attribution"),
         ],
         ignore_index=True,
     )
@@ -81,10 +83,10 @@ def explain_detector(
     gates = forced_gates(network.backbone, gate_means(known), images, measure, "force gates of the detector")
     to_remove = {strongest: masks[strongest][changed], f"edge/stage_{stage}": nulls[f"edge/stage_{stage}"][changed]}
     say(f"detector: remove pixels by {strongest}, chosen on validation frames, and by edges")
-    removal = removal_effect(images, to_remove, plain, measure, rng, settings.removed_share)
+    removal = removal_effect(images, to_remove, sign_of_map, measure, rng, settings.removed_share)
 
-    def masks_of(given: NDArray[np.uint8]) -> Masks:
-        return detector_masks(network, given, where)
+    def masks_of(changed_images: NDArray[np.uint8]) -> Masks:
+        return detector_masks(network, changed_images, where)
 
     few = frames.images[evenly_spaced(len(frames.images), max(2, settings.n_changed // 2))]
     evidence = Evidence(
@@ -96,14 +98,14 @@ def explain_detector(
         removal.merge(ids, left_on="frame_index", right_index=True),
         randomised(network, masks_of, few, settings.seed),
         stability(masks_of, few, rng),
-        plain,
+        sign_of_map,
         strongest,
     )
     return evidence, masks
 
 
 def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int) -> YOLOv3:
-    """A network of equal architecture with random weights and batch statistics from `images` (N, height, width)."""
+    """An untrained network of the detector's architecture, with batch statistics of `images` (N, height, width)."""
     trained, config = detector.network, detector.config
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -114,9 +116,9 @@ def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int)
 
 
 def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
-    """The gate up to stride 8 whose mean craterness, multiplied by its sign, is largest on validation frames.
+    """The gate up to stride 8 with the largest mean craterness, times the gate's sign, on validation frames.
 
-    A gate without a defined correlation is chosen only if there is no other gate.
+    The first gate if no gate has a defined correlation.
     """
     rows = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
     rows = rows[rows["map"].str[2].isin(list(SHALLOW_STAGES))]
@@ -127,12 +129,12 @@ def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
 
 def attributions(settings: ExplainConfig, network: YOLOv3, images: NDArray[np.uint8]) -> Masks:
     """Grad-CAM, integrated gradients and occlusion (N, height, width) of the detector's objectness."""
-    target, given = DetectorTarget(network), normalised(images)
+    target, frames = DetectorTarget(network), normalised(images)
     say("detector: Grad-CAM, integrated gradients, occlusion")
     return {
-        "grad_cam": grad_cam(target, given),
-        "integrated_gradients": integrated_gradients(target, given, settings.integration_steps),
-        "occlusion": occlusion(target, given, settings.occlusion_px, settings.occlusion_px),
+        "grad_cam": grad_cam(target, frames),
+        "integrated_gradients": integrated_gradients(target, frames, settings.integration_steps),
+        "occlusion": occlusion(target, frames, settings.occlusion_px, settings.occlusion_px),
     }
 
 

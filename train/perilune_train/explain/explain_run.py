@@ -1,4 +1,4 @@
-"""Run `explain`: write evidence on the gates of a detector and a stack navigator as tables, pictures and claims."""
+"""Run `perilune-train explain`: write evidence on attention gates as tables, pictures and claims."""
 
 import json
 import math
@@ -36,7 +36,7 @@ from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.runs import NamedRun, RunFolder
 
 _COUNTED = {"detect": ("pcc1_craterness", "pcc1_partial"), "navigate": ("pcc4", "pcc4_minus_pcc3")}
-"""Measures, by task, for which the gates that beat every null are counted."""
+"""Measures of each task in which metrics.json counts the gates that beat every null."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +58,9 @@ def explain_run(
 ) -> RunFolder:
     """Compute evidence on the attention gates of one or two networks on test data; writes runs/explain/<name>.
 
-    The config.yaml in the folder of the detector's checkpoint defines which craters are selected. A network that is
-    None is not explained. A finished run with equal settings, datasets and checkpoints is left unchanged. Signs, and
-    the gates whose pixels are removed, are chosen on the validation splits.
+    `detector` and `navigator` are the networks; None skips a network. The config.yaml in the folder of the detector's
+    checkpoint defines which craters are selected. The signs of correlations, and the gates whose pixels are removed,
+    are chosen on the validation splits. A finished run with equal settings, datasets and checkpoints is left unchanged.
 
     Raises UserError if an existing run has different settings, datasets or checkpoints; if a dataset, a checkpoint or
     config.yaml is missing or invalid; if a network has no attention; or if a network was fitted to the terrain of its
@@ -173,10 +173,12 @@ def _write_tables(run: RunFolder, evidence: Mapping[str, Evidence]) -> None:
 def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metrics:
     """Metrics of one network by name; undefined values are left out.
 
-    <measure>/<map>, _low and _high: means of gates and attribution methods. <measure>_null/<gate>/<null>: means of the
-    nulls. <measure>_p/<gate>: p, corrected for the number of gates. <task>/forced/<scope>: harm of forcing a gate, a
-    stage or all gates to their means. <task>/removal/<map>/<how>/<which>: harm of removed pixels.
-    <task>/stability/<change>/<gate> and <task>/randomised/<direction>/<step>/<gate>: similarity of masks.
+    - <measure>/<map>: mean of a gate or an attribution method; with _low and _high, the ends of its interval
+    - <measure>_null/<gate>/<null>: mean of a null
+    - <measure>_p/<gate>: p over all nulls, corrected for the number of gates
+    - <task>/forced/<scope>: harm of forcing a gate, a stage or all gates to their means
+    - <task>/removal/<map>/<how>/<which>: harm of removed pixels
+    - <task>/stability/<change>/<gate>, <task>/randomised/<direction>/<step>/<gate>: similarity of masks
     """
     numbers: dict[str, float] = {}
     for row in evidence.summary[evidence.summary["kind"] != "null"].to_dict("records"):
@@ -194,8 +196,8 @@ def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metr
     alike = evidence.stability.groupby(["change", "map"], sort=False)["pearson"].mean()
     for row in alike.reset_index().to_dict("records"):
         numbers[f"{task}/stability/{row['change']}/{row['map']}"] = row["pearson"]
-    kept = evidence.randomisation.groupby(["direction", "step", "map"], sort=False)["spearman"].mean()
-    for row in kept.reset_index().to_dict("records"):
+    ranked = evidence.randomisation.groupby(["direction", "step", "map"], sort=False)["spearman"].mean()
+    for row in ranked.reset_index().to_dict("records"):
         numbers[f"{task}/randomised/{row['direction']}/{row['step']}/{row['map']}"] = row["spearman"]
 
     metrics: Metrics = {name: float(value) for name, value in numbers.items() if math.isfinite(value)}

@@ -22,12 +22,12 @@ RUN_PAIRS = 8
 def ground_truth_mask(
     width_px: int, height_px: int, centres_px: ArrayLike, radii_px: ArrayLike, ring_factors: tuple[float, ...]
 ) -> Array:
-    """The paper's mask G (height, width): 0 in craters, 0.2, 0.4, 0.6, 0.8 in rings around them, 1 elsewhere.
+    """The paper's mask G (height, width): 0 in craters, larger in rings around them, 1 elsewhere.
 
-    Takes centres (N, 2) and radii (N,) in pixels. The rings end at ring_factors times the radius (equation
-    "crater_width"). Where craters overlap, the smallest value is used; the paper does not define this case. The paper's
-    text calls craters white and the background black, which contradicts the paper's numbers. This code follows the
-    numbers.
+    Takes centres (N, 2) and radii (N,) in pixels. The four rings have the values 0.2, 0.4, 0.6 and 0.8 and end at
+    ring_factors times the radius (equation "crater_width"). Where craters overlap, the smallest value is used; the
+    paper does not define this case. The paper's text calls craters white and the background black, which contradicts
+    the paper's numbers. This code follows the numbers.
     """
     mask = np.ones((height_px, width_px))
     levels = np.arange(len(ring_factors) + 1) / (len(ring_factors) + 1)
@@ -56,7 +56,7 @@ class LabelledFrames:
     labels: Sequence[FrameLabels]
     """Labels of each frame (N)."""
     radius_px: tuple[float, float]
-    """Range of crater radii that is evaluated, pixels."""
+    """Smallest and largest crater radius that is evaluated, pixels."""
     frame_ids: list[str]
     """Ids of the frames."""
     scene_ids: list[str]
@@ -77,12 +77,11 @@ class Pairs:
     images: NDArray[np.uint8]
     """The pairs (N, 2 height, width), the earlier frame above."""
     homographies: NDArray[np.float64]
-    """True homographies (N, 3, 3) of the ground plane, from pixels of the earlier frame to pixels of the later
-    frame."""
+    """True homographies (N, 3, 3) of the ground plane, from pixels of the earlier to pixels of the later frame."""
     translation_m: NDArray[np.float64]
-    """True translations (runs, pairs of a run, 3), metres, O_C of the earlier frame."""
+    """True translations (runs, pairs per run, 3), metres, in O_C of the earlier frame."""
     position_m: NDArray[np.float64]
-    """True positions (runs, pairs of a run, 3) at the later frames, metres, O_L."""
+    """True positions (runs, pairs per run, 3) at the later frames, metres, in O_L."""
     pair_ids: list[str]
     """Scene, trajectory and step of each pair, separated by "/"."""
     scene_ids: list[str]
@@ -94,10 +93,10 @@ class Pairs:
 def labelled_frames(
     dataset: Dataset, split: str, detector: DetectConfig, count: int, ring_factors: tuple[float, ...]
 ) -> tuple[LabelledFrames, DetectSplit]:
-    """Load at most `count` frames of a split, evenly spaced, and the whole split.
+    """Load a split; returns at most `count` of its frames, evenly spaced, and the whole split.
 
-    G contains only the craters that the detector's run selects, which excludes barely visible craters. Raises UserError
-    if the dataset is not a detection dataset, or if the split is empty or damaged.
+    The mask G contains only the craters that the labels of the detector's run select. Raises UserError if the dataset
+    is not a detection dataset, or if the split is empty or damaged.
     """
     if dataset.info.kind != "detect":
         raise UserError(dataset.store, "kind", dataset.info.kind, "detect, a dataset with labels")
@@ -138,7 +137,11 @@ def first_descent(split: DetectSplit) -> list[int]:
 
 
 def consecutive_pairs(descents: Sequence[navigation.Trajectory], count: int) -> Pairs:
-    """At most `count` pairs, in runs of at most RUN_PAIRS, spread evenly over descents and altitudes."""
+    """Pairs in runs of consecutive pairs, spread evenly over descents and altitudes.
+
+    All runs have the same length, at most RUN_PAIRS. The number of runs is `count` divided by this length, rounded
+    down, and at least 1.
+    """
     length = min(RUN_PAIRS, *(descent.n_pairs for descent in descents))
     runs = [(descent, start) for descent in descents for start in range(0, descent.n_pairs - length + 1, length)]
     return _pairs_of([(*runs[i], length) for i in evenly_spaced(len(runs), max(1, count // length))])

@@ -1,4 +1,4 @@
-"""Evidence on the gates of the stack navigator: correlation of both mask halves, nulls, interventions, stability."""
+"""Compute evidence on the stack navigator's gates: correlations with nulls, interventions, stability."""
 
 from pathlib import Path
 from typing import Any
@@ -38,16 +38,16 @@ def explain_navigator(
     validation: Pairs,
     where: Path,
 ) -> tuple[Evidence, Masks]:
-    """All tables of the stack navigator, and its masks for the test pairs (N, 2 height, width).
+    """All evidence tables of the stack navigator, and its masks for the test pairs (N, 2 height, width).
 
     The gate whose pixels are removed is chosen on the validation pairs. Raises UserError if the network has no
-    attention.
+    attention; the message names the checkpoint `where`.
     """
     size_px = architecture["size_px"]
     rng = np.random.default_rng([settings.seed, 2])
 
-    def masks_of(given: NDArray[np.uint8]) -> Masks:
-        return navigator_masks(navigator, given, size_px, where)
+    def masks_of(images: NDArray[np.uint8]) -> Masks:
+        return navigator_masks(navigator, images, size_px, where)
 
     masks, validation_masks = masks_of(pairs.images), masks_of(validation.images)
     untrained = untrained_navigator(navigator, architecture, validation.images, settings.seed)
@@ -98,7 +98,7 @@ def explain_navigator(
 def untrained_navigator(
     trained: StackNavigator, architecture: dict[str, Any], pairs: NDArray[np.uint8], seed: int
 ) -> StackNavigator:
-    """A network of the same architecture with random weights; batch statistics are measured on `pairs` (N, 2 h, w)."""
+    """An untrained network of the same architecture, with batch statistics of `pairs` (N, 2 height, width)."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network: Any = build(architecture)
@@ -114,7 +114,10 @@ def _targets(pairs: Pairs) -> PairTargets:
 
 
 def strongest_gate(masks: Masks, validation: Pairs) -> str:
-    """The gate up to stride 8 with the largest mean PCC4 on validation pairs; the first gate if PCC4 is undefined."""
+    """The gate up to stride 8 with the largest mean PCC4 on validation pairs.
+
+    The first gate if no gate has a defined PCC4.
+    """
     values = pair_values(masks, _targets(validation))
     rows = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
     means = rows.groupby("map", sort=False)["value"].mean()

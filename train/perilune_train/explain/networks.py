@@ -1,4 +1,4 @@
-"""Load the networks to explain and their images, and check the terrain that the networks were fitted to."""
+"""Load the networks to explain and their images, and check whether the networks were fitted to the terrain."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,12 +30,15 @@ from perilune_train.training.runs import choose_device, load_weights
 
 
 def folder_of(checkpoint: Path) -> Path:
-    """The folder with a checkpoint's config.yaml: the run folder, or the folder of an installed network's weights."""
+    """The folder with a checkpoint's config.yaml: of the run, or of the installed network."""
     return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
 
 
 def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainConfig) -> Detector:
-    """Load a detector on the device of `settings`, at scale 1 only, because masks belong to one scale."""
+    """Load a detector on the device of `settings`, at scale 1 only.
+
+    Other scales of its configuration are ignored, because an attention mask belongs to one scale.
+    """
     evaluation = config.evaluation.model_copy(update={"scales": (1.0,)})
     return open_detector(checkpoint, config.model_copy(update={"evaluation": evaluation, "device": settings.device}))
 
@@ -43,9 +46,11 @@ def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainC
 def terrain_marks(
     networks: Mapping[str, tuple[Path, Address]], allow_overlap: bool, split: str = "test"
 ) -> tuple[dict[str, str], Metrics]:
-    """Terrain marks and entries of metrics.json by network, from each network's checkpoint and dataset.
+    """Check the terrain that each network was fitted to; returns marks by network, and entries of metrics.json.
 
-    Raises UserError if a network was fitted to the terrain of the frames in `split` (unless `allow_overlap`).
+    `networks` has the checkpoint and the dataset by name. A mark is a text for all output of the network; it is empty
+    if the network's terrain is disjoint from the terrain of `split`, or shared by protocol. Raises UserError if a
+    network was fitted to the terrain of `split` (unless `allow_overlap`).
     """
     marks: dict[str, str] = {}
     metrics: Metrics = {}
@@ -63,17 +68,17 @@ class ExplainedDetector:
     """A detector and its frames."""
 
     checkpoint: Path
-    """Its weights."""
+    """File of the weights."""
     detector: Detector
     """The network, at scale 1."""
     config: DetectConfig
-    """Configuration of its run."""
+    """Configuration of the training run."""
     split: DetectSplit
     """The whole test split."""
     frames: LabelledFrames
-    """Test frames."""
+    """Test frames that are explained."""
     known_frames: LabelledFrames
-    """Validation frames: signs and gates are chosen on them."""
+    """Validation frames, on which the signs of correlations and the gate whose pixels are removed are chosen."""
     descent: LabelledFrames
     """All frames of the first test descent."""
 
@@ -83,21 +88,21 @@ class ExplainedNavigator:
     """A stack navigator and its pairs of frames."""
 
     checkpoint: Path
-    """Its weights."""
+    """File of the weights."""
     network: StackNavigator
-    """The network."""
+    """The network on its device."""
     architecture: dict[str, Any]
     """Architecture settings stored in the checkpoint."""
     pairs: Pairs
-    """Test pairs."""
+    """Test pairs that are explained."""
     known_pairs: Pairs
-    """Validation pairs: signs and gates are chosen on them."""
+    """Validation pairs, on which the gate whose pixels are removed is chosen."""
     flight: Pairs
     """Pairs of the first test descent, from high to low."""
 
 
 def open_detection(checkpoint: Path, data: Address, settings: ExplainConfig) -> ExplainedDetector:
-    """Load a detector, and its test and validation frames. Raises UserError if one is missing or invalid."""
+    """Load a detector, and its test and validation frames. Raises UserError if a file is missing or invalid."""
     config = config_of_run(folder_of(checkpoint), ())
     detector, dataset = open_single_scale(checkpoint, config, settings), open_single(data)
     frames, split = labelled_frames(dataset, "test", config, settings.n_frames, settings.ring_factors)
@@ -107,7 +112,7 @@ def open_detection(checkpoint: Path, data: Address, settings: ExplainConfig) -> 
 
 
 def open_navigation(checkpoint: Path, data: Address, settings: ExplainConfig) -> ExplainedNavigator:
-    """Load a stack navigator, and its test and validation pairs. Raises UserError if one is missing or invalid."""
+    """Load a stack navigator, and its test and validation pairs. Raises UserError if a file is missing or invalid."""
     stack, architecture = load_navigator(checkpoint, "stack")
     network, dataset = stack.to(choose_device(settings.device)), open_single(data)
     descents = load_split(dataset, "test")

@@ -74,7 +74,7 @@ class NavigatorArchitecture(Section):
 
 
 def check_architecture_of(model: type[Section], architecture: Mapping[str, Any], path: Path) -> None:
-    """Raise UserError naming the first setting of an architecture that is missing, unknown or out of range."""
+    """Raise UserError if a setting of an architecture is missing, unknown or out of range; it names the first one."""
     try:
         model.model_validate_json(json.dumps(architecture))
     except ValidationError as error:

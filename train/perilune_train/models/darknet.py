@@ -55,8 +55,9 @@ class AttentionDarknet53(nn.Module):
 
     At width 1, with 3 input channels, 5 stages and no attention, it has 52 convolutions and 40,620,640 floats in
     Darknet's count (weights, and scale, bias, mean and variance of each batch norm). Names follow the paper: residual
-    unit j of stage i is `units["B_ij"]` and its CBAM is `attentions["B_ij"]`, with i = 1..5 and j from 1 to 1, 2, 8, 8,
-    4. The form cbam_last has a CBAM only after the last unit of each stage: B_11, B_22, B_38, B_48, B_54.
+    unit j of stage i is `units["B_ij"]`, and the CBAM after it is `attentions["B_ij"]`. The five stages have 1, 2, 8, 8
+    and 4 units; i and j count from 1. The form cbam_last has a CBAM only after the last unit of each stage: B_11, B_22,
+    B_38, B_48, B_54.
 
     Deviation from the original at widths other than 1: channels are rounded to multiples of 8.
     """
@@ -78,7 +79,6 @@ class AttentionDarknet53(nn.Module):
             for j in range(UNITS[i]):
                 name = f"B_{i + 1}{j + 1}"
                 self.units[name] = ResidualUnit(channels)
-                # The form cbam_last has gates after the last units only.
                 if attention != "none" and (attention != "cbam_last" or j == UNITS[i] - 1):
                     self.attentions[name] = CBAM(channels, form=_FORMS[attention])
 

@@ -64,10 +64,9 @@ def backbone_slots(backbone: AttentionDarknet53) -> list[Slot]:
 def network_slots(network: YOLOv3, filters: int = _FILTERS) -> list[Slot]:
     """All tensors of a network with strides 8, 16, 32, in the order of yolov3.cfg.
 
-    `filters` is the number of channels of the output layers. The layers are in the order of execution. The backbone
-    comes first. Then each of the strides 32, 16 and 8 has its branch, its head and, except for stride 8, the lateral
-    convolution to the next stride.
-    Raises ValueError for other strides.
+    `filters` is the number of channels of the output layers. The order is the order of execution: first the backbone;
+    then, for each of the strides 32, 16 and 8, the branch, the head and, except for stride 8, the lateral convolution
+    to the next stride. Raises ValueError for other strides.
     """
     if network.strides != (8, 16, 32):
         raise ValueError(f"strides are {network.strides}, not (8, 16, 32)")
@@ -87,7 +86,7 @@ def count_floats(slots: Sequence[Slot]) -> int:
 def is_darknet(path: Path) -> bool:
     """Whether a file is a Darknet weight file.
 
-    It is one if it is not a torch checkpoint, and has either the name of a Darknet file or a plausible version.
+    True if the file is not a torch checkpoint and has the name of a Darknet file or a header with a plausible version.
     """
     start = b""
     if path.is_file():
@@ -134,7 +133,7 @@ def write_darknet(path: Path, content: DarknetFile) -> None:
 def fill_slots(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
     """Copy the first floats of a file into a network. Output layers with a different number of channels stay unchanged.
 
-    Raises UserError (`path` is for its message) and copies nothing if a variance is negative.
+    If a variance is negative, raises UserError, whose message names `path`, and copies nothing.
     """
     parts = np.split(content.values[: count_floats(slots)], np.cumsum([slot.floats for slot in slots])[:-1])
     for slot, part in zip(slots, parts, strict=True):

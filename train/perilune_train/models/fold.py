@@ -1,4 +1,4 @@
-"""Networks for flight: batch norm folded into the convolutions, attention in standard operations."""
+"""Prepare networks for export: fold batch norms into convolutions, and write attention in standard operations."""
 
 import torch
 from torch import Tensor, nn

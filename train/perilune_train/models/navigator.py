@@ -21,8 +21,8 @@ class Recurrent(nn.Module):
 
     The last linear layer starts at zero, so that an untrained network outputs the reference motion. With `summary`, a
     linear layer to `summary` values comes before the LSTM. `dropout` acts on the LSTM's input and output. With `exact`,
-    the layers compute in float32 even under autocast, because positions vary over hundreds of metres and bfloat16
-    resolves only 1/256 of that.
+    the layers compute in float32 even under autocast: positions vary over hundreds of metres, and bfloat16 resolves
+    only 1/256 of a value.
 
     Shape: features (batch, pairs, inputs) to (batch, pairs, 9) and the LSTM's state after the last pair. The argument
     `state` is the LSTM's state before the first pair; None at the start of a trajectory.
@@ -47,7 +47,7 @@ class Recurrent(nn.Module):
         return torch.autocast(values.device.type, enabled=False) if self.exact else nullcontext()
 
     def over_time(self, summaries: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        """Run `forward` without the layer `summary`, from the outputs of this layer (batch, pairs, values)."""
+        """Run the layers after `summary` on its outputs (batch, pairs, values); returns the result of `forward`."""
         with self.precision(summaries):
             hidden, state = self.lstm(self.dropout(summaries), state)
             return self.output(self.dropout(hidden)).float(), state
@@ -298,7 +298,7 @@ def slope(images: Tensor, dim: int) -> Tensor:
 
 
 def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
-    """Shift (N, 2, H, W) from the first to the second of two images (N, 2, H, W), in pixels along x and y.
+    """Local shifts (N, 2, H, W), pixels along x and y, from the first to the second of two images (N, 2, H, W).
 
     For a square window around each pixel, one least-squares step (Lucas & Kanade 1981) explains the change of
     brightness by the gradient. The step is damped where gradients are small. The result is valid for shifts smaller

@@ -13,7 +13,7 @@ def multiply_adds(network: nn.Module, shape: tuple[int, ...]) -> int:
     It is half of torch's count of floating-point operations. As usual, the count leaves out biases, norms, activations,
     products of gates and pooling.
     """
-    # On torch's `meta` device only shapes are computed.
+    # torch's `meta` device computes shapes only, which is fast.
     on_meta = copy.deepcopy(network).to("meta").eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         on_meta(torch.empty(shape, device="meta"))

@@ -25,7 +25,7 @@ class YOLOv3(nn.Module):
 
     Deviations from the original: There are no class outputs, because craters are the only class; the score is the
     objectness. The heads may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than
-    6 px. The neck then still starts at stride 32, with one 1 x 1 convolution. `width` scales the neck too.
+    6 px. The neck then still starts at stride 32, with one 1 x 1 convolution. `width` scales backbone and neck.
     """
 
     anchors: Tensor

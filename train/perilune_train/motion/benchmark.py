@@ -1,7 +1,4 @@
-"""Score a navigator and the other methods on the locked benchmark, by region, altitude and Sun elevation.
-
-Intervals are over scenes.
-"""
+"""Score a navigator and methods without training on the locked benchmark, by region, altitude and Sun elevation."""
 
 import itertools
 from dataclasses import replace
@@ -29,14 +26,14 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
 HEADLINE = "position_rmse_vector_m"
-"""The strictest RMSE of position: over lengths of the error vector, not over components."""
+"""The headline figure: RMSE of the lengths of the position error vectors. It is larger than the RMSE per component."""
 _COLUMNS = {
     HEADLINE: "position RMSE, vector (m)",
-    "position_rmse_per_component_m": "per component (m)",
+    "position_rmse_per_component_m": "position RMSE, per component (m)",
     "orientation_rmse_angle_deg": "orientation RMSE, angle (deg)",
-    "drift_final_m": "drift at the end (m)",
-    "stated_position_rmse_vector_m": "stated position RMSE, vector (m)",
-    "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is correct)",
+    "drift_final_m": "dead-reckoned position error at the last frame (m)",
+    "stated_position_rmse_vector_m": "position RMSE, vector, as the method's covariance predicts (m)",
+    "normalised_error_squared_mean": "mean squared normalised error (6 if the covariance is correct)",
 }
 _OF_BINS = tuple(_COLUMNS)[:3]
 """Figures that are also computed by region, altitude and Sun elevation."""
@@ -48,7 +45,7 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     """Score a run's best weights, the classical methods and the nominal motion; return the figures.
 
     Writes the page, figures, tables and pictures. Raises UserError if the benchmark is missing or was changed, or if
-    the network was trained on terrain of the benchmark; `allow_overlap` accepts such a network.
+    the network was trained on terrain of the benchmark. `allow_overlap` accepts this network and marks all output.
     """
     parts = open_parts("nav", data, manifests)
     best = RunFolder(run).best
@@ -90,7 +87,7 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
 
 
 def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str, float]]:
-    """All trajectories, and region and Sun elevation (degrees) of each scene. Scene names contain the part."""
+    """Trajectories of all parts, and region and Sun elevation (degrees) of each scene, by name <part>/<scene_id>."""
     trajectories, regions, suns = [], {}, {}
     for part in parts:
         for row in part.dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist():
@@ -102,7 +99,7 @@ def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str
 
 
 def _figures(errors: dict[str, pd.DataFrame], regions: dict[str, str], suns: dict[str, float]) -> Metrics:
-    """Flat figures by method, and by method and region, altitude_m or sun_deg.
+    """Figures of each method, over all scenes and by region, altitude and Sun elevation, with flat keys.
 
     Keys: <method>/<figure>, <method>/region/<name>/<figure>, <method>/altitude_m/<bin>/<figure>,
     <method>/sun_deg/<bin>/<figure>.
@@ -137,19 +134,28 @@ def _page(
     ms: float,
     counts: dict[str, tuple[int, int]],
 ) -> str:
-    """The page as Markdown."""
     spreads = {method: summary_spreads(table_of_method) for method, table_of_method in errors.items()}
     headline = spreads[fusion][HEADLINE].text(float(figures[f"{fusion}/{HEADLINE}"] or np.nan))
     lines = ["# Locked benchmark of navigation", ""]
     lines += [
-        f"**Position RMSE of a step {headline} m** (length of the error vector), run {code_span(run.resolve().name)}.",
+        f"**Position RMSE of a step: {headline} m** (length of the error vector), run {code_span(run.resolve().name)}.",
+        "",
+        "A step is the motion between two consecutive frames.",
         "",
     ]
     for name in part_names("nav"):
         n_frames, n_locked = counts.get(name, (0, 0))
         whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
         lines.append(f"- `{name}`: {whole} of the shared manifest" if n_frames else f"- `{name}`: **not scored**")
-    lines += [f"- one pair at a time with the state carried: {ms:g} ms", "", "## Methods", ""]
+    lines += [
+        f"- time for one pair of frames: {ms:g} ms",
+        "",
+        "## Methods",
+        "",
+        f"`{fusion}`: this network. `klt`: tracked corners. `alignment`: direct alignment of both frames. "
+        "`_gyroscope`: with the rotation that a gyroscope measured. `nominal`: the nominal motion, without images.",
+        "",
+    ]
     rows = []
     for method in errors:
         cells = [
@@ -161,7 +167,7 @@ def _page(
         rows.append([method, *cells])
     lines += [*table(["method", *_COLUMNS.values()], rows), ""]
     lines += ["In brackets: 95 % intervals over scenes, or the value of each scene if there are fewer than five.", ""]
-    for kind, title in (("region", "region"), ("altitude_m", "altitude (m)"), ("sun_deg", "Sun (deg)")):
+    for kind, title in (("region", "region"), ("altitude_m", "altitude (m)"), ("sun_deg", "Sun elevation (deg)")):
         start = f"{fusion}/{kind}/"
         names = [
             key[len(start) : -len("/scenes")] for key in figures if key.startswith(start) and key.endswith("/scenes")

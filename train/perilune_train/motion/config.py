@@ -20,12 +20,13 @@ class FusionConfig(Section):
     width: Annotated[float, Field(gt=0, le=2)]
     """Factor on the channel counts of the backbone; 1 is the paper's network."""
     attention: Attention = "cbam_identity"
-    """Attention after every residual unit."""
+    """Kind of the attention gates in the backbone."""
     hidden: Annotated[int, Field(ge=1, le=4096)]
     """Hidden size of each of the two LSTM layers; the paper uses 1000."""
     target: Target = "motion"
     """What stack estimates. motion: the motion from the earlier to the later frame. pose: position and attitude of the
-    camera in O_L at the later frame, over the landing area of the training; the dataset must have exactly one scene."""
+    camera in O_L at the later frame. A pose network knows only the landing area of its training data, so the dataset
+    must have exactly one scene."""
     pool: Literal[1, 2, 4] = 1
     """How stack averages the backbone's features. 1: over both frames together, as in the paper. 2 or 4: over each cell
     of a 2 x 2 or 4 x 4 grid on each frame; a linear layer then reduces them to at most 512 values for the LSTM."""
@@ -52,15 +53,15 @@ class FusionConfig(Section):
     """Peak learning rate of the coarse stage. If it is set, the learning rate of this stage falls to 0 by a separate
     cosine. None: both stages use `learning_rate`, with the schedule of `cycles`."""
     backbone_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Factor on the learning rate of a backbone from a detector in the fine stage. AdamW's first steps are equally
-    large for every weight, and their effects add up in a wide network. With 1, the fine stage can therefore lose what
-    the coarse stage has learned."""
+    """Factor on the learning rate of the backbone in the fine stage, if the backbone comes from a detector. AdamW's
+    first steps are equally large for every weight, and their effects add up in a wide network. With 1, the fine stage
+    can therefore lose what the coarse stage has learned."""
     cycles: Count = 1
     """Number of cosines of the learning rate. 1: one cosine over both stages. More (5 in the paper): a constant rate in
     the coarse stage, then this number of cosines in the fine stage, each from the peak down to 0."""
     jitter: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Standard deviation of a random motion that is added to each training pair, as a fraction of the spread of the
-    residuals in the training set."""
+    """Standard deviation of a random motion that is added to each training pair of warp. It is a fraction of the spread
+    of the true motions about the nominal motion in the training set. stack ignores this setting."""
     views: Annotated[int, Field(ge=0, le=64)] = 0
     """Number of further versions of each training trajectory for `target=pose`, seen from nearby poses. The frames are
     warped over the mean ground plane, and the nearby poses are the ground truth. Each training sequence uses one
@@ -71,13 +72,14 @@ class FusionConfig(Section):
 
 
 class StreamConfig(Section):
-    """Settings of training sequences over new ground, which `perilune-render serve` renders during training."""
+    """Settings of training sequences over scenes that are not in the dataset. `perilune-render serve` renders them
+    during training."""
 
     address: Annotated[str, Field(min_length=1, max_length=300)]
     """Address of the server's interface for `perilune_shared.client`, such as tcp://127.0.0.1:10364."""
     n_scenes: Annotated[int, Field(ge=1, lt=2**31)]
-    """Number of scenes. Training uses the server's scenes 1 to n_scenes in turn. Start the server with `--scenes`
-    n_scenes + 1."""
+    """Number of scenes. Training uses the server's scenes 1 to n_scenes in turn. The server also has a scene 0, so
+    start it with `--scenes` n_scenes + 1."""
     pairs_per_scene: Count = 64
     """Number of consecutive pairs that are rendered over one scene before the next scene."""
     share: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -120,7 +122,7 @@ class NavigateConfig(Section):
     cores."""
     stream: StreamConfig | None = None
     """Training sequences that are rendered during training; requires `fusion=warp` and `workers=0`. null: sequences
-    from the dataset only. Differs from `detect.stream`, which reads a dataset."""
+    from the dataset only. (`detect.stream` is another setting: it reads a dataset in portions.)"""
     warp: FusionConfig
     """Network with the later frame warped by the nominal motion and both frames stacked in channels; the default
     navigator."""
@@ -140,5 +142,5 @@ class NavigateConfig(Section):
         for name in ("target", "pool", "stages", "dropout", "views", "view_spread", "backbone_factor"):
             default = FusionConfig.model_fields[name].default
             if getattr(self.warp, name) != default:
-                raise ValueError(f"warp.{name}={default}, since only stack has another")
+                raise ValueError(f"warp.{name}={default}, since only stack has this setting")
         return self

@@ -27,23 +27,26 @@ from perilune_train.motion.network import Collate, Scales, predict
 
 FILE = "covariance.json"
 NAMES = ("flow", "flow_by_altitude", "prior", "turn", "along")
-"""Names of the five numbers, which are logarithms. flow: factor on the information of the flows. flow_by_altitude:
-growth of this factor with the logarithm of altitude / 1000 m. prior: factor on the prior. turn, along: factors on the
-standard deviations of the rotation about z and of the translation along z."""
+"""Names of the five numbers. flow: logarithm of the factor on the information of the flows, at an altitude of 1000 m.
+flow_by_altitude: exponent of altitude / 1000 m in this factor. prior: logarithm of the factor on the inverse variances
+of the prior. turn, along: logarithms of the factors on the standard deviations of the rotation about z and of the
+translation along z."""
 _ALTITUDE_M, _LARGEST = 1000.0, 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class MotionInformation:
-    """Inverse covariances of the motions of one trajectory of n frames, from a network's flows and prior."""
+    """Inverse covariances of the motions of one trajectory of n frames, from a network's flows and prior.
+
+    All are for turn (radians) and shift (metres), as in `EstimatedMotion`.
+    """
 
     information: Array
-    """Information of the flows (n - 1, 6, 6), before correction, on turn (radians) and shift (metres) as in
-    `EstimatedMotion`."""
+    """Inverse covariances (n - 1, 6, 6) from the flows, before correction."""
     prior: Array
-    """Inverse variances of the network's prior (6,)."""
+    """Inverse variances (6,) of the network's prior."""
     altitude_m: Array
-    """Nominal altitudes (n - 1,)."""
+    """Nominal altitudes (n - 1,), metres."""
 
     def covariance(self, numbers: Sequence[float] | Array) -> Array:
         """Covariances (n - 1, 6, 6), corrected by the five numbers of `NAMES`."""
@@ -55,7 +58,7 @@ class MotionInformation:
 
 
 def information_of(network: WarpNavigator, architecture: dict[str, Any], trajectory: Trajectory) -> MotionInformation:
-    """Compute the information on the motions of a trajectory from the flows and the prior of a warp network."""
+    """Compute the inverse covariances of a trajectory's motions from the flows and the prior of a warp network."""
     shrunk, scales = trajectory.shrunk(architecture["size_px"]), Scales(**architecture["scales"])
     network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=True)
@@ -72,7 +75,7 @@ def information_of(network: WarpNavigator, architecture: dict[str, Any], traject
 
 
 def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
-    """Fit the five numbers by maximum likelihood, with Gaussian errors of these motions."""
+    """Fit the five numbers of `NAMES` to the errors of motions by maximum likelihood; the errors are Gaussian."""
     errors = np.concatenate(
         [signed_errors(trajectory, motion) for trajectory, motion in zip(trajectories, motions, strict=True)]
     )
@@ -100,7 +103,7 @@ def calibrate(
 
 
 def write_numbers(folder: Path, numbers: list[float], n_pairs: int) -> None:
-    """Write covariance.json of a run."""
+    """Write covariance.json: the five numbers, and the number of pairs that they were fitted to."""
     content = {"numbers": dict(zip(NAMES, numbers, strict=True)), "pairs": n_pairs}
     write_text(folder / FILE, json.dumps(content, indent=2) + "\n")
 
@@ -122,7 +125,10 @@ def read_numbers(folder: Path) -> list[float] | None:
 def stated_covariances(
     folder: Path, network: Any, architecture: dict[str, Any], trajectories: list[Trajectory]
 ) -> list[Array] | None:
-    """Covariances of a run's motions in each trajectory, as in `EstimatedMotion`; None without covariance.json."""
+    """Covariances of a run's motions in each trajectory, as in `EstimatedMotion`.
+
+    None if the run has no covariance.json or its network is not a warp network.
+    """
     numbers = read_numbers(folder)
     if numbers is None or not isinstance(network, WarpNavigator):
         return None

@@ -92,14 +92,14 @@ def _check_area(path: Path, known: Provenance, dataset: Dataset, split: str) -> 
     """Raise UserError unless a split is over the landing area that a pose network was trained on."""
     trained = {use.sha256 for use in known.uses if use.use == "trained"}
     if trained and not {use.sha256 for use in split_terrain(dataset, split, "tested")} <= trained:
-        expected = f"the landing area that {path} was trained on; it estimates poses there only"
-        raise UserError(dataset.store, "terrain", "another one", expected)
+        expected = f"the landing area that {path} was trained on; it estimates poses only there"
+        raise UserError(dataset.store, "terrain", "other terrain", expected)
 
 
 def _evaluate_pose(
     network: Any, architecture: dict[str, Any], split: str, trajectories: list[Trajectory], out: Path, details: Metrics
 ) -> None:
-    """Evaluate a pose network, and the mean pose of its training frames, the only baseline in a checkpoint."""
+    """Evaluate a pose network and the mean pose of its training frames, the only baseline that a checkpoint stores."""
     scales = Scales(**architecture["scales"])
     poses, seconds = _timed(predict_pose, network, architecture, trajectories)
     mean = np.array(scales.mean_m), np.array(scales.mean_rotation)
@@ -145,8 +145,8 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     """Write compare.md and errors.png into `out`; returns the table.
 
     Each evaluation gets one row for its network. For each dataset and split, the methods without training get rows from
-    the first evaluation. Raises UserError if a folder is not an evaluation of navigation, or was evaluated on terrain
-    that its network was trained on, unless `allow_overlap`; then table and picture are marked.
+    the first evaluation. Raises UserError if a folder is not an evaluation of navigation, or if a network was trained
+    on the terrain of its evaluation. `allow_overlap` accepts these networks and marks table and picture.
     """
     rows, errors, marks, listed = [], {}, [], set()
     for folder in folders:
@@ -192,7 +192,9 @@ def _cells(metrics: Metrics, prefix: str) -> list[str]:
 def _read_errors(path: Path) -> pd.DataFrame:
     """Read the table of pairs. Raises UserError if the file is missing or lacks columns."""
     if not path.is_file():
-        raise UserError(path, "errors", "no such file", "one that `perilune-train navigate train` or `evaluate` writes")
+        raise UserError(
+            path, "errors", "no such file", "a file that `perilune-train navigate train` or `evaluate` wrote"
+        )
     try:
         return pd.read_parquet(path, columns=["method", *_DRAWN])
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:

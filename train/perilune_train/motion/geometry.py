@@ -48,9 +48,9 @@ def plane_homography(
 ) -> Array:
     """Homography (3, 3) of a plane, from image coordinates of frame 1 to image coordinates of frame 2.
 
-    The plane contains all points X1 with plane_normal_c1 . X1 = plane_distance_m. For the ground these are the downward
-    unit vector in O_C of frame 1 and the altitude. H = K R (I - t n^T / d) K^-1 (Hartley & Zisserman, 2nd ed., section
-    13.1).
+    The plane contains all points X1 with plane_normal_c1 . X1 = plane_distance_m. For the ground, the normal is the
+    downward unit vector in O_C of frame 1, and the distance is the altitude. H = K R (I - t n^T / d) K^-1 (Hartley &
+    Zisserman, 2nd ed., section 13.1).
     """
     k, t, n = (np.asarray(values, np.float64) for values in (camera_matrix, translation_m, plane_normal_c1))
     induced = np.eye(3) - np.outer(t, n) / plane_distance_m
@@ -94,7 +94,10 @@ def rotation_from_sixd(sixd: Tensor) -> Tensor:
 
 
 def euler_from_rotation(rotation: Tensor) -> Tensor:
-    """Angles (..., 3) in radians about x, y, z of rotation = Rz Ry Rx (..., 3, 3); |y| below 90 degrees."""
+    """Euler angles (..., 3) about x, y, z, in radians, of rotations (..., 3, 3) = Rz Ry Rx.
+
+    The angle about y must be between -90 and 90 degrees.
+    """
     cos_y = torch.hypot(rotation[..., 0, 0], rotation[..., 1, 0])
     return torch.stack(
         [
@@ -107,6 +110,6 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def mean_rotation(rotations: Array) -> Array:
-    """The rotation nearest to the mean of the matrices (Moakher 2002, doi 10.1137/S0895479801383877)."""
+    """Rotation (3, 3) nearest to the mean of rotations (n, 3, 3) (Moakher 2002, doi 10.1137/S0895479801383877)."""
     u, _, vt = np.linalg.svd(rotations.mean(0))
     return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)

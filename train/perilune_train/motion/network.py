@@ -25,12 +25,12 @@ Fusion = Literal["warp", "stack"]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """Scales that convert a network's standardised output y to a motion, or to a pose (motion/pose.py).
+    """Scales that convert a network's standardised output y (9,) to a motion, or to a pose (motion/pose.py).
 
-    Translation of stack: mean_m + spread_m * y. Translation of warp: nominal translation + spread_m * y. For both,
-    rotation_c2_from_c1 is the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the
-    nominal motion has no rotation. Position of a pose: mean_m + spread_m * y. The rotation from the mean attitude to
-    the attitude of a pose is computed as for motions.
+    Translation of a motion: mean_m + spread_m * y[:3] for stack, nominal translation + spread_m * y[:3] for warp.
+    Rotation of a motion: the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y[3:]; the
+    nominal motion has no rotation. Position of a pose: mean_m + spread_m * y[:3]. Attitude of a pose: the mean attitude
+    followed by a rotation that is computed as for motions.
     """
 
     mean_m: list[float]
@@ -40,8 +40,8 @@ class Scales:
     """Standard deviation of the translation from the mean (stack) or from the nominal translation (warp), metres (3,).
     For poses: standard deviation of the position."""
     rotation_rad: float
-    """Root mean square of a motion's rotation about one axis, radians. For poses: of the rotation from the mean
-    attitude."""
+    """Root mean square of a motion's rotation about one axis, radians. For poses: root mean square of the rotation from
+    the mean attitude, about one axis."""
     mean_rotation: list[list[float]] | None = None
     """For poses: mean rotation_camera_from_site of the training set (3, 3)."""
 
@@ -92,7 +92,7 @@ def target_of(architecture: dict[str, Any]) -> Target:
 def check_motion(path: Path, architecture: dict[str, Any]) -> None:
     """Raise UserError unless a checkpoint's network estimates motions."""
     if target_of(architecture) != "motion":
-        expected = "a network trained with target=motion; a pose is known over the landing area of the training only"
+        expected = "a network trained with target=motion; a pose network knows only the landing area of its training"
         raise UserError(path, "target", target_of(architecture), expected)
 
 
@@ -198,7 +198,7 @@ def _predicted(
     state: State | None,
     features: Tensor | None = None,
 ) -> tuple[Motion, State]:
-    """Motions of consecutive pairs of a shrunk trajectory, and the LSTM's state after the last one."""
+    """Motions of consecutive pairs of a shrunk trajectory, and the LSTM's state after the last pair."""
     sequence = pair_sequence(shrunk, pairs.start, len(pairs), warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
     if architecture["fusion"] == "warp":

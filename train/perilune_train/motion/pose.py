@@ -1,8 +1,8 @@
-"""Poses in O_L from a stack network: features of pairs, causal windows, and evaluation pair by pair as in flight.
+"""Estimate poses in O_L with a stack network: for a whole trajectory, or pair by pair as in flight.
 
-The network is trained on sequences of `sequence_pairs` pairs that start from the zero state of the LSTM. Evaluation
-does this too: the pose at each pair is computed from a window of the last `sequence_pairs` pairs. At the start of a
-trajectory the window is shorter.
+In training, the LSTM starts from the zero state and runs over `sequence_pairs` pairs. So it does in evaluation: the
+pose at each pair is computed from a window of the last `sequence_pairs` pairs. At the start of a trajectory the window
+is shorter.
 """
 
 import time
@@ -53,8 +53,8 @@ def warped_frames(frames: Tensor, homographies: Tensor) -> Tensor:
 def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tensor | None = None) -> Iterator[Tensor]:
     """Yield averaged backbone features (pairs, inputs) of all pairs of consecutive 8-bit frames (n, height, width).
 
-    They are yielded in portions, on the network's device. If homographies (n, 3, 3) are given, the frames are warped
-    first (`warped_frames`).
+    Each item has the features of some pairs, on the network's device. If homographies (n, 3, 3) are given, the frames
+    are warped first (`warped_frames`).
     """
     device = next(network.parameters()).device
     at_once = _PAIRS.get(device.type, 16)

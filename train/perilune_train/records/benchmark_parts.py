@@ -86,7 +86,7 @@ def _check_frames(dataset: Dataset, manifest: Dataset) -> None:
         equal = np.isclose(_array(frames[column]), _array(expected[column]), rtol=0, atol=1e-9).all(axis=1)
         if not equal.all():
             raise UserError(
-                dataset.store, column, f"another one in {frames.index[int(equal.argmin())]}", "the manifest's"
+                dataset.store, column, f"another value in {frames.index[int(equal.argmin())]}", "the manifest's value"
             )
     if not (frames["split"] == "test").all():
         raise UserError(dataset.store, "split", "train or val", "test frames only")

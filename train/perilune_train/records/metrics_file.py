@@ -20,7 +20,7 @@ Metrics = dict[str, float | int | str | None]
 def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None], name: str = METRICS_FILE) -> None:
     """Write metrics.json, or the file `name`. Values that are not finite become null.
 
-    Adds the entries run/...: commit, hardware, load, command, date, GPU and versions.
+    Adds entries with the prefix run/: commit, hardware, load, command, date, GPU and versions.
     """
     # Imported here, so that reading metrics does not require torch.
     import numpy as np

@@ -3,8 +3,8 @@
 Every checkpoint records the terrain on which the network was trained, selected or calibrated, by content hash
 (`perilune_shared.content`). The record includes the terrain of the network's parents: the network that provided the
 initial weights, and the teacher. A test on recorded terrain measures memorisation, not generalisation. Such a test
-raises an error, unless the splits of the dataset share terrain by protocol or the user allows it. If the user allows
-it, all output is marked.
+raises an error, unless the splits of the dataset share terrain by protocol, or the user allows the test. All output of
+an allowed test is marked.
 """
 
 import re
@@ -51,7 +51,7 @@ class TerrainUse:
     sha256: str
     """Content hash of the terrain (`terrain_of`)."""
     group: str
-    """Name of the group of datasets that share terrain by protocol; otherwise the dataset's name."""
+    """Name of the group of datasets that share terrain by protocol; the dataset's name if it belongs to no group."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
 
 
 def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUse]:
-    """The terrain under the frames of a split; empty without frames. Raises UserError on an invalid scene_id."""
+    """The terrain under the frames of a split; empty if it has no frames. Raises UserError on an invalid scene_id."""
     scene_ids = set(dataset.table("frames", ["scene_id"], split=split)["scene_id"].to_pylist())
     rows = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
     for row in rows:
@@ -193,7 +193,7 @@ def check_terrain(
     test split raises UserError with the names of the scenes, unless `allow_overlap`.
     """
     fitted = frozenset(use for use in provenance.uses if use.use != "tested")
-    # Users evaluate training and validation frames on purpose, and the report names the split.
+    # Who evaluates training or validation frames does so on purpose, and the report names the split.
     by_design = dataset.info.split_by != "scene" or split != "test"
     tested = split_terrain(dataset, split, "tested")
     return _compared(fitted, tested, dataset, by_design, provenance.known, allow_overlap or split != "test")

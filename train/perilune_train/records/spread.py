@@ -1,8 +1,8 @@
 """Spread of a metric: a 95 % bootstrap interval over independent units, or the value of each unit.
 
-Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene. In a split with one
-scene, the unit is the trajectory. If neither is known, the unit is the image. With fewer than five units there is no
-interval; the value of each unit is given instead.
+The unit is the scene: frames of one scene are alike, so whole scenes are drawn with replacement. In a split with one
+scene, the unit is the trajectory. If scenes and trajectories are unknown, the unit is the image. With fewer than five
+units there is no interval; the value of each unit is given instead.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,7 +40,7 @@ class Resamples:
         return len(self.names)
 
     def of_units(self, units: Rows) -> "Resamples":
-        """Make one resample for each of these units; it contains this unit once and no other."""
+        """Make one resample for each of `units`, which contains only this unit, once."""
         return replace(self, weights=np.eye(self.count)[units])
 
     def totals(self, rows: Rows, values: Array | None = None) -> Array:

@@ -1,1 +1,1 @@
-"""The report of a demo, a paper run or a benchmark: one HTML file without other files, and a summary."""
+"""The report of a demo, a paper run or a benchmark: one self-contained HTML file, and a Markdown summary."""

@@ -11,11 +11,11 @@ class Provenance:
     """The source of a figure: a run or dataset, with hashes, commit, command and hardware."""
 
     source: str
-    """Folder of the run below the folder of all runs, or name and kind of the dataset."""
+    """Path of the run's folder, relative to the folder of all runs; for a dataset, its name and kind."""
     settings_sha256: str = ""
     """SHA-256 of config.yaml, or of the dataset's recipes; empty if there is no such file."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of the inputs by name: datasets (of dataset.json) and checkpoints."""
+    """SHA-256 of the inputs by name: checkpoints, and dataset.json of each dataset."""
     commit: str = ""
     """Commit of the code; empty if not recorded."""
     date: str = ""
@@ -35,12 +35,12 @@ class Provenance:
 
     @property
     def anchor(self) -> str:
-        """Anchor of this source in the page; datasets with the same name get different anchors."""
+        """Anchor of this source in the page. Different datasets with equal names have different anchors."""
         return "source-" + hashlib.sha256(repr((self.source, self.inputs)).encode()).hexdigest()[:12]
 
     @property
     def facts(self) -> tuple[tuple[str, str], ...]:
-        """Names and values of the facts about the source; `not recorded` if the files do not contain a value."""
+        """Names and values of all facts; the value is `not recorded` if the files do not contain the fact."""
         known = {
             "command": self.command,
             "SHA-256 of the configuration": self.settings_sha256,
@@ -65,11 +65,11 @@ class Figure:
     caption: str
     """Caption: the quantities drawn, with units."""
     sources: tuple[Provenance, ...]
-    """The runs and datasets that it shows."""
+    """The runs and datasets that the figure shows."""
     wide: bool = False
-    """Whether it takes the whole width of the page."""
+    """Whether the figure takes the whole width of the page."""
     key: str = ""
-    """Anchor in the page; empty for none."""
+    """Anchor in the page; empty if no link leads to the figure."""
 
 
 @dataclass(frozen=True)
@@ -83,15 +83,15 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     """Cells, row by row; Markup for a link."""
     sources: tuple[Provenance, ...]
-    """The runs and datasets that it shows."""
+    """The runs and datasets that the table shows."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A crater or a detection on a frame: an ellipse, or a box with sides along the image axes."""
+    """A label (an ellipse) or a detection (a box along the image axes) on a frame."""
 
     kind: str
-    """found, missed or ignored (labels); matched, false or unjudged (detections)."""
+    """Labels: found, missed or ignored. Detections: matched, false or unjudged (not evaluated)."""
     shape: tuple[float, float, float, float, float]
     """Ellipse: centre x, y and semi-axes, pixels; direction, degrees. Box: x0, y0, width, height, pixels; score."""
 
@@ -101,21 +101,21 @@ class FramePicture:
     """A frame with its labels and detections."""
 
     name: str
-    """frame_id."""
+    """The frame_id."""
     image: str
     """The frame as a data URI."""
     width_px: int
-    """Width of the frame; marks are in pixels of the frame."""
+    """Width of the frame, pixels. Marks are in pixels of the frame."""
     height_px: int
-    """Height of the frame."""
+    """Height of the frame, pixels."""
     about: str
     """Caption: altitude, Sun elevation and counts."""
     labels: tuple[Mark, ...]
-    """Ellipses."""
+    """Labels, as ellipses."""
     detections: tuple[Mark, ...] = ()
-    """Boxes."""
+    """Detections, as boxes."""
     sources: tuple[Provenance, ...] = ()
-    """The runs and datasets that it shows."""
+    """The runs and datasets that the picture shows."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Section:
     title: str
     """Heading."""
     lead: tuple[str, ...] = ()
-    """First lines: the answer, then how it was obtained."""
+    """First paragraphs: the result, then how it was obtained."""
     tables: tuple[Table, ...] = ()
     """Tables, before the figures."""
     figures: tuple[Figure, ...] = ()
@@ -147,21 +147,21 @@ class MaskStack:
     high: float
     """Attention value that is drawn brightest."""
     images: tuple[str, ...]
-    """One data URI for each frame, empty where there is none."""
+    """Data URI of each frame's mask; empty for a frame without a mask."""
 
 
 @dataclass(frozen=True)
 class Viewer:
-    """One descent to look through."""
+    """One descent whose frames the reader can step through."""
 
     trajectory: str
-    """scene_id/trajectory_id."""
+    """Name of the trajectory, scene_id/trajectory_id."""
     frames: tuple[FramePicture, ...]
     """Frames from high to low."""
     masks: tuple[MaskStack, ...]
     """Masks of each gate; empty if there is no explain run."""
     sources: tuple[Provenance, ...]
-    """The sources of frames, detections and masks."""
+    """Sources of the frames, detections and masks."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Report:
     sections: tuple[Section, ...]
     """Sections in the order of the page."""
     viewer: Viewer | None
-    """None without a detection dataset with frames."""
+    """Frames to step through; None if there is no detection dataset with test frames."""
     provenance: tuple[Provenance, ...]
     """All sources, each once."""
     missing: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""The report's section on a dataset: counts, histograms of altitude, size and Sun, shaded map, labelled frames."""
+"""The report's section on a dataset: counts, histograms, a shaded map and labelled frames."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ _LABELLED = 4
 
 
 def dataset_section(dataset: Dataset, key: str, split: DetectSplit | None) -> Section:
-    """Describe a dataset. `split` has its test frames with labels; None if the dataset has no labels."""
+    """The section on a dataset. `split` has the test frames with labels; None if the dataset has no labels."""
     info, provenance = dataset.info, provenance_of_dataset(dataset)
     counts = {name: value for name, value in info.counts.model_dump().items() if value}
     table = Table(
@@ -97,14 +97,14 @@ def _histograms(dataset: Dataset) -> list[Figure]:
 
 
 def _histogram(axes: Axes, values: Mapping[str, Array], *, on_logarithms: bool) -> None:
-    """Draw stacked bars by group. With `on_logarithms`, draw lines instead, because stacked bars would mislead."""
-    finite = {name: one[np.isfinite(one) & ((one > 0) | (not on_logarithms))] for name, one in values.items()}
+    """Draw a histogram of each group as stacked bars; on logarithmic axes as lines, because stacked bars mislead."""
+    finite = {name: group[np.isfinite(group) & ((group > 0) | (not on_logarithms))] for name, group in values.items()}
     known = np.concatenate(list(finite.values()))
     low, high = (known.min(), known.max()) if len(known) else (1.0, 2.0)
     bins = np.geomspace(low, max(high, low * 1.01), 31) if on_logarithms else np.linspace(low, max(high, low + 1), 31)
     below = np.zeros(len(bins) - 1)
-    for number, (name, one) in enumerate(finite.items()):
-        counted, colour, label = np.histogram(one, bins)[0].astype(np.float64), COLOURS[number], name or None
+    for number, (name, group) in enumerate(finite.items()):
+        counted, colour, label = np.histogram(group, bins)[0].astype(np.float64), COLOURS[number], name or None
         if on_logarithms:
             axes.stairs(counted, bins, color=colour, linestyle=DASHES[number], linewidth=1.7, label=label)
             continue

@@ -1,4 +1,4 @@
-"""The report's section on crater detection: figures, curves, bins, best and worst frames."""
+"""The report's section on crater detection: figures, curves, AP by bins, best and worst frames."""
 
 import re
 from collections.abc import Sequence
@@ -32,13 +32,13 @@ _COLUMNS = ("score", "precision", "recall")
 
 
 def detection_section(runs: Sequence[Run], frames: LabelledFrames | None) -> Section:
-    """Show the detection runs. `frames` are the test frames with the detections of the last run."""
+    """The section on detection runs. `frames` are the test frames with the detections of the last run."""
     pictures = () if frames is None else tuple(extremes(frames))
     return _section(runs, "test/", "detection", "Crater detection", pictures)
 
 
 def scores_section(scores: Sequence[Run]) -> Section:
-    """Show scores of detectors on the locked benchmark."""
+    """The section on scores of detectors on the locked benchmark."""
     section = _section(scores, "visible/", "benchmark-detection", "Detection on the locked benchmark", ())
     pictures = [
         Figure(picture_of(path, caption), caption, (score.provenance,), wide=True)
@@ -52,7 +52,7 @@ def scores_section(scores: Sequence[Run]) -> Section:
 
 
 def headline(run: Run, prefix: str = "test/") -> str:
-    """One sentence with the main figures of a run."""
+    """One sentence with the main figures of a run. `prefix` is the start of the metrics' keys."""
     precision, recall = (run.metrics.get(prefix + key) for key in ("precision", "recall"))
     ap, f1 = (_value(run, prefix + key) for key in ("ap50_paper", "f1"))
     who = "The installed detector" if run.name.endswith(INSTALLED) else f"The detector {run.name}"
@@ -65,25 +65,25 @@ def headline(run: Run, prefix: str = "test/") -> str:
 
 
 def extremes(frames: LabelledFrames) -> list[FramePicture]:
-    """The two frames with the highest and the two with the lowest F1.
+    """The two frames with the highest F1 and the two frames with the lowest F1.
 
-    The two frames of a pair are from different trajectories if possible.
+    If possible, both best frames are from different trajectories, and so are both worst frames.
     """
     f1 = frames.f1()
-    order = [int(place) for place in np.argsort(f1, kind="stable") if np.isfinite(f1[place])]
+    order = [int(index) for index in np.argsort(f1, kind="stable") if np.isfinite(f1[index])]
     table = frames.split.frames.table
     chosen: list[tuple[str, int]] = []
     for word, ranked in (("best", order[::-1]), ("worst", order)):
         picked: list[int] = []
         for others_too in (False, True):
-            for place in ranked:
+            for index in ranked:
                 seen = [(table["scene_id"][k], table["trajectory_id"][k]) for k in picked]
-                fresh = (table["scene_id"][place], table["trajectory_id"][place]) not in seen
+                fresh = (table["scene_id"][index], table["trajectory_id"][index]) not in seen
                 used = picked + [k for _, k in chosen]
-                if len(picked) < _EXTREMES and place not in used and (fresh or others_too):
-                    picked.append(place)
-        chosen += [(word, place) for place in picked]
-    return [frames.picture(place, f"{word}, F1 {f1[place]:.2f}: ") for word, place in chosen]
+                if len(picked) < _EXTREMES and index not in used and (fresh or others_too):
+                    picked.append(index)
+        chosen += [(word, index) for index in picked]
+    return [frames.picture(index, f"{word}, F1 {f1[index]:.2f}: ") for word, index in chosen]
 
 
 def _section(
@@ -94,12 +94,12 @@ def _section(
     spread = (
         f"95 % intervals over {units} {'trajectories' if unit == 'trajectory' else f'{unit}s'}"
         if isinstance(units, int) and units >= MIN_UNITS
-        else f"the value of each {unit or 'unit'}, since they are too few for an interval"
+        else f"the value of each {unit or 'unit'}, since there are too few for an interval"
     )
     lead = (
         *(headline(run, prefix) for run in runs),
         *_starts(runs),
-        f"In brackets: {spread}. AP is the paper's definition, IoU 0.5.",
+        f"In brackets: {spread}. AP is computed by the paper's definition, at IoU 0.5.",
     )
     rows = tuple(
         (text, *(_value(run, prefix + name, spread=True) for run in runs))
@@ -134,7 +134,7 @@ def _value(run: Run, key: str, *, spread: bool = False) -> str:
 
 
 def _curves(runs: Sequence[Run], prefix: str) -> list[Figure]:
-    """Draw precision against recall for all runs in one figure. Runs without a curve are left out."""
+    """A figure of precision against recall for all runs that have a curve; empty if no run has one."""
     folder = {"visible/": "visible"}.get(prefix, ".")
     drawn = [run for run in runs if (run.folder / folder / _CURVE).is_file()]
     if not drawn:
@@ -158,13 +158,13 @@ def _curves(runs: Sequence[Run], prefix: str) -> list[Figure]:
 
 
 def read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of a run's table as arrays. Raises UserError if one is missing or the file is damaged."""
+    """Columns of a run's table as arrays. Raises UserError if a column is missing or the file is damaged."""
     read = read_table(path, RUN_TABLE, dict.fromkeys(columns, "number"))
     return {name: read.numbers(name) for name in columns}
 
 
 def _bins(runs: Sequence[Run], prefix: str) -> list[Figure]:
-    """Draw AP by radius, altitude and Sun elevation, with the bars of the runs side by side."""
+    """Figures of AP by radius, altitude and Sun elevation, with the bars of the runs side by side."""
     by_panel: dict[str, dict[str, tuple[float, float, str]]] = {by: {} for by in _PANELS}
     for run in runs:
         for key in run.metrics:
@@ -207,10 +207,10 @@ def _bar(axes, run: Run, key: str, x: float, width: float, number: int) -> None:
     if not isinstance(value, int | float):
         return
     label = plain(run.name) if key not in axes.get_legend_handles_labels()[1] else None
-    shown = [text for text in axes.get_legend_handles_labels()[1] if text == label]
+    in_legend = [text for text in axes.get_legend_handles_labels()[1] if text == label]
     axes.bar(
         x, value, width, color=COLOURS[number % 6], hatch=_HATCHES[number % 4], edgecolor="white", linewidth=0.3,
-        label=None if shown else label,
+        label=None if in_legend else label,
     )  # fmt: skip
     spread = read_spread(run.metrics, key)
     if spread.interval is not None:

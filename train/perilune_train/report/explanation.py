@@ -1,4 +1,4 @@
-"""The report's sections on explanations and the paper's claims: verdicts, mosaics, bars with nulls, interventions."""
+"""The report's sections on explain runs and on the paper's claims: verdicts, tables and pictures."""
 
 import re
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ _ORDER = ("masks_", "pcc_", "gates_", "removal_", "before_after_")
 
 
 def explanation_section(run: Run, key: str, title: str) -> Section:
-    """Show an explain run: its headline, a table of its claims, and all its pictures with captions."""
+    """The section on an explain run: headline, table of claims, and all pictures with captions."""
     claims = read_claims(run.folder / CLAIMS_FILE)
     captions = _captions(run.folder / CAPTIONS_FILE)
     pictures = {path.name: f"{key}-picture-{number}" for number, path in enumerate(_ordered(run.folder))}
@@ -39,9 +39,9 @@ def explanation_section(run: Run, key: str, title: str) -> Section:
 
 
 def headline_of(run: Run) -> str:
-    """The run's finding on the gates, as one text; empty if there is none, for example for rendered interventions.
+    """The headline of an explain run on one line; empty if the run has no headline (rendered interventions).
 
-    If every claim is undecided because there are too few scenes, the text says this once.
+    If the headline contains only undecided verdicts, the text gives the reason once.
     """
     headline = run.metrics.get("headline")
     if not isinstance(headline, str):
@@ -54,18 +54,18 @@ def headline_of(run: Run) -> str:
 
 
 def paper_section(folder: Path, run: Run) -> Section:
-    """Show the paper's claims with verdicts and pictures.
+    """The section on the paper's claims, with verdicts and pictures.
 
     `folder` is the folder of the experiment; `run` has the content of its paper.json.
     """
-    rows, place = [], 1
-    while f"verdict/{place}/claim" in run.metrics:
-        rows.append(tuple(str(run.metrics.get(f"verdict/{place}/{part}")) for part in ("claim", "measured", "answer")))
-        place += 1
+    rows, number = [], 1
+    while f"verdict/{number}/claim" in run.metrics:
+        rows.append(tuple(str(run.metrics.get(f"verdict/{number}/{part}")) for part in ("claim", "measured", "answer")))
+        number += 1
     lead = (f"Claims of the paper: {_counted([answer for _, _, answer in rows])}.",)
     table = Table("Claims of the paper", ("claim", "measured here", "verdict"), tuple(rows), (run.provenance,))
     captions = {
-        "detections.png": "Detections of the networks: truth red, detections cyan.",
+        "detections.png": "Detections of the networks. Red: ground truth. Cyan: detections.",
         "curve.png": "AP of YOLOv3 without attention against the density of craters.",
         "learning.png": "Learning curves.",
         "trajectory.png": "Errors along a test trajectory.",
@@ -79,7 +79,7 @@ def paper_section(folder: Path, run: Run) -> Section:
 
 
 def _counted(verdicts: list[str]) -> str:
-    """The number of claims and the number of each verdict, as text."""
+    """The number of claims, and the number of claims with each verdict, as text."""
     counts = {verdict: verdicts.count(verdict) for verdict in dict.fromkeys(verdicts)}
     return f"{len(verdicts)}; {', '.join(f'{verdict}: {count}' for verdict, count in counts.items())}"
 
@@ -93,9 +93,9 @@ def read_claims(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
     content = read_json(path)
-    if not isinstance(content, list) or not all(isinstance(one, dict) for one in content):
+    if not isinstance(content, list) or not all(isinstance(claim, dict) for claim in content):
         raise UserError(path, "claims", type(content).__name__, "a list of objects")
-    return [{key: str(one.get(key) or "-") for key in (*_COLUMNS, "picture")} for one in content]
+    return [{key: str(claim.get(key) or "-") for key in (*_COLUMNS, "picture")} for claim in content]
 
 
 def _captions(path: Path) -> dict[str, str]:
@@ -113,12 +113,12 @@ def _claims_table(claims: list[dict[str, str]], pictures: Mapping[str, str], pro
 
 
 def _link(name: str, pictures: Mapping[str, str]) -> str:
-    """A link to the picture of a claim; the picture's name if there is no such picture."""
+    """A link to the picture of a claim; only the picture's name if the run has no such picture."""
     return Markup('<a href="#{}">{}</a>').format(pictures[name], name) if name in pictures else name
 
 
 def _ordered(folder: Path) -> list[Path]:
-    """All pictures of the folder: masks, bars, gates, removal, interventions, then others; within these, by name."""
+    """All pictures of the folder, in the order of `_ORDER` and then by name; other pictures follow."""
 
     def rank(path: Path) -> tuple[int, str]:
         return next((k for k, start in enumerate(_ORDER) if path.name.startswith(start)), len(_ORDER)), path.name

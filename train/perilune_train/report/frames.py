@@ -1,4 +1,4 @@
-"""Frames with labels and detections, and the descent that the viewer shows with attention masks."""
+"""Frames with labels and detections, and the descent with attention masks that the viewer shows."""
 
 import io
 import zipfile
@@ -29,7 +29,7 @@ _KINDS = {FOUND: "matched", FALSE: "false"}
 
 @dataclass(frozen=True)
 class LabelledFrames:
-    """The test frames of a dataset with labels and, if there is a run, with its detections."""
+    """The test frames of a dataset with labels and, if there is a run, the run's detections."""
 
     split: DetectSplit
     """Frames and labels."""
@@ -38,11 +38,11 @@ class LabelledFrames:
     matches: Matches
     """Detections matched at IoU 0.5."""
     first_label: NDArray[np.intp]
-    """Row of the first label of each frame in the matches (N,)."""
+    """Index (N,) of each frame's first label among the labels of all frames, which `matches` uses."""
     has_detections: bool
     """Whether the detections come from a run; False if there is no run."""
     provenance: Provenance
-    """Provenance of the run; of the dataset if there is no run."""
+    """Provenance of the run, or of the dataset if there is no run."""
 
     def f1(self) -> NDArray[np.float64]:
         """F1 of each frame (N,) at the run's threshold; NaN for frames without selected labels."""
@@ -66,7 +66,7 @@ class LabelledFrames:
             labels.append(Mark(kind, (_px(cx), _px(cy), _px(a), _px(b), _px(np.degrees(theta)))))
         labels = [mark for mark, labelled in zip(labels, frame_labels.labelled, strict=True) if labelled]
         detections = []
-        # The rows of the matches have the order of the detections of each frame.
+        # The matches of a frame have the order of its detections.
         for (x0, y0, x1, y1), score, outcome in zip(
             self.found[index].boxes, self.found[index].scores, self.matches.outcome[rows], strict=True
         ):
@@ -93,12 +93,12 @@ class LabelledFrames:
         outcome = self.matches.outcome[self.matches.frame == index]
         return text + f", {np.sum(outcome == FOUND)} found, {np.sum(outcome == FALSE)} false"
 
-    def places_of(self, trajectory: str) -> list[int]:
-        """Indices of the frames of one trajectory, scene_id/trajectory_id, in order."""
-        return [place for place, name in enumerate(facts_of(self.split.frames).trajectory) if name == trajectory]
+    def indices_of(self, trajectory: str) -> list[int]:
+        """Indices of the frames of one trajectory (scene_id/trajectory_id), in order."""
+        return [index for index, name in enumerate(facts_of(self.split.frames).trajectory) if name == trajectory]
 
     def trajectories(self) -> list[str]:
-        """Names of the trajectories, scene_id/trajectory_id, in order."""
+        """Names of the trajectories (scene_id/trajectory_id), in order."""
         return list(dict.fromkeys(facts_of(self.split.frames).trajectory))
 
 
@@ -125,9 +125,10 @@ def frame_uri(image: NDArray[np.uint8]) -> str:
 
 
 def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Provenance | None) -> Viewer:
-    """The descent that the viewer shows, at most 60 frames: the masks' descent, otherwise the first test trajectory.
+    """The descent that the viewer shows, with at most 60 frames.
 
-    Raises UserError if the file of masks is damaged or contains other frames.
+    It is the descent of the masks, or the first test trajectory without a file of masks. Raises UserError if the file
+    of masks is damaged or contains other frames.
     """
     names = frames.split.frames.table["frame_id"].tolist()
     content = None if masks is None else read_masks(masks)
@@ -138,19 +139,20 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
         if first not in names:
             raise UserError(masks, "frame_ids", first, "a test frame of the detection dataset")
         trajectory = facts_of(frames.split.frames).trajectory[names.index(first)]
-    places = frames.places_of(trajectory)
-    if len(places) > _MAX_FRAMES:
-        places = [places[k] for k in np.linspace(0, len(places) - 1, _MAX_FRAMES).astype(int)]
-    chosen = [names[place] for place in places]
+    indices = frames.indices_of(trajectory)
+    if len(indices) > _MAX_FRAMES:
+        indices = [indices[k] for k in np.linspace(0, len(indices) - 1, _MAX_FRAMES).astype(int)]
+    chosen = [names[index] for index in indices]
     stacks = () if content is None else tuple(_stacks(content, chosen))
     sources = [frames.provenance, *([mask_provenance] if stacks and mask_provenance else [])]
-    return Viewer(trajectory, tuple(frames.picture(place) for place in places), stacks, tuple(sources))
+    return Viewer(trajectory, tuple(frames.picture(index) for index in indices), stacks, tuple(sources))
 
 
 def read_masks(path: Path) -> dict[str, NDArray[Any]]:
-    """Read masks_detect.npz: frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) per block.
+    """Read a file of masks, as written by `explain.maps.masks.save_masks`: all arrays by name.
 
-    Raises UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
+    The arrays are frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) for each block. Raises
+    UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -182,17 +184,17 @@ def read_masks(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _stacks(content: dict[str, NDArray[Any]], names: Sequence[str]) -> list[MaskStack]:
-    place_of = {str(name): place for place, name in enumerate(np.atleast_1d(content["frame_ids"]))}
+    index_of = {str(name): index for index, name in enumerate(np.atleast_1d(content["frame_ids"]))}
     colours = (matplotlib.colormaps["cividis"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
     stacks = []
     for number, block in enumerate(np.atleast_1d(content["blocks"])):
         images = []
         for name in names:
-            place = place_of.get(name)
-            if place is None:
+            index = index_of.get(name)
+            if index is None:
                 images.append("")
                 continue
-            picture = Image.fromarray(content[str(block)][place]).convert("P")
+            picture = Image.fromarray(content[str(block)][index]).convert("P")
             picture.putpalette(colours.tobytes())
             images.append(_png(picture))
         low, high = (float(content[key][number]) for key in ("low", "high"))

@@ -20,12 +20,12 @@ _MAX_TRACKS = 6
 
 
 def shaded_ground(craters: pd.DataFrame, sun: Array, half_m: float, side_px: int = _SIDE_PX) -> NDArray[np.uint8]:
-    """Return a grey map (side_px, side_px) of a square with sides of 2 half_m.
+    """Shaded grey map (side_px, side_px) of a square of ground with sides of 2 half_m, centred on the site.
 
-    Row 0 has the lowest y, column 0 the lowest x. `craters` has x_m, y_m, diameter_m and depth_m; `sun` is a unit
-    vector (3,) towards the Sun, O_L. Each crater is a parabolic bowl with a rim, whose height falls with the cube of
-    the distance and is 0 from 2.5 radii on. The brightness follows Lambert's law, without cast shadows. Relief and
-    boulders are not in the crater table, so they are not drawn.
+    Row 0 has the lowest y, column 0 the lowest x. `craters` has the columns x_m, y_m, diameter_m and depth_m. `sun` is
+    a unit vector (3,) towards the Sun, O_L. Each crater is a parabolic bowl with a rim. The height of the rim falls
+    with the cube of the distance and is 0 beyond 2.5 radii. The brightness follows Lambert's law, without cast shadows.
+    Relief and boulders are not in the crater table, so they are not drawn.
     """
     pixel_m = 2 * half_m / side_px
     axis = (np.arange(side_px) + 0.5) * pixel_m - half_m
@@ -50,7 +50,7 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
     frames = dataset.table("frames", columns, scene_id=scene_id).to_pandas()
     frames = frames.sort_values(["trajectory_id", "frame_index"])
     sun = np.asarray(frames["sun_direction"].iloc[0], np.float64)
-    position = np.stack([np.asarray(one, np.float64) for one in frames["position_m"]])
+    position = np.stack([np.asarray(position_m, np.float64) for position_m in frames["position_m"]])
     half_m = float(np.abs(position[:, :2]).max() + _MARGIN_M)
     craters = dataset.table("craters", ["x_m", "y_m", "diameter_m", "depth_m"], scene_id=scene_id).to_pandas()
     min_m = _MIN_DIAMETER_PX * 2 * half_m / _SIDE_PX
@@ -58,7 +58,7 @@ def scene_map(dataset: Dataset, scene_id: str) -> Figure:
     tracks = list(frames.groupby("trajectory_id").indices.items())[:_MAX_TRACKS]
     with drawing(height_in=5.0) as figure:
         axes = figure.subplots()
-        # Columns run west and rows south, so reverse both.
+        # x points west and y south, so reverse columns and rows to have north up and east to the right.
         image = shaded_ground(drawn, sun / np.linalg.norm(sun), half_m)[::-1, ::-1]
         axes.imshow(image, cmap="gray", vmin=0, vmax=255, origin="lower", extent=(-half_m, half_m, -half_m, half_m))
         for number, (trajectory, rows) in enumerate(tracks):

@@ -1,4 +1,4 @@
-"""The report's sections on navigation: trajectory, errors with bands, comparison of all methods."""
+"""The report's sections on navigation: trajectory, errors by altitude and step, comparison of all methods."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ _ERRORS = (
     "drift_x_m", "drift_y_m", "drift_z_m", "method",
 )  # fmt: skip
 _DRAWN = ("warp", "stack", "klt", "klt_gyroscope", "nominal")
-"""Methods that the figures show in addition to the runs' methods; the table has all methods."""
+"""Methods that the figures show in addition to the methods of the runs. The table has all methods."""
 _POSE = {
     "position_rmse_vector_m": "position RMSE, vector (m)",
     "position_rmse_per_component_m": "per component (m)",
@@ -37,8 +37,9 @@ _SCORED_ANGLES = ("orientation_rmse_angle_deg", "attitude_rmse_deg")
 _METHOD_PICTURES = {
     "altitude.png": "Position errors over ground by altitude: median, and 5 to 95 %.",
     "flights.png": "Errors of the filter along each descent, within three standard deviations.",
-    "matches_high.png": "First frame: detections matched (cyan) and not (red), catalogue at the pose (yellow).",
-    "matches_low.png": "Last frame, likewise.",
+    "matches_high.png": "First frame: matched detections (cyan), unmatched detections (red), and catalogue craters at"
+    " the estimated pose (yellow).",
+    "matches_low.png": "Last frame, in the colours of the picture of the first frame.",
 }
 LANDING_TABLE = "draws.parquet"
 _LANDING_ROWS = ("scene_id", "trajectory_id", "draw", "time_s", "status", "error_m", "turn_deg", "squared")
@@ -49,7 +50,7 @@ _LANDING_COLUMNS = {
     "in_band_share": "share in the 95 % band",
 }
 _LANDING_PICTURES = {
-    "errors.png": "Position errors over all draws: 50, 95 and 100 %, and the median of three stated sigmas.",
+    "errors.png": "Position errors over all draws: 50, 95 and 100 % quantiles, and the median of three stated sigmas.",
     "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is correct.",
 }
 _METHOD_COLUMNS = {
@@ -64,7 +65,7 @@ _METHOD_COLUMNS = {
 
 
 def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
-    """Show the navigation runs. `dataset` has the true positions; without it, no trajectory is drawn."""
+    """The section on navigation runs. `dataset` has the true positions; with None, no trajectory is drawn."""
     of_poses = [run for run in runs if run.metrics.get("evaluation/target") == "pose"]
     leads = (*(headline(run) for run in runs), *_starts(runs))
     tables, pictures = (_poses(of_poses),) if of_poses else (), [_pose_picture(run) for run in of_poses]
@@ -114,7 +115,7 @@ def headline(run: Run) -> str:
 
 
 def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
-    """Compare all navigation methods over the same descents, from the output folder of `make navigate`."""
+    """The section that compares all methods on the same descents. `folder` has the output of `make navigate`."""
     rows = _read(folder / "navigation.parquet", None)
     columns = {key: title for key, title in _METHOD_COLUMNS.items() if key in rows and rows[key].notna().any()}
     cells = tuple((str(row["method"]), *(_cell(row[key]) for key in columns)) for row in rows.to_dict("records"))
@@ -135,14 +136,13 @@ def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
 def _starts(runs: Sequence[Run]) -> list[str]:
     """One line for each run that did not start from random weights."""
     starts = {run.name: str(run.metrics.get("network/backbone", "from scratch")) for run in runs}
-    # Readers of the page have no use for an absolute path of the training machine. Keep the last folders, which name
-    # the run.
-    shown = {name: re.sub(r"(?<=\s)/\S*/(?=(?:[^/\s]+/){3}[^/\s]+$)", "", start) for name, start in starts.items()}
-    return [f"{name} started {start}." for name, start in shown.items() if not start.startswith("from scratch")]
+    # An absolute path of the training machine says nothing to readers. Keep the last folders, which name the run.
+    shortened = {name: re.sub(r"(?<=\s)/\S*/(?=(?:[^/\s]+/){3}[^/\s]+$)", "", start) for name, start in starts.items()}
+    return [f"{name} started {start}." for name, start in shortened.items() if not start.startswith("from scratch")]
 
 
 def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
-    """Show the filter with the installed detector on the test descents, from the folder of `navigate monte-carlo`."""
+    """The section on the filter over the test descents. `folder` has the output of `navigate monte-carlo`."""
     rows, columns = read_landing(folder), _LANDING_COLUMNS
     cells = tuple(("/".join(ids), *(number(row[key]) for key in columns)) for ids, row in by_trajectory(rows).items())
     table = Table("Descents, with all draws of each", ("descent", *columns.values()), cells, sources)
@@ -160,7 +160,7 @@ def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
 
 
 def landing_headline(rows: pd.DataFrame) -> str:
-    """One line with the filter's errors, from the table of draws."""
+    """One sentence with the filter's position errors, from the table of draws."""
     summary = run_summary(rows)
     over, end = number(summary["position_rmse_m"]), number(summary["position_end_rmse_m"])
     return (
@@ -175,7 +175,7 @@ def read_landing(folder: Path) -> pd.DataFrame:
 
 
 def scores_section(scores: Sequence[Run]) -> Section:
-    """Show scores of navigation on the locked benchmark: networks, classical methods, fixes and the filter."""
+    """The section on scores of navigation on the locked benchmark: networks, classical methods and the filter."""
     rows, figures = [], []
     for score in scores:
         for key in score.metrics:
@@ -215,7 +215,7 @@ def _table(runs: Sequence[Run]) -> Table:
 
 
 def _poses(runs: Sequence[Run]) -> Table:
-    """Table of the pose errors in the landing frame, for each run and its floors."""
+    """Table of the pose errors in the landing frame, for each run and its baselines (`FLOORS`)."""
     rows = []
     for run in runs:
         loses = run.metrics.get("evaluation/worse_than")
@@ -234,7 +234,7 @@ def _pose_picture(run: Run) -> Figure:
 def _trajectory(
     errors: pd.DataFrame, methods: Sequence[str], dataset: Dataset, sources: tuple[Provenance, ...]
 ) -> list[Figure]:
-    """Draw the side view and ground track of the first test descent: true, and dead reckoned by each method."""
+    """Figures of the first test descent from the side and from above: true, and dead reckoned by each method."""
     scene, trajectory = errors["scene_id"].iloc[0], errors["trajectory_id"].iloc[0]
     columns = ["frame_index", "position_m"]
     rows = dataset.table("frames", columns, scene_id=scene, trajectory_id=trajectory).to_pandas()
@@ -273,7 +273,7 @@ def _along(start: np.ndarray):
 
 
 def _bands(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenance, ...]) -> list[Figure]:
-    """Draw the median error per step by altitude, with a band from 5 to 95 % of the pairs."""
+    """Figures of the error of a step by altitude: the median, and a band from the 5 % to the 95 % quantile."""
     edges = np.linspace(errors["altitude_m"].min(), errors["altitude_m"].max() * 1.0001, _BINS + 1)
     figures = []
     for what, column, unit in (("position", "position_error_m", "m"), ("orientation", "orientation_error_deg", "deg")):
@@ -294,13 +294,13 @@ def _bands(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenan
             label_axes(axes, f"Error of {what} of a step", "altitude (m)", f"error ({unit})")
             figure.legend(loc="outside lower center", ncols=3)
             html = svg_of(figure, f"Error of {what} of a step by altitude, with bands from 5 to 95 percent")
-        caption = f"Error of {what} of a step by altitude, over all test pairs: median, and band from 5 to 95 %."
+        caption = f"Error of {what} of a step by altitude, over all test pairs: median, and 5 to 95 % quantiles."
         figures.append(Figure(html, caption, sources))
     return figures
 
 
 def _drift(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenance, ...]) -> Figure:
-    """Draw the error of the dead-reckoned position along the descent: median and range over all test descents."""
+    """Figure of the error of the dead-reckoned position by step: median and range over all test descents."""
     with drawing(height_in=3.6) as figure:
         axes = figure.subplots()
         for place, method in enumerate(methods):
@@ -315,13 +315,13 @@ def _drift(errors: pd.DataFrame, methods: Sequence[str], sources: tuple[Provenan
         figure.legend(loc="outside lower center", ncols=3)
         html = svg_of(figure, "Error of the dead-reckoned position by step")
     count = errors.groupby(["scene_id", "trajectory_id"]).ngroups
-    caption = f"Error of the dead-reckoned position: median, and band from the least to the largest, of {count} "
-    caption += "test descent." if count == 1 else "test descents."
+    caption = f"Error of the dead-reckoned position: median, and smallest to largest error, over {count} test "
+    caption += "descent." if count == 1 else "descents."
     return Figure(html, caption, sources)
 
 
 def _compared(rows: pd.DataFrame, sources: tuple[Provenance, ...]) -> Figure:
-    """Draw the position RMSE of all methods as dots on a logarithmic axis."""
+    """Figure of the position RMSE of all methods, as dots on a logarithmic axis."""
     known = rows[rows["position_rmse_m"].notna()].sort_values(["kind", "position_rmse_m"], ascending=[False, False])
     with drawing(height_in=0.28 * len(known) + 1.4) as figure:
         axes = figure.subplots()
@@ -335,9 +335,7 @@ def _compared(rows: pd.DataFrame, sources: tuple[Provenance, ...]) -> Figure:
         logarithmic(axes, "x")
         label_axes(axes, "Position error of all methods", "position RMSE (m)", "")
         html = svg_of(figure, "Position error of all methods of navigation")
-    caption = (
-        "Position RMSE of all methods: of the motion of a step (squares), and of the position over ground (circles)."
-    )
+    caption = "Position RMSE of all methods. Squares: of the motion in a step. Circles: of the position over ground."
     return Figure(html, caption, sources)
 
 

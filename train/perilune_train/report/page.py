@@ -1,4 +1,4 @@
-"""Write a report: read datasets and runs, render report.html and summary.md, and publish both files together."""
+"""Write a report: read datasets and runs, and write report.html and summary.md."""
 
 import base64
 import hashlib
@@ -51,7 +51,7 @@ _VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinj
 
 @dataclass(frozen=True)
 class _Opened:
-    """The datasets and runs of a report that exist, and the names of the others."""
+    """The datasets and runs of a report that exist, and the names of those that are missing."""
 
     datasets: dict[Path, Dataset]
     """Complete datasets with frames, by folder."""
@@ -64,15 +64,15 @@ class _Opened:
     scores: list[Run]
     """Scores on the locked benchmark."""
     missing: tuple[str, ...]
-    """Names of the datasets and runs that do not exist."""
+    """Names of the datasets and runs that do not exist or are not complete."""
 
 
 def write_report(kind: Kind, name: str, dataset: Path, runs: Path, out: Path) -> Path:
     """Write report.html and summary.md of a demo, a paper run or a benchmark into `out`; return the page's path.
 
-    `dataset` is the folder of the datasets, `runs` the folder of all runs (sources.py). Datasets and runs that do not
-    exist are left out, and the page names them. Raises UserError and writes nothing if none of them exists or if a file
-    is damaged.
+    `dataset` is the folder of the datasets, `runs` the folder of all runs; `sources.folders_of` lists what is read from
+    them. Datasets and runs that do not exist are left out, and the page names them. Raises UserError and writes nothing
+    if no dataset and no run exists, or if a file is damaged.
     """
     report = gather(kind, name, dataset, runs)
     page, summary = html_of(report), summary_of(report)
@@ -101,7 +101,7 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
             source = provenance_of_dataset(data) if detect is None else detect.provenance
             frames = frames or labelled_frames(split, detections, source)
         sections.append(dataset_section(data, f"dataset-{len(sections)}", split))
-    # Results come first, descriptions of the datasets after them.
+    # Show results first, then descriptions of the datasets.
     sections = [*_run_sections(folders, opened, frames, runs), *sections]
     if not sections:
         raise UserError(dataset, "report", "no dataset and no finished run", f"the datasets and runs of a {kind}")
@@ -137,7 +137,7 @@ def _open(folders: Folders, root: Path) -> _Opened:
     if folders.landing is not None and not (folders.landing / navigation.LANDING_TABLE).is_file():
         missing.append(f"landing {folders.landing.name}")
     missing += [f"methods {path.name}" for path in folders.methods if not (path / "navigation.parquet").is_file()]
-    return _Opened(datasets, **runs, scores=[one for one in scores if one is not None], missing=tuple(missing))
+    return _Opened(datasets, **runs, scores=[score for score in scores if score is not None], missing=tuple(missing))
 
 
 def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | None, root: Path) -> list[Section]:
@@ -146,13 +146,13 @@ def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | No
         sections.append(explanation.paper_section(folders.page, page))
     if opened.detect:
         sections.append(detection.detection_section(opened.detect, frames))
-    scored = [one for one in opened.scores if "visible/ap50_paper" in one.metrics]
+    scored = [score for score in opened.scores if "visible/ap50_paper" in score.metrics]
     if scored:
         sections.append(detection.scores_section(scored))
     if opened.navigate:
-        nav = next((one for one in opened.datasets.values() if one.info.kind == "nav"), None)
+        nav = next((dataset for dataset in opened.datasets.values() if dataset.info.kind == "nav"), None)
         sections.append(navigation.navigation_section(opened.navigate, nav))
-    others = [one for one in opened.scores if one not in scored]
+    others = [score for score in opened.scores if score not in scored]
     if others:
         sections.append(navigation.scores_section(others))
     if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
@@ -187,17 +187,18 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 
 
 def _headlines(opened: _Opened, folders: Folders) -> list[str]:
-    """Sentences with the results of detection, navigation, landing and explanation; the first one opens the page.
+    """Sentences with the results of detection, navigation, landing and explanation.
 
-    For the preset `tiny`, its purpose comes before all figures.
+    The first sentence is shown at the top of the page. With the preset `tiny`, it says that the figures are no measure
+    of the method.
     """
-    recipes = [recipe for one in opened.datasets.values() for recipe in one.info.recipes.values()]
+    recipes = [recipe for dataset in opened.datasets.values() for recipe in dataset.info.recipes.values()]
     lines = [_TRIAL] if any(recipe.preset == _TRIAL_PRESET for recipe in recipes) else []
     if lines and opened.detect and opened.detect[-1].name.endswith(INSTALLED):
         lines[0] += " The frames show the installed detector."
     # Begin with the last run, because the frames show its detections.
     lines += [detection.headline(run) for run in reversed(opened.detect)]
-    lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
+    lines += [detection.headline(score, "visible/") for score in opened.scores if "visible/ap50_paper" in score.metrics]
     lines += [navigation.headline(run) for run in opened.navigate]
     if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
         lines.append(navigation.landing_headline(navigation.read_landing(folders.landing)))
@@ -208,16 +209,16 @@ def _provenance(sections: Sequence[Section], viewer: Viewer | None) -> tuple[Pro
     by_anchor: dict[str, Provenance] = {}
     for section in sections:
         groups = (section.tables, section.figures, section.frames)
-        by_anchor |= {source.anchor: source for group in groups for one in group for source in one.sources}
+        by_anchor |= {source.anchor: source for group in groups for entry in group for source in entry.sources}
     by_anchor |= {source.anchor: source for source in (viewer.sources if viewer else ())}
     return tuple(by_anchor.values())
 
 
 def html_of(report: Report) -> str:
-    """Render the page as one HTML file that contains its styles, script and data.
+    """Render the page as one HTML file that contains all styles, scripts and data.
 
-    A security policy allows no other styles or scripts and no connections. Jinja2 escapes names from files; in the
-    viewer's data `json_block` escapes them.
+    A content security policy forbids other styles, other scripts and connections. Names from files are escaped by
+    Jinja2 and, in the viewer's data, by `json_block`.
     """
     files = importlib.resources.files("perilune_train.report") / "templates"
     style, script = ((files / name).read_text(encoding="utf-8") for name in ("style.css", "viewer.js"))
@@ -261,9 +262,9 @@ def viewer_data(viewer: Viewer) -> dict[str, object]:
 
 
 def json_block(content: object) -> Markup:
-    """JSON text that can neither close the script element around it nor break a line in it."""
+    """Content as JSON text that is safe inside a script element."""
     text = json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
-    # JSON allows these characters to be escaped. `ensure_ascii` already escapes U+2028 and U+2029.
+    # These characters could close the element. `ensure_ascii` already escapes the line ends U+2028 and U+2029.
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return Markup(text)

@@ -30,7 +30,7 @@ DASHES: tuple[str | tuple[float, tuple[float, ...]], ...] = (
 )  # fmt: skip
 """One dash pattern per colour, so that lines can be told apart without colour."""
 WIDTH_IN = 5.0
-"""Width of a figure, inches. It fills half of a wide page, or a whole narrow page, with text that is still legible."""
+"""Width of a figure, inches. The text is legible if the figure fills half of a wide page, or a whole narrow page."""
 _INK, _INK_RGB = "#010203", re.compile(r"#010203")
 _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _FONT = re.compile(r"(?:^|\s)(\d+(?:\.\d+)?)px")
@@ -58,7 +58,7 @@ _QUALITY = 82
 _WHITE = 250
 _MIN_PAPER_SHARE = 0.01
 _MIN_PATCH_PX = 60
-"""A white area beyond a line counts as paper from this size on. Bright spots in photographs are mostly smaller."""
+"""Smallest white area, pixels, that counts as paper beyond a line. Bright spots in photographs are mostly smaller."""
 _STROKE_PX = 13
 """Largest width of a line or letter on paper, pixels."""
 _MAX_INK_SPREAD = 24
@@ -70,34 +70,34 @@ ElementTree.register_namespace("xlink", _LINK)
 
 @contextmanager
 def drawing(width_in: float = WIDTH_IN, height_in: float = 3.4) -> Iterator[Drawing]:
-    """Yield an empty figure in the report's style, to draw on and to pass to `svg_of` within the block."""
+    """Yield an empty figure in the report's style. Draw on it and call `svg_of` within the block."""
     with matplotlib.rc_context(_STYLE):
         yield Drawing(figsize=(width_in, height_in), layout="constrained")
 
 
 def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
-    """Set the title and both labels. Names from data are drawn literally, because text.parse_math is off."""
+    """Set the title and both axis labels. Names from data are drawn literally, because text.parse_math is off."""
     axes.set(title=title, xlabel=x, ylabel=y)
 
 
 def logarithmic(axes: Axes, *which: Literal["x", "y"]) -> None:
-    """Make axes logarithmic, with plain numbers at the powers of ten. Axes within two decades also have 2 and 5."""
+    """Make axes logarithmic, with plain numbers at powers of ten. Axes of less than two decades also have 2 and 5."""
     for name in which:
         (axes.set_xscale if name == "x" else axes.set_yscale)("log")
         axis = axes.xaxis if name == "x" else axes.yaxis
         low, high = axis.get_view_interval()
         few = low > 0 and high / low < 100
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
-        # The usual labels are mathematical text, which is disabled because of names from files.
+        # Matplotlib's default labels are mathematical text, which is off (text.parse_math).
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axis.set_minor_locator(NullLocator())
 
 
 def svg_of(figure: Drawing, description: str) -> Markup:
-    """Return a figure as inline SVG whose text and axes have the colour of the page's text.
+    """A figure as inline SVG whose text and axes have the colour of the page's text.
 
-    Styles are converted to presentation attributes, since the page's security policy allows no inline styles.
-    Identifiers are unique within this process.
+    Styles become presentation attributes, since the page's security policy allows no inline styles. Identifiers are
+    unique within this process. `description` is read by screen readers.
     """
     stream = io.StringIO()
     figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
@@ -177,16 +177,16 @@ def picture_of(path: Path, description: str) -> Markup:
 
 
 def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
-    """Split a picture (height, width, 3) on white paper into two layers (height, width, 4): content, and black ink.
+    """Split a picture (height, width, 3) into two layers (height, width, 4): content, and black ink.
 
-    Drawn together over white, the layers give the picture. Returns None if there is no paper.
+    Drawn together over white, the layers give the picture. Returns None if the picture has no white paper.
     """
     paper = _paper(colours)
     if paper is None:
         return None
     values = colours.astype(np.float64)
     # Smallest opacity with which a colour over white can give the pixel. Black ink gets this opacity. Coloured lines
-    # get a larger one, because they would be too dark over black.
+    # get a larger opacity, because with the smallest opacity they would be too dark over black.
     least = (255 - values.min(axis=2)) / 255
     share = np.where(paper, np.sqrt(least), 1.0)
     pure = 255 - (255 - values) / np.maximum(share, 1 / 255)[..., None]
@@ -199,10 +199,10 @@ def layers_of(colours: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np
 
 
 def _paper(colours: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
-    """Mask (height, width) of the white paper of a picture (height, width, 3), including thin lines and letters on it.
+    """Pixels (height, width) of a picture (height, width, 3) that are white paper, or thin lines and letters on it.
 
-    Photographs and filled shapes are not part of the mask. Paper starts at each large white area and continues beyond
-    lines. Returns None if there is no large white area.
+    Photographs and filled shapes are not paper. Paper starts at each large white area and continues beyond lines.
+    Returns None if there is no large white area.
     """
     _, parts, facts, _ = cv2.connectedComponentsWithStats((colours.min(axis=2) >= _WHITE).astype(np.uint8))
     area = facts[:, cv2.CC_STAT_AREA]

@@ -1,4 +1,4 @@
-"""Datasets and runs of each kind of report, and their provenance."""
+"""Folders that each kind of report reads, and the provenance of runs and datasets."""
 
 import hashlib
 import json
@@ -18,7 +18,8 @@ from perilune_train.report.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
 Kind = Literal["demo", "paper", "benchmark"]
 SCORE_FILE = "benchmark.json"
 INSTALLED = "-installed"
-"""End of the folder name of an evaluation of the installed detector. This folder has no settings and no threshold."""
+"""End of the name of a folder with an evaluation of the installed detector. The folder has no settings and no
+threshold."""
 MAX_JSON_BYTES = 16 * 2**20
 """Largest size of a JSON file that is read, bytes."""
 
@@ -39,10 +40,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Folders:
-    """Folders that a report reads; any of them may be absent."""
+    """Folders that a report reads. Any folder may be absent."""
 
     datasets: tuple[Path, ...]
-    """Datasets, detection before navigation."""
+    """Datasets: detection, then navigation."""
     detect: tuple[Path, ...]
     """Detection runs."""
     navigate: tuple[Path, ...]
@@ -60,12 +61,12 @@ class Folders:
 
 
 def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
-    """The folders of a report by its kind.
+    """The folders of a report, by the kind of report.
 
-    demo: `dataset` contains detect and nav. Runs are <runs>/<task>/<name>. <runs>/detect/<name>-installed is the
-    evaluation of the installed detector.
-    paper: as for demo, but in the folder of the experiment and with the networks' names.
-    benchmark: `dataset` contains the benchmark's datasets. All scores in <runs>/benchmark are shown.
+    - demo: `dataset` contains detect and nav. Runs are <runs>/<task>/<name>. <runs>/detect/<name>-installed is the
+      evaluation of the installed detector.
+    - paper: as demo, but `runs` is the folder of the experiment, and runs have the names of the networks.
+    - benchmark: `dataset` contains the datasets of the benchmark. All scores in <runs>/benchmark are shown.
     """
     both = (dataset / "detect", dataset / "nav")
     if kind == "demo":
@@ -97,9 +98,9 @@ def _scores(runs: Path) -> tuple[Path, ...]:
 
 
 def read_run(folder: Path, root: Path, file: str = METRICS_FILE) -> Run | None:
-    """Read a run; None if it is absent or not finished. Raises UserError if one of its files is damaged.
+    """Read a run; None if it is absent or not finished. Raises UserError if a file of the run is damaged.
 
-    `root` is the folder of all runs. Names in the report are relative to it.
+    `root` is the folder of all runs; the report shows paths relative to `root`. `file` has the metrics.
     """
     if not (folder / file).is_file():
         return None
@@ -109,17 +110,15 @@ def read_run(folder: Path, root: Path, file: str = METRICS_FILE) -> Run | None:
 
 
 def sources_of(runs: Sequence[Run]) -> tuple[Provenance, ...]:
-    """Provenance of each of several runs."""
+    """Provenance of each run."""
     return tuple(run.provenance for run in runs)
 
 
 def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Provenance:
-    """Provenance of a run's folder, from config.yaml, inputs.json and the entries run/... of its metrics.
+    """Provenance of a run, from config.yaml and inputs.json in its folder and the entries run/... of its metrics.
 
-    Unknown parts are left out. The random seed comes from config.yaml, or from the metric `seed` if the folder has no
-    config.yaml.
-
-    Raises UserError if a file is damaged.
+    A part that is not recorded is empty. The random seed comes from config.yaml, or from the metric `seed` if
+    config.yaml has no seed. Raises UserError if a file is damaged.
     """
     names = ("commit", "date", "command", "hardware", "versions")
     recorded = {key: str(metrics.get(f"run/{key}") or "") for key in names}
@@ -145,9 +144,9 @@ def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Prove
 
 
 def provenance_of_dataset(dataset: Dataset) -> Provenance:
-    """Provenance of a dataset: the hash of dataset.json, and the random seeds, versions and settings of its recipes.
+    """Provenance of a dataset: the hash of dataset.json, and seeds, versions and settings of its recipes.
 
-    A dataset records no command, commit or date, so that rendering it again gives equal bytes. The versions contain
+    A dataset records no command, commit or date, so that rendering it again gives equal bytes. The versions include
     hashes of the renderer's code.
     """
     recipes = list(dataset.info.recipes.values())

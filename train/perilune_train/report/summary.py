@@ -8,7 +8,7 @@ from perilune_train.report.content import Report
 
 
 def summary_of(report: Report) -> str:
-    """Return the summary as Markdown. Special characters in names from files are escaped."""
+    """The summary as Markdown. Special characters in names from files are escaped."""
     lines = [f"# {for_markdown(report.title)}", "", *[f"- {for_markdown(line)}" for line in report.summary], ""]
     lines += ["The figures and the frames are in `report.html`, beside this file.", ""]
     for section in report.sections:

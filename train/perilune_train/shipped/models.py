@@ -48,11 +48,11 @@ def shipped_models() -> list[ShippedModel]:
     return [ShippedModel(n, t, _FOLDER / n) for n, t in _TASKS.items() if (_FOLDER / n / WEIGHTS).is_file()]
 
 
-def weights_file(given: str | Path) -> Path:
-    """The file of weights for a setting, which is a path or the name of an installed network (`crater-detector`)."""
+def weights_file(path_or_name: str | Path) -> Path:
+    """The file of weights at a path, or of an installed network by its name (`crater-detector`)."""
     installed = {model.name: model.folder / WEIGHTS for model in shipped_models()}
-    path = Path(given)
-    return path if path.exists() else installed.get(str(given), path)
+    path = Path(path_or_name)
+    return path if path.exists() else installed.get(str(path_or_name), path)
 
 
 def shipped_run(task: Task) -> Path:

@@ -32,7 +32,7 @@ _STATE_KEY = "perilune/run"
 
 
 def hashes_of(inputs: Mapping[str, Address | None]) -> dict[str, str | None]:
-    """SHA-256 of each input. For a dataset (a folder or an address), the hash of its dataset.json."""
+    """SHA-256 of each input: of a file, or of dataset.json if the input is a dataset (a folder or an address)."""
     return {name: None if address is None else _hash_of(address) for name, address in inputs.items()}
 
 
@@ -48,8 +48,8 @@ def _hash_of(address: Address) -> str | None:
 def held(*folders: RunFolder) -> Iterator[None]:
     """Lock the folders of runs within the block, so that no second training writes into them.
 
-    If several processes train together, the first one holds the locks. Raises UserError if another training holds a
-    lock.
+    If several processes train together, only the first process holds the locks. Raises UserError if another training
+    holds a lock.
     """
     with contextlib.ExitStack() as locks:
         for run in folders if is_first_process() else ():
@@ -64,8 +64,8 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
     last.ckpt. finished: leave the run unchanged and print a message.
 
     Raises UserError if the existing run has other settings or inputs, or if the folder is not a run of this task. Also
-    raises it if the first process resumes but this process has no last.ckpt, because several machines train without a
-    shared folder.
+    raises it if the first process resumes and this process finds no last.ckpt; this happens if several machines train
+    without a shared folder.
     """
     if is_first_process():
         state = _decide(run, task, config, inputs, overwrite)

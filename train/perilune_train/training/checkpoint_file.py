@@ -1,8 +1,8 @@
 """Torch checkpoints as untrusted input: check the structure of a file before torch reads its tensors.
 
-A checkpoint is a ZIP with a pickle of plain values and, for each tensor, a file of its numbers. This module
-reads the pickle with an allowlist of instructions and names, none of which executes code; tensors become records of
-their shape. Torch reads the file only if sizes, names and values are those that perilune writes.
+A checkpoint is a ZIP with a pickle of plain values and, for each tensor, a file of its numbers. This module reads the
+pickle with an allowlist of instructions and names, none of which executes code; tensors become records of their shape.
+Torch reads the file only if sizes, names and values are as perilune writes them.
 """
 
 import pickle
@@ -60,7 +60,7 @@ class TensorRecord:
     """Shape of a tensor whose numbers have not been read."""
 
     shape: tuple[int, ...]
-    """Its shape."""
+    """Length of each axis."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ _GAIN = 1.03
 
 
 class FairThreads:
-    """Chooses torch's number of threads for each step of a loop, and restores the program's number after the step.
+    """Chooses torch's number of CPU threads for each step of a loop, and restores the program's number afterwards.
 
     An operation ends when its slowest thread ends. If another process takes half of one core, all threads of an
     operation effectively run at half speed, and fewer threads are faster. While other processes use the cores, trials

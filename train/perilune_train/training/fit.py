@@ -106,7 +106,7 @@ class KeepBest(Callback):
 
 
 class KeepLast(Callback):
-    """Save the whole state after every validated epoch and, if `minutes` is set, every `minutes` within an epoch.
+    """Save the whole state after every validated epoch and, if `minutes` is given, after every `minutes` of an epoch.
 
     If a run resumes within an epoch, Lightning skips the task's `on_train_epoch_start`; this callback calls it.
     """
@@ -132,8 +132,8 @@ class KeepLast(Callback):
             pl_module.on_train_epoch_start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # After the last batch, validation and the checkpoint of the epoch follow. Between the batches of one step, do
-        # not save: the state would lack the gradients summed so far.
+        # Do not save after the last batch: the validation and the checkpoint of the epoch follow. Do not save between
+        # the batches of one step: the state would lack the gradients summed so far.
         between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
         if self.minutes is None or trainer.is_last_batch or between:
             return
@@ -149,8 +149,8 @@ class KeepLast(Callback):
             self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        # Loaders raise DataLost between two batches, when the state is complete. With several processes, do not save:
-        # the others may still train. Before the first batch of an epoch, do not save: last.ckpt already has this state.
+        # Loaders raise DataLost between two batches, when the state is complete. With several processes, do not save,
+        # because the others may still train. Before the first batch of an epoch, last.ckpt already has the state.
         done = trainer.fit_loop.epoch_loop.batch_progress.current
         between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
         if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
@@ -189,7 +189,7 @@ class FewerThreadsIfCrowded(Callback):
 
 
 class Bar(Callback):
-    """Progress bar: steps done, total steps, rate, time left, loss."""
+    """Progress bar with steps done, total steps, rate, time left and loss."""
 
     def __init__(self, label: str):
         self.label = label
@@ -218,7 +218,7 @@ class Bar(Callback):
 
 
 def process_layout(devices: int, num_nodes: int) -> tuple[int, int]:
-    """Processes per machine and number of machines: from torchrun's environment, else from the arguments."""
+    """Processes per machine and number of machines: under torchrun from its environment, else the arguments."""
     if torch.distributed.is_torchelastic_launched():
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return local, int(os.environ["WORLD_SIZE"]) // local
@@ -226,13 +226,13 @@ def process_layout(devices: int, num_nodes: int) -> tuple[int, int]:
 
 
 def own_share(devices: int, num_nodes: int) -> Share:
-    """The share of the data that this process trains on. Also valid before training (see `is_first_process`)."""
+    """The share of the data that this process trains on; also correct before training (see `is_first_process`)."""
     return Share(int(rank_zero_only.rank), math.prod(process_layout(devices, num_nodes)))
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """Number of epochs, size of a step, and when to validate and save."""
+    """How long to train, how to make a step, and when to validate and save."""
 
     epochs: int
     """Number of epochs."""
@@ -293,9 +293,9 @@ def fit(
     several processes, each loader provides the batches of its own process. The task logs `schedule.monitor` in
     validation, and has `architecture` and `evaluated` (see KeepBest).
 
-    With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
+    With `resume`, training continues from last.ckpt, if the run has this file, and gives exactly the result of an
     uninterrupted run. The state is saved after every validation. With `schedule.checkpoint_minutes` it is also saved
-    within epochs; the task's training batches must then continue at the position of the checkpoint.
+    within epochs; the task's loader must then continue at the position of the checkpoint.
 
     Raises UserError if last.ckpt is damaged or belongs to another network or number of processes, if Lightning gives
     this process a rank other than the one in the environment, or if the loss diverges.

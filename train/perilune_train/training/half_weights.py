@@ -41,8 +41,9 @@ def write_half(path: Path, content: Mapping[str, Any]) -> None:
 def write_bytewise(path: Path, content: Mapping[str, Any]) -> None:
     """Write the content of a checkpoint with 8 bits per weight, half the size of `write_half`.
 
-    Convolutions and matrices are rounded, as in `write_half`. Each output channel has a step (float32), and its weights
-    become integers from -127 to 127 times this step. Raises UserError if a weight is not finite.
+    Only convolutions and matrices are rounded, as in `write_half`. Each output channel has a step (float32). A weight
+    of the channel becomes an integer from -127 to 127, in units of this step. Raises UserError if a weight is not
+    finite.
     """
     tensors = {}
     for name, tensor in content["state_dict"].items():

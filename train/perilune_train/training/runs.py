@@ -60,7 +60,7 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has its metrics, and metrics and weights are whole files."""
+        """Whether the run has metrics.json, and no file of metrics or weights is damaged."""
         return self.metrics.is_file() and self.damaged is None
 
     @property
@@ -92,7 +92,7 @@ class NamedRun:
 def is_first_process() -> bool:
     """Whether this process writes files and messages: the only process, or the first of several that train together.
 
-    Also valid before training: Lightning reads the rank from an environment variable that it or torchrun sets.
+    Also correct before training: the rank comes from an environment variable that Lightning or torchrun sets.
     """
     # Imported here, so that commands that do not train need not import Lightning.
     from lightning.pytorch.utilities import rank_zero_only
@@ -115,10 +115,10 @@ def save_weights(
 
 
 def load_weights(path: Path) -> dict[str, Any]:
-    """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` or `write_half` wrote.
+    """Read a file that `save_weights` or `write_half` wrote: `{"architecture": settings, "state_dict": tensors}`.
 
     The tensors are on the CPU, and finite. The architecture is a dictionary of plain values; the loader of each kind of
-    network checks them.
+    network checks them. The key `terrain` (provenance.py) may be present.
 
     Raises UserError if the file is missing, is damaged or has other content.
     """

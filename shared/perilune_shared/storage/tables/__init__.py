@@ -1,1 +1,1 @@
-"""Read CSV and Parquet tables that are not part of a dataset, under limits. All are untrusted input."""
+"""Read CSV and Parquet tables that are not part of a dataset, with limits. All of them are untrusted."""

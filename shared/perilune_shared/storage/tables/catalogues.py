@@ -1,8 +1,8 @@
 """Read longitude, latitude and diameter from crater catalogues with known or stated columns.
 
 These catalogues are recognised by their columns: Robbins 2018 (doi 10.1029/2018JE005592), Head et al. 2010, Povilaitis
-et al. 2018 (also as LROCCraters.csv of DeepMoon), the gazetteer of the IAU, and every table with latitude, longitude
-and a diameter or radius whose column name contains the unit, such as craterpy's tables.
+et al. 2018 (also as LROCCraters.csv of DeepMoon), and the gazetteer of the IAU. A table with latitude, longitude and a
+diameter or radius is recognised too if the column name of the size contains the unit, as in craterpy's tables.
 """
 
 import re
@@ -52,7 +52,8 @@ _PATTERNS = {
     "radius_km": re.compile(r"(?:r|rad|radius)" + _UNIT.format("(?:km|kilometers|kilometres)"), re.IGNORECASE),
 }
 _MAX_NEIGHBOURS = 100
-"""Number of craters, from west to east, with which each crater is compared; limits the time for hostile catalogues."""
+"""Number of following craters, in the order of x, with which each crater is compared; limits the time for hostile
+catalogues."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +80,11 @@ class SurfaceCraters:
 def read_craters(
     path: Path, setting: str, names: Mapping[str, str] | None = None, others: Sequence[str] = ()
 ) -> SurfaceCraters:
-    """Read a catalogue, CSV or Parquet. `names` states the columns; if it is empty, they are recognised.
+    """Read a catalogue, CSV or Parquet.
 
-    Messages call the setting of `names` by the name `setting`. `others` are additional optional columns of numbers.
-    Raises UserError on a file without such columns, and on the first value that is not a valid coordinate or size.
+    `names` states the columns by key; if it is empty, the columns are recognised. `setting` is the setting in which
+    users state columns, for messages. `others` are additional optional columns of numbers. Raises UserError if a column
+    is missing or cannot be recognised, and about the first value that is not a valid coordinate or size.
     """
     with open_table(path, CATALOGUE) as table:
         chosen = _stated(path, setting, table.names, names) if names else recognised(path, setting, table.names)
@@ -98,7 +100,7 @@ def read_craters(
 
 
 def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]:
-    """Return the names of a catalogue's columns, by key. Raises UserError if they cannot be recognised."""
+    """Return the names of a catalogue's columns by key. Raises UserError if they cannot be recognised."""
     for known in _KNOWN.values():
         if set(known.values()) <= set(names):
             return dict(known)
@@ -121,15 +123,18 @@ def recognised(path: Path, setting: str, names: Sequence[str]) -> dict[str, str]
 
 
 def duplicates(x_m: Array, y_m: Array, diameter_m: Array) -> NDArray[np.bool_]:
-    """Return whether each crater (N,) repeats an earlier one: centre within a tenth of the radius, size within a tenth.
+    """Return whether each of N craters repeats an earlier crater of the catalogue, bool (N,).
 
-    Catalogues joined from several sources contain some craters twice, with slightly different values.
+    Catalogues joined from several sources contain some craters twice, with slightly different values. Two craters count
+    as one if their centres differ by at most a tenth of the larger radius, and their diameters by at most a tenth of
+    the larger diameter.
     """
     repeats = np.zeros(len(x_m), bool)
     by_size = np.argsort(diameter_m, kind="stable")
     sizes = diameter_m[by_size]
     for low in np.unique(np.floor(np.log2(sizes))):
-        # The window extends beyond the octave, so that craters on both sides of the upper limit are compared.
+        # Compare the craters of one octave of diameters, and slightly larger ones, since two observations of a crater
+        # may lie on both sides of the upper limit.
         high = 1.1 * 2 ** (low + 1)
         similar = by_size[slice(*np.searchsorted(sizes, [2**low, high]))]
         order = similar[np.argsort(x_m[similar], kind="stable")]

@@ -1,4 +1,4 @@
-"""Columns that were read from a table, with the line of each row for messages."""
+"""Columns that were read from a table, with the line of each row so that messages can state it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Texts:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The rows of a table, limited to the requested columns that exist in it."""
+    """The requested columns of a table; requested columns that the table lacks are omitted."""
 
     path: Path
     """Path of the file."""
@@ -96,7 +96,10 @@ class Columns:
         return UserError(*self.at(row, name), value, expected)
 
     def at(self, row: int, name: str) -> tuple[str, str]:
-        """Return the location of a value: (file and line, column) in text, (file, column and row from 0) in Parquet."""
+        """Return the location of a value, as the first two arguments of UserError.
+
+        For text: file and line, then column. For Parquet: file, then column and row, counted from 0.
+        """
         if self.lines is None:
             return str(self.path), f"{name}: row {row}"
         return f"{self.path}:{self.lines[row]}", name

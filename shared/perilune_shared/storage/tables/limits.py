@@ -11,7 +11,7 @@ MAX_VALUE_CHARACTERS = 1_000
 MAX_TEXT_CHARACTERS = 100_000_000
 """Maximum total length of the distinct values of one column that is read as text."""
 SPARE_ROWS, BYTES_PER_ROW = 200_000, 4
-"""A Parquet file of n bytes has at most SPARE_ROWS + n / BYTES_PER_ROW rows. Measurements do not compress better."""
+"""A Parquet file of n bytes has at most SPARE_ROWS + n / BYTES_PER_ROW rows. Measurements need more bytes per row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class TableLimits:
     """Limits of one kind of table."""
 
     kind: str
-    """What the table contains, as messages name it."""
+    """Name of the table's content in messages."""
     rows: int
     """Maximum number of rows."""
     file_bytes: int

@@ -1,8 +1,8 @@
-"""Read untrusted Parquet tables: check schema, rows and sizes first, then read only the requested columns.
+"""Read columns of untrusted Parquet tables, after a check of schema, rows and sizes.
 
-A short file can have any number of rows and texts of any length, since dictionaries and runs repeat values without
-further bytes. Therefore rows and sizes are compared with the limits before anything is decompressed, texts are read as
-dictionaries, and only one column is in memory besides the result.
+A short file can have any number of rows and texts of any length, since Parquet can repeat a value without further
+bytes. Therefore rows and sizes are compared with the limits before anything is decompressed, each distinct text is read
+only once, and only one column is in memory besides the result.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -78,7 +78,10 @@ class ParquetTable:
         """Return None; `TextTable.peek` returns the next row."""
 
     def read(self, columns: Mapping[str, Kind], required: Sequence[str] = ()) -> Columns:
-        """Read the given columns; columns that the table lacks are omitted. Raises UserError on another type."""
+        """Read the given columns; columns that the table lacks are omitted.
+
+        Raises UserError if a `required` column is missing, or a column has another type or is damaged.
+        """
         check_present(self.path, self.names, required)
         wanted = [name for name in columns if name in self.names]
         check_unique(self.path, self.names, wanted)
@@ -124,7 +127,7 @@ class ParquetTable:
             raise UserError(self.path, f"column {name}", type_in_file, expected)
 
     def _check_sizes(self, names: Sequence[str]) -> None:
-        """Check the sizes of the columns that will be read, as stated in the footer and in the page headers."""
+        """Check the sizes that footer and page headers state for the columns that will be read."""
         footer = self._file.metadata
         in_file = {self._name_in_file[name] for name in names}
         paths = [footer.schema.column(index).path for index in range(footer.num_columns)]

@@ -1,4 +1,4 @@
-"""Open an untrusted table; the content decides whether it is read as Parquet or as text."""
+"""Open an untrusted table and recognise by its content whether it is Parquet or text."""
 
 import stat
 from collections.abc import Mapping, Sequence
@@ -29,10 +29,11 @@ _OTHERS = {
 
 
 def open_table(path: Path, limits: TableLimits, header: Sequence[str] | None = None) -> "TextTable | ParquetTable":
-    """Open a table in a `with` statement and read the header; then use `names` and `read`.
+    """Open a table and read its header.
 
-    `header` gives the column names of a text file without a header. Raises UserError if the file is missing, not a
-    regular file, too large or of another format.
+    Use the result in a `with` statement: `names` has the column names, and `read` reads columns. `header` gives the
+    column names of a text file without a header. Raises UserError if the file is missing, not a regular file, too large
+    or of another format.
     """
     expected = f"a CSV or Parquet file with {limits.kind}"
     try:
@@ -65,7 +66,7 @@ def read_table(
 ) -> Columns:
     """Read columns of a table with a header.
 
-    Only columns in `required` must exist; by default all of them.
+    Raises UserError if a column of `required` is missing; by default, all `columns` are required.
     """
     with open_table(path, limits) as table:
         return table.read(columns, list(columns) if required is None else required)

@@ -2,7 +2,7 @@
 
 Accepts the output of spreadsheets and other programs: a byte order mark, CRLF, spaces around names and values, a
 separator at the end of each line, empty lines, and comments (`#`) anywhere. If the first row contains only numbers, and
-a comment before it contains as many names, that comment is the header, as in files of EuRoC.
+the last comment before it contains as many names, this comment is the header, as in files of EuRoC.
 """
 
 import csv
@@ -71,7 +71,7 @@ class TextTable:
     def rows(self) -> Iterator[Row]:
         """Yield the remaining rows, each with one value per column.
 
-        Raises UserError on a row of another length, and if there are more rows than the limit.
+        Raises UserError if a row has another number of values, and if there are more rows than the limit.
         """
         n_names = len(self.names)
         for n_rows, (line, words) in enumerate(self._rows, 1):
@@ -111,7 +111,7 @@ class TextTable:
         )
 
     def _read_lines(self) -> Iterator[tuple[int, str]]:
-        """Yield the lines that are neither empty nor comments."""
+        """Yield number and text of each line that is neither empty nor a comment."""
         n_seen = 0
         for line in itertools.count(1):
             text = self._stream.readline(MAX_LINE_BYTES + 1)
@@ -166,9 +166,9 @@ class TextTable:
         return names
 
     def _names_in_comment(self, n_columns: int) -> list[str] | None:
-        """Return the names in the last comment if there are `n_columns` of them.
+        """Return the names in the last comment if their number is `n_columns`, or None.
 
-        0 accepts any number above one.
+        With `n_columns` 0, returns the names if there are at least two.
         """
         for comment in reversed(self.comments[-1:]):
             names = (
@@ -181,7 +181,7 @@ class TextTable:
 
 
 class _Counted:
-    """Lines for csv.reader; records the line where the current row began, and limits the length of a row."""
+    """Lines for csv.reader; records the line where the current row begins, and limits the row's length."""
 
     def __init__(self, path: Path, lines: Iterator[tuple[int, str]]):
         self._path, self._lines, self._length = path, lines, 0
@@ -285,7 +285,7 @@ def _builder(kind: Kind, path: Path, name: str) -> _Numbers | _Integers | _Words
 
 
 def _batch(rows: Iterator[Row]) -> list[Row]:
-    """Return the next rows, few enough to need little memory."""
+    """Return the next rows: so few that they need little memory, and none at the end."""
     batch: list[Row] = []
     n_characters = 0
     for line, words in rows:
@@ -303,9 +303,9 @@ def _separator(line: str) -> str:
     return best if counts[best] > 1 or len(line.split()) == 1 else " "
 
 
-def _without_empty_end(words: list[str], n_least: int) -> list[str]:
-    """Remove empty values at the end, but keep at least `n_least` values."""
-    while len(words) > n_least and not words[-1]:
+def _without_empty_end(words: list[str], min_length: int) -> list[str]:
+    """Remove empty values at the end, but keep at least `min_length` values."""
+    while len(words) > min_length and not words[-1]:
         words = words[:-1]
     return words
 

@@ -42,7 +42,7 @@ def detector(tmp_path_factory):
 
 
 def test_only_stack_estimates_a_pose():
-    with pytest.raises(ValidationError, match=r"warp.target=motion, since only stack has another"):
+    with pytest.raises(ValidationError, match=r"warp.target=motion, since only stack has this setting"):
         NavigateConfig(warp=NETWORK | {"target": "pose"}, stack=NETWORK)
     with pytest.raises(ValidationError, match=r"warp.pool=1"):
         NavigateConfig(warp=NETWORK | {"pool": 4}, stack=NETWORK)

@@ -159,7 +159,7 @@ def test_commands_take_a_run_of_poses(run, dataset_nav, make_dataset, tmp_path, 
     assert text.count("(stack, pose)") == 2 and text.count("mean_pose_at_frame") == 1
     elsewhere = make_dataset(tmp_path / "other", "nav", splits={"test": 1}, n_frames=4, seed=9)
     done = call("navigate", "evaluate", "--run", run.root, "--dataset", elsewhere, "--out", tmp_path / "f")
-    assert done.returncode == 2 and re.search("terrain: got another one, expected the landing area", _one_line(done))
+    assert done.returncode == 2 and re.search("terrain: got other terrain, expected the landing area", _one_line(done))
     done = call("navigate", "deploy", "--run", run.root, "--out", tmp_path / "x")
     assert done.returncode == 2 and "target: got pose, expected a network trained with target=motion" in _one_line(done)
     assert not (tmp_path / "f").exists() and not (tmp_path / "x").exists()

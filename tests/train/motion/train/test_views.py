@@ -188,5 +188,5 @@ def test_stored_features_of_views_come_last_and_validation_is_not_warped(dataset
 def test_only_a_network_for_poses_has_views():
     with pytest.raises(ValidationError, match=r"stack.target=pose, since stack.views is given"):
         NavigateConfig(warp=NETWORK, stack=NETWORK | {"views": 2})
-    with pytest.raises(ValidationError, match=r"warp.views=0, since only stack has another"):
+    with pytest.raises(ValidationError, match=r"warp.views=0, since only stack has this setting"):
         NavigateConfig(warp=NETWORK | {"views": 2}, stack=NETWORK)

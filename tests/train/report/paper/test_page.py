@@ -133,7 +133,7 @@ def test_every_section_of_finished_runs(runs, dataset):
     assert (
         navigation.index("Pose in O_L:")
         < navigation.index("Pose in O_L over")
-        < navigation.index("Motion from frame to frame")
+        < navigation.index("Motion between consecutive frames")
     )
     assert "| Darknet53-LSTM | the paper | 7.61 | - | 0.011 | 0.22 |" in navigation
     assert "| attention-Darknet53-LSTM | here | 1.000 (0.900 to 1.100) | 1.732 | 0.01000 | 0.204 |" in navigation

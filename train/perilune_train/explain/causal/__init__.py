@@ -1,1 +1,1 @@
-"""Effect of single craters, removed from the ground and rendered again."""
+"""Effect of single craters on networks: craters are removed from the ground, and frames are rendered again."""

@@ -1,4 +1,4 @@
-"""Effects of removing craters, by size, freshness and Sun elevation: tables, pictures and metrics."""
+"""Effects of removing craters by crater radius, depth and Sun elevation: tables, pictures and metrics."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -17,23 +17,24 @@ from perilune_train.records.pictures import save_figure
 VERSIONS = {"rendered": ("crater removed, rendered again", BLUE), "inpainted": ("crater inpainted", ORANGE)} | {
     "placebo": ("empty ground inpainted", GREY)
 }
-"""Label and colour of each version of a frame."""
+"""Label and colour of each changed version of a frame."""
 BINS = {
     "radius_px": ("radius, px", (0, 3, 5, 10, 80)),
     "depth_ratio": ("depth / diameter", (0, 0.05, 0.1, 0.15, 1)),
     "sun_elevation_deg": ("Sun, degrees", (0, 20, 35, 50, 90)),
 }
-"""Label and edges of the bins of each property of a crater."""
+"""Label and bin edges of each property of a crater."""
 OUTSIDE = "outside"
 """Name of the bin for values outside all other bins; it is not drawn."""
 MAX_ROWS = 6
-"""Largest number of gates drawn as bars, in one row of panels per gate; more gates are drawn as a heat map."""
+"""Largest number of gates that are drawn as bars. More gates are drawn as a heat map."""
 
 
 def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
-    """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present.
+    """Means of the column `value` in bins of each property of `BINS`.
 
-    The bin 3-5 has values above 3 and up to 5; "outside" has the values outside all bins.
+    Columns: property, bin, version, value (the mean), n (number of views), and map if `table` has this column. The bin
+    3-5 has values above 3 and up to 5; the bin "outside" has values outside all other bins.
     """
     parts, keys = [], [name for name in ("map", "version") if name in table]
     for name, (label, edges) in BINS.items():
@@ -47,8 +48,8 @@ def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
 def bin_metrics(table: pd.DataFrame, prefix: str) -> Metrics:
     """Figures of `binned` for metrics.json: means, and numbers of crater views.
 
-    Means have keys <prefix>/<version>[/<map>]/<property>/<bin>. Numbers of views have keys
-    <prefix>/<version>/<property>/<bin>_n, because they do not depend on the map.
+    A mean has the key <prefix>/<version>[/<map>]/<property>/<bin>. A number of views does not depend on the map and has
+    the key <prefix>/<version>/<property>/<bin>_n.
     """
     names = {label: name for name, (label, _) in BINS.items()}
     metrics: Metrics = {}
@@ -78,7 +79,7 @@ def draw_bins(path: Path, tables: Mapping[str, pd.DataFrame]) -> None:
 
 
 def draw_gate_bins(path: Path, table: pd.DataFrame) -> None:
-    """Draw the changes of all gates as bars, or of many gates as a heat map.
+    """Draw the mean changes of all gates by bin: as bars for up to MAX_ROWS gates, else as a heat map.
 
     `table` is the result of `binned` with the column map.
     """

@@ -46,15 +46,15 @@ CAPTIONS = {
     " again; the same pixels inpainted; empty ground inpainted.",
     "detections_causal.png": "Share of craters that the detector finds at its threshold, with and without the crater.",
     "bins_causal.png": "Change of every gate by size, freshness and Sun. n: views of craters.",
-    "before_after_causal.png": "A frame with craters, the same frame rendered without the outlined ones, and one"
-    " gate's mask of both.",
+    "before_after_causal.png": "A frame with craters, the same frame rendered without the outlined craters, and one"
+    " gate's masks for both frames.",
 }
 _BATCH = 8
 
 
 @dataclass(frozen=True, slots=True)
 class PoseInputs:
-    """Descents with and without some craters, and the network that estimates poses from them."""
+    """Descents with and without some craters, and the navigator to test on them."""
 
     dataset: Address
     """Navigation dataset with all craters."""
@@ -66,7 +66,7 @@ class PoseInputs:
 
 @dataclass(frozen=True, slots=True)
 class CausalInputs:
-    """Frames with and without some craters."""
+    """Frames with and without some craters, and optional inputs for further comparisons."""
 
     dataset: Address
     """Detection dataset with all craters."""
@@ -77,11 +77,11 @@ class CausalInputs:
     turned: Address | None = None
     """Dataset of these frames with all craters under another Sun; None to skip the comparison of Suns."""
     pose: PoseInputs | None = None
-    """Inputs for the effect on poses; None to skip it."""
+    """Inputs for the effect on the navigator; None to skip this effect."""
 
 
 def causal_folder(named: NamedRun) -> RunFolder:
-    """The folder that `causal_run` writes; a command locks it (`training.begin.held`)."""
+    """The folder that `causal_run` writes. The caller must lock this folder (`training.begin.held`)."""
     return named.folder("explain", "-causal")
 
 
@@ -95,10 +95,10 @@ def causal_run(
 ) -> RunFolder:
     """Measure how removing craters changes masks, detections and poses; writes runs/explain/<name>-causal.
 
-    `checkpoint` contains the detector's weights. `gate` is the gate that the headline is about; it must be chosen on
-    other frames. A finished run with equal inputs is left unchanged.
+    `checkpoint` contains the detector's weights. `gate` is the gate that the claims are about; choose it on other
+    frames. A finished run with equal settings and inputs is left unchanged.
 
-    Raises UserError if an existing run has different settings or inputs, if an input is missing or invalid, or if the
+    Raises UserError if an existing run has different settings or inputs, if an input is missing or invalid, or if a
     network was fitted to the terrain of the frames (unless `allow_overlap`).
     """
     run = causal_folder(named)
@@ -172,7 +172,7 @@ def causal_run(
 def _versions(
     dataset: Dataset, pairs: CraterPairs, split: str, labels, settings: ExplainConfig, rng: np.random.Generator
 ) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[float, float] | None]]:
-    """The frames in all versions, by name, and the shifts of the placebo regions."""
+    """The frames by name of the version, and the shift of each placebo region (None without free ground)."""
     whole = load_split(dataset, split, labels)
     index_of = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
     frames = frames_of(whole, [index_of[name] for name in pairs.frames["frame_id"]], settings.ring_factors)
@@ -190,9 +190,9 @@ def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
 
 
 def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, checkpoint: Path) -> pd.DataFrame:
-    """Similarity between the masks of each pose under the two Suns. Columns: map, change, frame_index, pearson.
+    """Similarity between the masks of each pose under two Suns. Columns: map, change, frame_index, pearson.
 
-    Raises UserError if the second dataset has frames that the first does not have.
+    Raises UserError if `turned` has frames that `factual` does not have.
     """
     tables = same_frames(factual, turned, split)
     images = [load_images(dataset, rows, split) for dataset, rows in zip((factual, turned), tables, strict=True)]

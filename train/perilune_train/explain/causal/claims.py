@@ -1,6 +1,6 @@
 """Claims of a causal run: figures, intervals, placebos and verdicts.
 
-Scenes are independent; views of one scene are not. A verdict is therefore based on the mean change of each scene,
+Scenes are independent, but views of one scene are not. A verdict is therefore based on the mean change of each scene,
 tested by sign flips over scenes. Intervals come from a bootstrap over scenes and do not affect verdicts.
 """
 
@@ -16,10 +16,9 @@ from perilune_train.records.spread import MIN_UNITS
 
 NO_PLACEBO = "undecided: no placebo"
 _BOTH_WAYS = MIN_UNITS + 1
-"""Number of scenes that a two-sided test needs. With five scenes the smallest p would be 2 / 32, which is above
-`LEVEL`."""
+"""Smallest number of scenes for a two-sided test. With five scenes, p is at least 2 / 32, which is above `LEVEL`."""
 _FEW = 0.1
-"""Largest ratio between the shares of craters detected after removal and before removal."""
+"""The share of craters detected after removal must be below this fraction of the share detected before removal."""
 _VIEW = ["crater", "scene_id", "frame_id"]
 _VERSIONS = ["factual", "rendered", "inpainted", "placebo"]
 
@@ -37,12 +36,14 @@ class Tested:
 
 
 def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tested:
-    """Whether a gate reacts to single craters.
+    """The claim that a gate reacts to single craters.
 
-    `effects` is the table of `mask_effects`, `gates` the table of `by_gate`. The change may have either sign, so p is
-    two-sided. The change must also be larger in magnitude than the placebo's change, paired over the views that have
-    both. For this, change - placebo and change + placebo are tested, with the sign of the mean change, and the larger p
-    counts.
+    `effects` is the table of `mask_effects`, `gates` the table of `by_gate`. Two tests must pass:
+
+    - The mean change is not 0. The change may have either sign, so p is two-sided.
+    - The change is larger in magnitude than the placebo's change, paired over the views that have both. The change is
+      multiplied by the sign of its mean; then change - placebo and change + placebo are tested, and the larger p
+      counts.
     """
     views = _views(effects[effects["map"] == gate], "change")
     changed = _scene_means(views["rendered"], views)
@@ -69,12 +70,13 @@ def reaction_claim(effects: pd.DataFrame, gates: pd.DataFrame, gate: str) -> Tes
 
 
 def detection_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
-    """Whether the detector finds a crater because of its appearance.
+    """The claim that the detector finds a crater because of the crater's appearance.
 
-    `effects` is the table of `detection_effects` with the column `found`. Two one-sided tests must pass. The crater
-    must be detected more often when it is present than when it is removed. It must also be detected more often when
-    other ground is inpainted than when the crater is removed. In addition, the share detected after removal must be
-    below a tenth of the share detected before.
+    `effects` is the table of `with_found`. Three conditions must hold; the first two are one-sided tests:
+
+    - Craters are detected more often before removal than after removal.
+    - Craters are detected more often when other ground is inpainted than after removal.
+    - The share detected after removal is below a tenth of the share detected before removal.
     """
     views = _views(effects, "found")
     lost = views["factual"] - views["rendered"]
@@ -95,9 +97,10 @@ def detection_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
 
 
 def pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
-    """Whether removing craters increases the navigator's error; one-sided.
+    """The claim that removing craters increases the navigator's error.
 
-    `effects` is the table of `pose_effects`. No placebo is needed because both versions are rendered.
+    `effects` is the table of `pose_effects`. The test is one-sided. No placebo is needed, because both versions are
+    rendered.
     """
     before, after, moved_m = (float(np.sqrt((effects[name] ** 2).mean())) for name in ("before", "after", "moved_m"))
     harm = effects["after"] - effects["before"]
@@ -115,19 +118,25 @@ def pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> Tested:
 
 
 def _views(effects: pd.DataFrame, value: str) -> pd.DataFrame:
-    """One row per view of a crater, with its ids and a column for each version; NaN where a version has no value."""
+    """One row per view of a crater: its ids, and `value` in a column for each version (NaN without a value)."""
     table = effects.pivot(index=_VIEW, columns="version", values=value)
     return table.reindex(columns=_VERSIONS).reset_index()
 
 
 def _scene_means(values: pd.Series, rows: pd.DataFrame) -> NDArray[np.float64]:
-    """Mean (S,) of the finite values (N,) of each scene that has finite values; `rows` (N) has the column scene_id."""
+    """Mean (S,) of the values (N,) of each scene, without NaN; `rows` (N) has the column scene_id.
+
+    Scenes without finite values are left out.
+    """
     known = values[np.isfinite(values)]
     return known.groupby(rows.loc[known.index, "scene_id"]).mean().to_numpy(np.float64)
 
 
 def _p(by_scene: NDArray[np.float64], *, both_ways: bool = False) -> float:
-    """p of a mean above 0, by sign flips over scenes; doubled if the sign was chosen on these scenes (`both_ways`)."""
+    """p of a mean above 0, by sign flips over scenes; NaN with too few scenes.
+
+    `both_ways` doubles p, because the sign was chosen on these scenes.
+    """
     if len(by_scene) < (_BOTH_WAYS if both_ways else MIN_UNITS):
         return float("nan")
     p = unit_sign_flip_p(by_scene)
@@ -154,7 +163,7 @@ def _verdict(n_scenes: int, n_placebo: int | None, needed: int, holds: bool) -> 
 def _interval(
     ends: tuple[float, float], n_scenes: int, p: float, p_placebo: float = float("nan"), unit: str = "", digits: int = 2
 ) -> str:
-    """Text of the column "interval": ends of the bootstrap interval, number of scenes, and p of the sign flips."""
+    """Text of a claim's interval: ends of the bootstrap interval, number of scenes, and p of the sign flips."""
     low, high = (f"{end:.{digits}f}" for end in ends)
     parts = [f"{low} to {high}{unit} ({n_scenes} scenes)" if np.isfinite(ends[0]) else "none: fewer than 5 scenes"]
     parts += [f"p {p:.4f}"] if np.isfinite(p) else []

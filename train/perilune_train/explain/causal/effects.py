@@ -1,12 +1,12 @@
-"""How masks, detections and poses change when single craters are removed.
+"""Measure how masks, detections and poses change when single craters are removed.
 
 Three changes of a frame are compared in an ellipse around each crater:
 
-- rendered: the crater is removed from the ground and the frame is rendered again. Pixels outside the crater's reach
-  stay equal, except for one or two grey values where the automatic exposure changes.
+- rendered: the crater is removed from the ground, and the frame is rendered again. Pixels far from the crater stay
+  equal, except for one or two grey values if the automatic exposure changes.
 - inpainted: the ellipse is filled from its surroundings, which removes the crater's pixels.
-- placebo: an ellipse of equal shape on ground without labelled craters is filled in this way. It shows the effect of
-  filling alone.
+- placebo: an ellipse of equal shape on ground without labelled craters is filled from its surroundings. This shows the
+  effect of filling alone.
 
 A gate reacts to craters if the rendered change alters its mask and the placebo does not.
 """
@@ -33,8 +33,8 @@ from perilune_train.motion.network import predict, target_of
 from perilune_train.motion.pose import predict_pose
 
 REACH = 1.4
-"""Ratio of the semi-axes of the region around a crater to the crater's semi-axes. The region ends at the outermost ring
-of the paper's mask G."""
+"""Semi-axes of the region around a crater, divided by the crater's semi-axes. The region ends where the outermost ring
+of the paper's mask G ends."""
 _INPAINT_RADIUS_PX = 3
 _TRIES = 200
 _MIN_IOU = 0.5
@@ -42,7 +42,10 @@ _TRAJECTORY = ["scene_id", "trajectory_id"]
 
 
 def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.bool_]:
-    """Pixels (height, width) of the region around a crater (a row of `CraterPairs.craters`), moved by `shift_px`."""
+    """Pixels (height, width) of the elliptic region around a crater, moved by `shift_px` (x, y).
+
+    `crater` is a row of `CraterPairs.craters`.
+    """
     u, v = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
     x, y = u - crater["ellipse_cx_px"] - shift_px[0], v - crater["ellipse_cy_px"] - shift_px[1]
     c, s = np.cos(crater["ellipse_theta_rad"]), np.sin(crater["ellipse_theta_rad"])
@@ -51,11 +54,10 @@ def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, flo
 
 
 def empty_shift(crater: pd.Series, occupied: NDArray[np.bool_], rng: np.random.Generator) -> tuple[float, float] | None:
-    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if none was
-    found.
+    """A random shift (x, y), pixels, that moves a crater's region onto free ground; None if no shift was found.
 
-    `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free or the
-    number of tries is used up.
+    `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free, at
+    most 200 times.
     """
     height, width = occupied.shape
     reach = REACH * crater["ellipse_a_px"] + 1
@@ -70,7 +72,7 @@ def empty_shift(crater: pd.Series, occupied: NDArray[np.bool_], rng: np.random.G
 
 
 def inpainted(image: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The image (height, width) with the chosen pixels filled from their surroundings (Telea 2004)."""
+    """The image (height, width) with the chosen pixels (height, width) filled from their surroundings (Telea 2004)."""
     filled = cv2.inpaint(image, chosen.astype(np.uint8), _INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
     return np.asarray(filled, np.uint8)
 
@@ -78,11 +80,11 @@ def inpainted(image: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> NDArray[np
 def filled_frames(
     pairs: CraterPairs, occupied: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[tuple[float, float] | None]]:
-    """Inpaint the removed craters, and placebo regions; returns both sets of frames and the shifts of the placebo
-    regions.
+    """Inpaint the removed craters in copies of the frames, and placebo regions in other copies.
 
-    Both sets are (N, height, width). There is one shift for each row of `pairs.craters`. `occupied` (N, height, width)
-    are pixels in or near labelled craters.
+    Returns the frames with inpainted craters and the frames with inpainted placebo regions, both (N, height, width),
+    and the shift of the placebo region for each row of `pairs.craters`. `occupied` (N, height, width) are pixels in or
+    near labelled craters.
     """
     shape = pairs.factual.shape[1:]
     without, placebo = (np.zeros(pairs.factual.shape, bool) for _ in range(2))
@@ -109,10 +111,10 @@ def mask_effects(
 ) -> pd.DataFrame:
     """Change of every gate's mask in the region of every crater, in standard deviations of the mask.
 
-    `masks` holds the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean of
+    `masks` has the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean of
     the factual mask over the region minus the mean of the other version's mask. A change above 0 means that the gate is
-    stronger with the crater. Columns: all of `pairs.craters`, then map, version, change. The change is NaN for a
-    placebo without free ground.
+    stronger with the crater. `shifts` comes from `filled_frames`; the change of a placebo without a shift is NaN.
+    Columns: crater, map, version, change, and the crater's ids and properties.
     """
     shape, rows = pairs.factual.shape[1:], []
     for (_, crater), shift in zip(pairs.craters.iterrows(), shifts, strict=True):
@@ -135,10 +137,11 @@ def mask_effects(
 def detection_effects(
     pairs: CraterPairs, detect: Callable[[NDArray[np.uint8]], list[Detections]], versions: dict[str, NDArray[np.uint8]]
 ) -> pd.DataFrame:
-    """Highest score of a detection that matches each crater's box (IoU 0.5) in each version of the frame; 0 if no
-    match.
+    """Highest score of the detections that match each crater, in each version of its frame.
 
-    `versions` are frames (N, height, width) by name. Columns: all of `pairs.craters`, then version, score.
+    A detection matches if its box has an IoU of at least 0.5 with the crater's box. The score is 0 without a match.
+    `versions` are frames (N, height, width) by name. Columns: crater, version, score, and the crater's ids and
+    properties.
     """
     boxes = pairs.craters[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     image, rows = pairs.craters["image"].to_numpy(), []
@@ -155,7 +158,7 @@ def detection_effects(
 def with_found(effects: pd.DataFrame, threshold: float, shifts: Sequence[tuple[float, float] | None]) -> pd.DataFrame:
     """The table of `detection_effects` with the column found: 1 if the score reaches the threshold, else 0.
 
-    For a crater without free ground (a shift of None) nothing was inpainted, so found is NaN for the placebo.
+    `shifts` comes from `filled_frames`. A crater whose shift is None has no placebo, so found is NaN for its placebo.
     """
     missing = np.array([shift is None for shift in shifts], bool)[effects["crater"].to_numpy(int)]
     is_found = (effects["score"] >= threshold).astype(float)
@@ -169,11 +172,11 @@ def _facts(pairs: CraterPairs) -> pd.DataFrame:
 def pose_effects(
     navigator: StackNavigator, architecture: dict[str, Any], factual: Dataset, counterfactual: Dataset, split: str
 ) -> pd.DataFrame:
-    """Position errors of each pair of consecutive frames, with all craters (before) and after removal (after).
+    """The navigator's position error in each pair of frames, before and after the removal of craters.
 
-    Columns: frame_id (scene/trajectory/step), scene_id, before, after (position errors, metres), moved_m (length of the
-    difference between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory,
-    because its pairs would not be consecutive. Render it with as many frames per trajectory as the dataset has.
+    Columns: frame_id (scene/trajectory/step), scene_id, before, after (position errors, metres), moved_m (distance
+    between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory, because its
+    pairs would not be consecutive.
     """
     check_descents(factual, counterfactual, split)
     originals = {trajectory.ids: trajectory for trajectory in load_split(factual, split)}
@@ -192,8 +195,7 @@ def pose_effects(
 
 
 def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> None:
-    """Raise UserError unless the split of the second dataset has every frame of its trajectories in the first
-    dataset."""
+    """Raise UserError if the counterfactual dataset lacks frames of one of its trajectories."""
     whole, changed = (
         Counter(frame_table(dataset, split)[_TRAJECTORY].agg("/".join, axis=1)) for dataset in (factual, counterfactual)
     )

@@ -1,4 +1,4 @@
-"""Frames with and without single craters, and the positions of these craters."""
+"""Load frames with and without single craters, and the labels of these craters."""
 
 import io
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ def crater_pairs(
 ) -> CraterPairs:
     """Load the frames of a counterfactual dataset and the matching frames of the dataset it was rendered from.
 
-    `removed` is the table of `read_removed`. The result lists only craters that `selection` accepts in the factual
-    frame and that are wholly in the image. Raises UserError if there are no such craters, or if the second dataset has
-    frames that the first dataset lacks.
+    `removed` is the table of `read_removed`. The result lists only removed craters that `selection` accepts in the
+    factual frame and that are wholly in the image. Raises UserError if there are no such craters, or if the
+    counterfactual dataset has frames that the factual dataset lacks.
     """
     known, rows = same_frames(factual, counterfactual, split)
     craters = _shown(factual, removed, rows, split, selection)
@@ -56,7 +56,7 @@ def crater_pairs(
 def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The frames of a split that both datasets contain, as two `frame_table`s in equal order.
 
-    Raises UserError if the second dataset has frames that the first does not have.
+    Raises UserError if `other` has frames that `factual` lacks.
     """
     rows, whole = (frame_table(dataset, split) for dataset in (other, factual))
     known = whole[whole["frame_id"].isin(rows["frame_id"])].reset_index(drop=True)
@@ -67,9 +67,9 @@ def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFr
 
 
 def read_removed(address: Address) -> pd.DataFrame:
-    """Read the table of removed craters of a counterfactual dataset, <dataset>.removed.parquet.
+    """Read <dataset>.removed.parquet, the table of the craters removed from a counterfactual dataset.
 
-    Raises UserError if it is missing, is damaged or has no craters.
+    Raises UserError if the table is missing, damaged or empty.
     """
     above, _, name = f"{str(address).rstrip('/')}.removed.parquet".rpartition("/")
     store = open_store(above or ".")

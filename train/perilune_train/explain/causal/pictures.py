@@ -18,10 +18,10 @@ _CELL_PX = 256
 
 
 def by_gate(effects: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """Mean change of every gate and version, with a 95 % interval over scenes: map, version, change, low, high, n.
+    """Mean change of every gate in each version, with a 95 % interval over scenes.
 
-    `effects` is the table of `mask_effects`. low and high are NaN with fewer than five scenes. n is the number of
-    crater views with a value; if n is 0, the change is NaN.
+    `effects` is the table of `mask_effects`. Columns: map, version, change, low, high, n. low and high are NaN with
+    fewer than five scenes. n is the number of crater views with a value; if n is 0, the change is NaN.
     """
     rows = []
     for (gate, version), views in effects.groupby(["map", "version"], sort=False):
@@ -49,7 +49,7 @@ def scene_interval(
 
 
 def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
-    """Draw the mean change of every gate in each version, with intervals if they exist."""
+    """Draw the table of `by_gate` as bars, with intervals if they exist."""
     gate_names = list(dict.fromkeys(gates["map"]))
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     axis = figure.subplots()
@@ -69,9 +69,10 @@ def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
 
 
 def draw_pair(path: Path, pairs: CraterPairs, masks: dict[str, NDArray[np.floating]], image: int, gate: str) -> None:
-    """Draw a PNG: a frame with its removed craters outlined, the frame without them, and one gate's masks of both.
+    """Draw, as one PNG row, a frame before and after the removal of craters, and the gate's masks for both.
 
-    `masks` are one gate's masks (N, height, width) of the versions "factual" and "rendered".
+    The removed craters are outlined. `masks` are the masks (N, height, width) of the gate in the versions "factual" and
+    "rendered". `image` is the index of the frame.
     """
     removed_craters = pairs.craters[pairs.craters["image"] == image]
     frames = [cv2.cvtColor(images[image], cv2.COLOR_GRAY2BGR) for images in (pairs.factual, pairs.counterfactual)]

@@ -1,1 +1,1 @@
-"""PCC1 to PCC4 of the paper, for each image, from maps over images."""
+"""The paper's correlations PCC1 to PCC4, for each image or pair of images."""

@@ -21,13 +21,12 @@ def true_homography(
     position_2_m: Array,
     rotation_2_camera_from_site: Array,
 ) -> Array:
-    """Homography (3, 3) of the ground from pixel coordinates in frame 1 to pixel coordinates in frame 2, from true
-    poses.
+    """Homography (3, 3) of the ground plane from pixels of frame 1 to pixels of frame 2, from true poses.
 
     Takes positions (3,) in metres, O_L, and rotations (3, 3). The plane is the mean ground, z = 0 of O_L. The paper
-    uses "the affine transformation matrix defined by groundtruth pose" without defining it. Deviation from the paper:
-    this is a homography, which is exact on the plane; an affine map is not. Raises ValueError if frame 1 is not above
-    the plane.
+    uses "the affine transformation matrix defined by groundtruth pose" without defining it. Deviation from the paper: a
+    homography, which is exact on the plane; an affine map is not. Raises ValueError if the camera of frame 1 is not
+    above the plane.
     """
     if position_1_m[2] <= 0:
         raise ValueError(f"altitude is {position_1_m[2]} m, not above 0")
@@ -39,7 +38,7 @@ def true_homography(
 
 
 def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool_]:
-    """Mask (height, width) of the pixels of frame 1 whose ground is also in frame 2, which has an equal shape."""
+    """Pixels (height, width) of frame 1 whose ground is also in frame 2; both frames have `shape`."""
     height, width = shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     moved = apply_homography(homography, np.stack([u, v], axis=-1))
@@ -47,10 +46,9 @@ def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool
 
 
 def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array) -> Array:
-    """Resample an image of frame 2 (height, width) bilinearly at the pixels of frame 1; edge pixels are repeated
-    outside.
+    """An image of frame 2 (height, width), resampled bilinearly at the pixels of frame 1.
 
-    `homography` (3, 3) maps image coordinates of frame 1 to frame 2.
+    Outside the image, its edge pixels are repeated. `homography` (3, 3) maps pixels of frame 1 to pixels of frame 2.
     """
     height, width = image_2.shape
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -1,4 +1,4 @@
-"""Compute PCC1 to PCC4 of the paper for each image or pair, as rows of one long table.
+"""Compute the paper's correlations PCC1 to PCC4 for each image or pair, as rows of one long table.
 
 Columns: task, kind, map, measure, frame_id, scene_id, value. Means, intervals and tests are computed from these rows.
 """
@@ -34,7 +34,7 @@ PCC1_SIGN = (
 
 @dataclass(frozen=True, slots=True)
 class FrameTargets:
-    """Targets of N frames with which maps are correlated, and the names of the frames."""
+    """Images of N frames with which maps are correlated, and the names of the frames."""
 
     truth: Maps
     """The paper's masks G (N, height, width): 1 on background, 0 in craters."""
@@ -53,8 +53,7 @@ class PairTargets:
     """True motions of N pairs of frames, and the names of the pairs."""
 
     homographies: Sequence[Array]
-    """Homographies (3, 3) of the N pairs, from image coordinates of the earlier (upper) frame to the later (lower)
-    frame."""
+    """Homography (3, 3) of each pair (N), from pixels of the earlier (upper) to pixels of the later (lower) frame."""
     pair_ids: Sequence[str]
     """Ids of the pairs (N)."""
     scene_ids: Sequence[str]
@@ -66,11 +65,14 @@ def detector_values(
 ) -> pd.DataFrame:
     """The long table of PCC1 and PCC2 for every map (N, height, width).
 
-    pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background. A value above 0 means that
-    the map is lower on craters. pcc1_craterness is the correlation with 1 - G. A value above 0 means that the map is
-    higher on craters. pcc1_partial is the partial correlation with 1 - G given brightness and gradient. pcc2 of frame n
-    is the mean correlation of its map with this gate's maps of all other frames m; with `other_scenes`, only of frames
-    in other scenes. The paper uses one unspecified m. Undefined values are NaN.
+    - pcc1_background: the paper's PCC1, the correlation with G. G is 1 on background, so a value above 0 means that the
+      map is lower on craters.
+    - pcc1_craterness: the correlation with 1 - G. A value above 0 means that the map is higher on craters.
+    - pcc1_partial: the partial correlation with 1 - G given brightness and gradient.
+    - pcc2: the mean correlation between the frame's map and the maps of all other frames (with `other_scenes`: of all
+      frames of other scenes). The paper uses one other frame and does not say which.
+
+    Undefined values are NaN.
     """
     scenes = np.asarray(targets.scene_ids)
     paired = scenes[:, None] != scenes[None] if other_scenes else ~np.eye(len(scenes), dtype=bool)
@@ -94,14 +96,19 @@ def detector_values(
 
 
 def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pixels: bool = True) -> pd.DataFrame:
-    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the pair's id.
+    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs.
 
-    pcc3 and pcc4 use the overlap: the pixels of the upper frame whose ground is also in the lower frame. The paper uses
-    all pixels, at least for PCC3, and does not define the moved map outside the overlap. In pcc3_all_pixels and
-    pcc4_all_pixels the moved map is 0 there, which is OpenCV's default. If one half is constant, both values of that
-    kind (overlap or all pixels) are NaN, because their means must be over equal sets of pairs. pcc4_minus_pcc3 is the
-    increase due to the true motion, over the overlap. Without `all_pixels` only the measures over the overlap are
-    computed, which takes half the time.
+    The column frame_id has the ids of the pairs. Measures:
+
+    - pcc3: the correlation of the upper with the lower half, over the overlap. The overlap is the pixels of the upper
+      frame whose ground is also in the lower frame.
+    - pcc4: as pcc3, with the lower half moved by the true motion.
+    - pcc4_minus_pcc3: the increase due to the true motion.
+    - pcc3_all_pixels, pcc4_all_pixels: over all pixels. Outside the overlap the moved half is 0, OpenCV's default. The
+      paper uses all pixels, at least for PCC3, and does not define the moved half outside the overlap.
+
+    If pcc3 or pcc4 of a pair is undefined, both are NaN, so that their means are over equal sets of pairs; likewise for
+    the measures over all pixels. Without `all_pixels` these are not computed, which takes half the time.
     """
     height, width = (size // part for size, part in zip(next(iter(masks.values())).shape[1:], (2, 1), strict=True))
     seen = np.stack([seen_in_second((height, width), homography) for homography in targets.homographies])
@@ -130,14 +137,14 @@ def pair_values(masks: Masks, targets: PairTargets, kind: Kind = "gate", all_pix
 
 
 def _mean_defined(values: Array, wanted: NDArray[np.bool_]) -> Array:
-    """Mean (N,) of the wanted values that are not NaN in each row of (N, M); NaN for a row without such values."""
+    """Mean (N,) of the `wanted` values in each row of values (N, M), without NaN; NaN if no value remains."""
     used = wanted & ~np.isnan(values)
     counts = used.sum(1)
     return np.where(counts > 0, np.where(used, values, 0.0).sum(1) / np.maximum(counts, 1), np.nan)
 
 
 def _table(names: dict[str, str], values: Array, ids: Sequence[str], scenes: Sequence[str]) -> pd.DataFrame:
-    """Rows of the long table for one measure of one map; `names` holds the columns that are constant over all rows."""
+    """Rows of the long table for one measure of one map; `names` has the columns that are equal in all rows."""
     if not len(values) == len(ids) == len(scenes):
         raise ValueError(f"{len(values)} maps, {len(ids)} frame names and {len(scenes)} scene names")
     varying = {"frame_id": list(ids), "scene_id": list(scenes), "value": np.asarray(values, np.float64)}

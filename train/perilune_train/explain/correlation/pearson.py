@@ -10,11 +10,11 @@ from perilune_shared.geometry.frames import Array
 Maps = NDArray[np.floating]
 """Maps (N, height, width) of N images."""
 _ROUNDING = 1e-6
-"""Variation below this share of the values counts as a rounding error of float32."""
+"""Largest variation, relative to the values, that counts as a rounding error of float32."""
 
 
 def pearson(a: ArrayLike, b: ArrayLike, seen: NDArray[np.bool_] | None = None) -> float:
-    """Pearson correlation of two maps over the pixels `seen`; NaN if a map is constant or `seen` is empty."""
+    """Pearson correlation of two maps over the pixels `seen`; NaN if a map is constant or no pixel is `seen`."""
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
     return float(pearson_rows(x[None], y[None], None if seen is None else seen[None])[0])
 
@@ -40,10 +40,10 @@ def partial_rows(maps: Maps, targets: Maps, givens: Sequence[Maps]) -> Array:
 
 
 def partial_of_rows(rows: Array, residuals: Array, basis: Sequence[Array]) -> Array:
-    """The partial correlations of `partial_rows`, from standardised maps (N, P) and `residual_rows` (N, P) of the
-    targets.
+    """Partial correlations (N,) from standardised maps (N, P) and the targets' `residual_rows` (N, P).
 
-    The target's residuals are orthogonal to the basis, so only the length of the map's residual is needed.
+    `basis` is the `given_basis` of the other maps. The target's residual is orthogonal to the basis, so of the map's
+    residual only the length is needed.
     """
     left = np.sqrt(
         np.maximum(1 - sum((dot_rows(rows, basis_rows) ** 2 for basis_rows in basis), np.zeros(len(rows))), 0)
@@ -57,9 +57,9 @@ def dot_rows(a: Array, b: Array) -> Array:
 
 
 def standardised_rows(maps: Maps, seen: NDArray[np.bool_] | None = None) -> Array:
-    """Maps (N, ...) as rows (N, P) of mean 0 and length 1, so that a dot product is a correlation; 0 where not `seen`.
+    """Maps (N, ...) as rows (N, P) of mean 0 and length 1; the dot product of two rows is their correlation.
 
-    A row is NaN if the map is constant or no pixel is `seen`.
+    Pixels that are not `seen` are 0 and do not count. A row is NaN if the map is constant or no pixel is `seen`.
     """
     flat = maps.reshape(len(maps), -1)
     rows = np.zeros(flat.shape)
@@ -78,7 +78,10 @@ def standardised_rows(maps: Maps, seen: NDArray[np.bool_] | None = None) -> Arra
 
 
 def given_basis(givens: Sequence[Maps]) -> list[Array]:
-    """Orthonormal rows (N, P) that span the centred givens (N, ...); zero where a given depends on earlier givens."""
+    """Orthonormal basis of the centred given maps (N, ...): rows (N, P) for each given map.
+
+    A row is zero if the given map depends linearly on earlier given maps.
+    """
     basis: list[Array] = []
     for given in givens:
         rows = _without(np.nan_to_num(standardised_rows(given)), basis)
@@ -88,22 +91,26 @@ def given_basis(givens: Sequence[Maps]) -> list[Array]:
 
 
 def residual_rows(rows: Array, basis: Sequence[Array]) -> Array:
-    """Residuals (N, P), scaled to length 1, of standardised maps (N, P) after regression on a basis; NaN if
-    constant."""
+    """Residuals (N, P), scaled to length 1, of standardised maps (N, P) after regression on a basis.
+
+    A row is NaN if the basis determines the map.
+    """
     residuals = _without(rows, basis)
     lengths = np.linalg.norm(residuals, axis=1)
     return residuals / np.where(lengths > _ROUNDING, lengths, np.nan)[:, None]
 
 
 def is_constant(values: ArrayLike) -> bool:
-    """Whether the standard deviation is at most 1e-6 of the largest absolute value, which counts as a rounding
-    error."""
+    """Whether values are constant except for rounding errors.
+
+    The standard deviation of these values is at most 1e-6 of the largest absolute value.
+    """
     array = np.asarray(values, np.float64)
     return bool(np.std(array) <= _ROUNDING * max(float(np.abs(array).max()), 1e-30))
 
 
 def _without(rows: Array, basis: Sequence[Array]) -> Array:
-    """Rows (N, P) without their components along the basis, which are subtracted twice to limit rounding errors."""
+    """Rows (N, P) without their components along the basis. Subtracting twice limits rounding errors."""
     for _ in range(2):
         for basis_rows in basis:
             rows = rows - dot_rows(rows, basis_rows)[:, None] * basis_rows

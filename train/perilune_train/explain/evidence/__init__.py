@@ -1,1 +1,1 @@
-"""Tests of what the maps mean: nulls, interventions, localisation, stability."""
+"""Tests of what attention masks mean: nulls, interventions, localisation, stability."""

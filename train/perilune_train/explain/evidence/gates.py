@@ -1,7 +1,7 @@
-"""Force attention gates to their means, to measure how much the output loses without their patterns.
+"""Force attention gates to their means, to measure how much worse the output becomes without their patterns.
 
-If a gate's pattern matters, replacing its spatial mask by its mean over pixels and frames changes the output. Channel
-gates are unchanged. This test is needed because a mask that correlates with craters may have no effect on the output.
+The spatial mask of a gate is replaced by the mask's mean over pixels and frames. Channel gates are unchanged. This test
+is needed because a mask that correlates with craters may have no effect on the output.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +17,7 @@ from perilune_train.explain.maps.masks import Masks
 from perilune_train.models.darknet import AttentionDarknet53
 
 ALL = "all gates"
+"""Name of the scope with all gates."""
 
 
 def gate_means(masks: Masks) -> dict[str, float]:
@@ -25,7 +26,7 @@ def gate_means(masks: Masks) -> dict[str, float]:
 
 
 def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Sets of gates that are forced together: each gate alone, the gates of each stage ("stage 3"), and all gates."""
+    """Gates that are forced together, by scope: each gate alone, the gates of each stage ("stage 3"), all gates."""
     stages = sorted({block[2] for block in blocks})
     alone = {block: (block,) for block in blocks}
     together = {f"stage {stage}": tuple(block for block in blocks if block[2] == stage) for stage in stages}
@@ -34,7 +35,7 @@ def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 @contextmanager
 def forced(backbone: AttentionDarknet53, means: Mapping[str, float]) -> Iterator[None]:
-    """Replace the spatial masks of some gates by constants while the block runs."""
+    """Replace the spatial masks of the gates in `means` by constants while the block runs."""
 
     def constant(value: float) -> Callable[[Tensor], Tensor]:
         return lambda x: x.new_full((len(x), 1, *x.shape[2:]), value)
@@ -57,9 +58,9 @@ def forced_gates(
     measure: Callable[[NDArray[np.uint8]], NDArray[np.float64]],
     label: str,
 ) -> pd.DataFrame:
-    """Performance on each image with all gates, and with the gates of each scope forced to their means.
+    """Performance on each image before and after forcing the gates of each scope to their means.
 
-    `measure` gives one value per image. Columns: scope, image (index), before, after.
+    `measure` returns one value per image. Columns: scope, image (index), before, after.
     """
     before, tables = measure(images), []
     chosen = scopes(list(means))

@@ -26,10 +26,10 @@ def localisation(
 ) -> pd.DataFrame:
     """Long table of how well each map (N, height, width) locates the crater pixels (N, height, width).
 
-    `sign` is 1, or -1 for a map that is weaker on craters; determine it on validation frames. `frames` has columns
-    frame_id and scene_id in the order of the maps. Columns of the table: task, kind, map, measure, frame_id, scene_id,
-    value. Measures: pointing, relevance_mass, auc, pointing_chance, relevance_mass_chance; the chance level of auc is
-    0.5. Values are NaN where the map is constant, or where no pixel or every pixel is in a crater.
+    `sign` is 1, or -1 for a map that is weaker on craters; determine the sign on validation frames. `frames` has the
+    columns frame_id and scene_id in the order of the maps. Columns of the table: task, kind, map, measure, frame_id,
+    scene_id, value. `localised` defines the measures. Values are NaN where the map is constant, or where no pixel or
+    every pixel is in a crater.
     """
     rows = []
     for name, images_map in maps.items():
@@ -44,14 +44,18 @@ def localisation(
 
 
 def localised(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> dict[str, float]:
-    """Localisation measures of one map (height, width) that is larger on craters, given the crater pixels (height,
-    width).
+    """Localisation measures of one map (height, width), from the crater pixels (height, width).
 
-    pointing: 1 if the map's largest pixel is within TOLERANCE_PX of a crater, else 0 (Zhang et al. 2018, doi
-    10.1007/s11263-017-1059-x). With ties, it is the share of tied pixels that are hits. Its chance level is the share
-    of the image area within the tolerance of craters. relevance_mass: share of the map, shifted to minimum 0, within
-    craters (Arras et al. 2022, doi 10.1016/j.inffus.2021.11.008). Its chance level is the share of the image area in
-    craters. auc: probability that a crater pixel has a larger value than a pixel outside craters; ties count half.
+    The map must be larger on craters.
+
+    - pointing: 1 if the map's largest pixel is within TOLERANCE_PX of a crater, else 0 (Zhang et al. 2018, doi
+      10.1007/s11263-017-1059-x). If several pixels are largest: the share of these pixels that are hits.
+    - pointing_chance: share of the image area within TOLERANCE_PX of craters.
+    - relevance_mass: share of the map, shifted to minimum 0, within craters (Arras et al. 2022, doi
+      10.1016/j.inffus.2021.11.008).
+    - relevance_mass_chance: share of the image area in craters.
+    - auc: probability that a crater pixel has a larger value than a pixel outside craters; ties count half. The chance
+      level is 0.5.
     """
     near = within(craters, TOLERANCE_PX)
     if is_constant(relevance) or craters.all() or not craters.any():

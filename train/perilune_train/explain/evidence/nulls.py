@@ -1,7 +1,7 @@
-"""Null maps: how large correlations are for maps that do not show a trained network's attention to these craters.
+"""Null maps: maps without a trained network's attention to the frame, for comparison with gates.
 
-A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if it applies to the gates of stage k,
-and "<null>/<gate>" if it applies to one gate.
+A null is named "<null>" if it applies to every gate, "<null>/stage_<k>" if it applies to the gates of stage k, and
+"<null>/<gate>" if it applies to one gate.
 """
 
 from collections.abc import Sequence
@@ -25,9 +25,10 @@ def detector_nulls(
 ) -> pd.DataFrame:
     """The long table of PCC1 and PCC2 of all null maps of N frames (N, height, width).
 
-    Nulls: "edge", "contrast" and "brightness" of the images (`baseline_maps`); "untrained", the masks of an untrained
-    network; "other frame", each gate's mask of a frame of another scene. PCC2 is
-    omitted for "other frame", because it does not depend on the order of the frames.
+    - "edge", "contrast", "brightness": `baseline_maps` of the images
+    - "untrained": masks of an untrained network
+    - "other frame": each gate's mask for a frame of another scene. PCC2 is left out, because exchanging frames does not
+      change it.
     """
     maps = baseline_maps(images) | renamed("untrained", untrained)
     exchanged = renamed("other frame", of_other_rows(masks, targets.scene_ids, rng))
@@ -45,10 +46,11 @@ def pair_nulls(
 ) -> pd.DataFrame:
     """The long table of PCC3 and PCC4 of all null maps of N pairs (N, 2 height, width), the earlier frame above.
 
-    Correlations use only the overlap of the two frames.
+    - "edge", "contrast", "brightness": `baseline_maps` of both frames
+    - "untrained": masks (N, 2 height, width) of an untrained network
+    - "other pair": each gate's mask, with the lower half replaced by the lower half of a pair of another scene
 
-    Nulls: the baselines of both images; "untrained", the stacked masks (N, 2 height, width) of an untrained network;
-    "other pair", each gate's mask with the lower half of another pair.
+    Correlations use only the overlap of the two frames.
     """
     first, second = np.split(pairs, 2, axis=1)
     upper, lower = (baseline_maps(images, px_per_input_px) for images in (first, second))
@@ -60,7 +62,7 @@ def pair_nulls(
 
 
 def renamed(null: str, masks: Masks) -> Masks:
-    """The masks with the names "<null>/<gate>"."""
+    """The masks, renamed to "<null>/<gate>"."""
     return {f"{null}/{gate}": gate_masks for gate, gate_masks in masks.items()}
 
 
@@ -73,7 +75,10 @@ def of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generat
 
 
 def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray:
-    """For each of N rows, the index (N,) of a random row of another scene (of the same scene if there is only one)."""
+    """For each of N rows, the index (N,) of a random row of another scene.
+
+    With only one scene, the index of any other row. Raises ValueError with fewer than two rows.
+    """
     scenes = np.asarray(scene_ids)
     if len(scenes) < 2:
         raise ValueError(f"got {len(scenes)} frames, expected at least 2")
@@ -84,9 +89,10 @@ def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray
 
 @torch.no_grad()
 def measure_statistics(network: nn.Module, *given: torch.Tensor) -> None:
-    """Set the batch statistics of an untrained network to those of one batch, then switch it to evaluation mode.
+    """Set an untrained network's batch statistics from one batch, and switch the network to evaluation mode.
 
-    Without measured statistics the features of an untrained network shrink from layer to layer.
+    `given` are the network's inputs. Without measured statistics, the features of an untrained network shrink from
+    layer to layer.
     """
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm2d):

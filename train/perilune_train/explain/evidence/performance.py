@@ -21,18 +21,20 @@ _BATCH = 8
 
 @dataclass(frozen=True)
 class DetectionPerformance:
-    """Average precision of a detector on each of some labelled frames."""
+    """Average precision of a detector on single labelled frames, to be called with images of these frames."""
 
     detector: Detector
-    """The detector, at scale 1 only: attention masks belong to one scale."""
+    """The detector, at scale 1 only, because an attention mask belongs to one scale."""
     labels: Sequence[FrameLabels]
     """Labels of the N frames."""
     radius_px: tuple[float, float]
-    """Range of radii that is evaluated, pixels."""
+    """Smallest and largest crater radius that is evaluated, pixels."""
 
     def __call__(self, images: NDArray[np.uint8]) -> Values:
-        """AP at IoU 0.5 (the paper's sum) of each frame (N,), from images (N, height, width); NaN for frames without
-        labels."""
+        """AP (N,) of each frame by the paper's definition, from images (N, height, width).
+
+        NaN for frames without selected labels.
+        """
         detections = []
         for start in range(0, len(images), _BATCH):
             boxes, scores = self.detector.predict(images[start : start + _BATCH])
@@ -50,18 +52,18 @@ class DetectionPerformance:
 
 @dataclass(frozen=True)
 class MotionPerformance:
-    """Position error of a stack navigator on runs of pairs, each from the initial state of the LSTM."""
+    """Position error of a stack navigator on runs of pairs. Each run starts from the initial state of the LSTM."""
 
     navigator: StackNavigator
     """The network, in evaluation mode."""
     truth_m: Values
-    """True translations (O_C of the earlier frame) or positions (O_L), metres, (runs, pairs, 3)."""
+    """True translations in O_C of the earlier frame, or positions in O_L, (runs, pairs, 3), metres."""
     mean_m: Values
     """Mean of the truth over the training set (3,), metres."""
     spread_m: Values
     """Standard deviation of the truth over the training set (3,), metres."""
     size_px: int
-    """Width of the network's frames."""
+    """Width of the network's input, pixels."""
 
     def __call__(self, images: NDArray[np.uint8]) -> Values:
         """Position errors (n,), metres, of the n = runs * pairs stacked pairs (n, 2 height, width)."""

@@ -1,4 +1,4 @@
-"""The permutation null: the correlation that remains when the targets of different scenes are exchanged."""
+"""The permutation null: the correlation that remains after the targets of different scenes are exchanged."""
 
 from collections.abc import Sequence
 
@@ -25,13 +25,15 @@ _PAIR_STEP = 4
 def permuted(
     correlations: ArrayLike, scene_ids: Sequence[str], rng: np.random.Generator, n_draws: int = DRAWS
 ) -> tuple[float, float]:
-    """Permutation test of the mean diagonal of correlations (N, N): mean over permutations, and one-sided p.
+    """Permutation test of a mean diagonal: returns the mean over permutations, and the one-sided p.
 
-    Element (n, m) is the correlation of mask n with target m. The targets of whole scenes are exchanged, because scenes
-    are the independent units. Each frame gets the target at its relative position in the other scene, so that altitudes
-    stay similar. p is (1 + draws that reach the observed mean) / (1 + n_draws) (Phipson & Smyth 2010, doi
-    10.2202/1544-6115.1585). With S scenes it is about 1 / S! at least. For a gate that is weaker on craters, pass the
-    negated correlations. NaN values are left out; both are NaN if no diagonal value is defined.
+    Element (n, m) of `correlations` (N, N) is the correlation of mask n with target m. The targets of whole scenes are
+    exchanged, because scenes are the independent units. A frame at a relative position in its scene gets the target at
+    this position in the other scene, so that altitudes stay similar. For a gate that is weaker on craters, pass the
+    negated correlations. NaN values are left out; both results are NaN if no diagonal value is defined.
+
+    p is (1 + draws that reach the observed mean) / (1 + n_draws) (Phipson & Smyth 2010, doi 10.2202/1544-6115.1585).
+    With S scenes, p is at least about 1 / S!.
     """
     values = np.asarray(correlations, np.float64)
     if np.isnan(np.diagonal(values)).all():
@@ -76,9 +78,9 @@ def detector_permutations(masks: Masks, targets: FrameTargets, signs: Signs, rng
 def pair_permutations(masks: Masks, targets: PairTargets, rng: np.random.Generator) -> pd.DataFrame:
     """Rows of the permutation null for pcc3, pcc4 and pcc4_minus_pcc3, with the columns of `null_differences`.
 
-    Upper halves are compared with lower halves of pairs in other scenes. Each lower half is moved by the homography of
-    the pair that it belongs to. Stacked masks (N, 2 height, width) are sampled every fourth pixel, since all N x N
-    combinations are computed; values therefore differ slightly from the values of `pair_values`.
+    Upper halves are compared with lower halves of pairs in other scenes. For pcc4, each lower half is moved by the
+    homography of the upper half's pair. All N x N combinations are computed, so only every fourth pixel of the stacked
+    masks (N, 2 height, width) is used. Values therefore differ slightly from the values of `pair_values`.
     """
     scale = np.diag([1 / _PAIR_STEP, 1 / _PAIR_STEP, 1.0])
     small = [scale @ homography @ np.linalg.inv(scale) for homography in targets.homographies]

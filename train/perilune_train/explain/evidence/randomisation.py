@@ -1,4 +1,7 @@
-"""Compare masks before and after randomising weights, as a sanity check (Adebayo et al. 2018, arXiv 1810.03292)."""
+"""Compare masks before and after weights are randomised.
+
+This is the sanity check of Adebayo et al. 2018, arXiv 1810.03292.
+"""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
@@ -46,15 +49,16 @@ def cascade(
     each direction is "all". A stage includes its attention gates. The copies are in evaluation mode. The original and
     the random state of PyTorch are unchanged.
 
-    A mask of the forward pass depends only on stages up to the gate. Top-down randomisation therefore does not change
-    masks of lower stages. The bottom-up cascade is more informative: it shows whether deep masks need the trained
-    features of lower stages. (In Adebayo et al., saliency maps come from gradients, which pass through all layers.)
+    A mask depends only on the stages up to its gate. Top-down randomisation therefore does not change masks of lower
+    stages. The bottom-up cascade is more informative: it shows whether deep masks need the trained features of lower
+    stages. (In Adebayo et al., saliency maps come from gradients, which pass through all layers.)
 
-    Weights are drawn with the default initialisation of PyTorch's layers. This differs from an untrained network of the
-    identity form, whose attention weights start at zero: a constant mask has no similarity to compare, so attention
-    weights are drawn too. With `run`, the batch norms of randomised stages get the statistics of the images that it
-    passes through a backbone (`calibrate`). Without `run`, they have mean 0 and variance 1, and deep gates of the plain
-    form are constant.
+    All weights, also those of attention gates, are drawn with the default initialisation of PyTorch's layers. In an
+    untrained network of the form cbam_identity, the attention weights are zero; its masks would be constant and have no
+    similarity to compare.
+
+    `run` passes images through a backbone. With `run`, the batch norms of randomised stages get the statistics of these
+    images (`calibrate`). Without `run`, they have mean 0 and variance 1, and deep gates of the form cbam are constant.
     """
     changed = copy.deepcopy(backbone).eval()
     parts: list[nn.Module] = []
@@ -77,10 +81,9 @@ def cascade(
 def calibrate(
     backbone: AttentionDarknet53, parts: Sequence[nn.Module], run: Callable[[AttentionDarknet53], object]
 ) -> None:
-    """Set mean and variance of the batch norms in `parts` from the images that `run` uses.
+    """Set mean and variance of the batch norms in `parts` from the images that `run` passes through the backbone.
 
-    `run` passes images through the backbone; statistics of several batches are averaged. The batch norms are left in
-    evaluation mode.
+    The statistics of several batches are averaged. Afterwards the batch norms are in evaluation mode.
     """
     norms = [module for part in parts for module in part.modules() if isinstance(module, nn.BatchNorm2d)]
     momenta = [norm.momentum for norm in norms]
@@ -96,13 +99,14 @@ def calibrate(
 
 
 def similarity(trained: Masks, other: Masks, step: str = "") -> pd.DataFrame:
-    """Similarity of each gate's masks (N, height, width) to the trained ones: columns map, step, spearman, ssim.
+    """Similarity of each gate's masks (N, height, width) to the trained masks.
 
-    Both columns are means over the images with defined values. `spearman` is Spearman's rank correlation over pixels;
-    it is undefined if a mask is constant. `ssim` is the mean structural similarity (Wang et al. 2004, doi
-    10.1109/TIP.2003.819861). Its dynamic range is the range of the trained mask, and it is undefined if that mask is
-    constant. Deviation: masks wider than 64 px are first averaged to a width of 64 px, close to the resolution of stage
-    2 for frames of 256 px.
+    Columns: map, step, spearman, ssim. The last two are means over the images with defined values.
+
+    - spearman: Spearman's rank correlation over pixels; undefined if one of the masks is constant.
+    - ssim: mean structural similarity (Wang et al. 2004, doi 10.1109/TIP.2003.819861), with the range of the trained
+      mask as dynamic range; undefined if the trained mask is constant. Deviation: masks wider than 64 px are first
+      averaged to a width of 64 px, the resolution of stage 2 for frames of 256 px.
     """
     rows = []
     for name, trained_maps in trained.items():
@@ -119,10 +123,11 @@ def similarity(trained: Masks, other: Masks, step: str = "") -> pd.DataFrame:
 def randomised(
     network: WithBackbone, masks_of: Callable[[NDArray[np.uint8]], Masks], images: NDArray[np.uint8], seed: int
 ) -> pd.DataFrame:
-    """Similarity of a network's masks to its masks under both cascades: direction, step, map, spearman, ssim.
+    """Similarity of a network's masks to the masks under both cascades of random weights.
 
-    `masks_of` returns the masks of `network` for images. The backbone of `network` is replaced while `masks_of` is
-    called, and restored at the end. The batch norms of randomised stages get the statistics of `images`.
+    Columns: direction, step, map, spearman, ssim. `masks_of` returns the masks of `network` for images. The backbone of
+    `network` is replaced while `masks_of` is called, and restored at the end. The batch norms of randomised stages get
+    the statistics of `images`.
     """
     trained, backbone, tables = masks_of(images), network.backbone, []
 

@@ -1,4 +1,4 @@
-"""Remove the pixels that a map attends to, and compare with two controls and the least attended pixels."""
+"""Measure the harm of removing the pixels that a map attends to, compared with two controls."""
 
 from collections.abc import Callable, Mapping
 from typing import Literal
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 Which = Literal["most", "least"]
 Filling = Literal["inpaint", "mean"]
 Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
-"""One value (N,) for each image (N, height, width); NaN if undefined."""
+"""Function that returns a value (N,) for each image (N, height, width); NaN if undefined."""
 CONTROLS = ("random", "shifted")
+"""Names of the controls (`random_like`, `shifted_like`)."""
 _FILLINGS: tuple[Filling, ...] = ("inpaint", "mean")
 BLOCK_PX = 8
 """Side of the removed blocks, pixels. Inpainting can restore single pixels, but not blocks of this size."""
@@ -29,10 +30,10 @@ def chosen_pixels(
     rng: np.random.Generator,
     block_px: int = BLOCK_PX,
 ) -> NDArray[np.bool_]:
-    """The blocks with the largest ("most") or smallest ("least") means of sign * map, as pixels (height, width).
+    """Pixels (height, width) of the blocks with the largest ("most") or smallest ("least") means of sign * map.
 
-    The number of blocks is `share` of all blocks, rounded. Ties, which occur where a gate is at its bound, are broken
-    at random.
+    The number of blocks is `share` times the number of all blocks, rounded. Equal means, which occur where a gate is at
+    its bound, are ordered at random.
     """
     means = sign * block_means(map_, block_px).ravel()
     order = np.lexsort((rng.random(means.size), -means if which == "most" else means))
@@ -42,10 +43,10 @@ def chosen_pixels(
 def random_like(
     image: NDArray[np.uint8], chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX
 ) -> NDArray[np.bool_]:
-    """Random blocks of an image (height, width) whose brightness is distributed as in the chosen blocks.
+    """Random blocks of an image (height, width) with the brightness distribution of the chosen blocks.
 
-    Each decile of the image's block means contributes as many blocks as in `chosen`. Chosen blocks may be drawn again,
-    so that the control depends on brightness only. This makes the control harder to beat.
+    From each decile of the image's block means, as many blocks are drawn as `chosen` contains. Chosen blocks may be
+    drawn again, so that the control depends only on brightness. This makes the control harder to beat.
     """
     means = block_means(image, block_px).ravel()
     decile = np.empty(means.size, int)
@@ -59,9 +60,9 @@ def random_like(
 
 
 def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX) -> NDArray[np.bool_]:
-    """The chosen blocks, flipped, rotated and circularly shifted at random: an equal shape at another position.
+    """The chosen blocks at another position: flipped, rotated and circularly shifted at random.
 
-    Images that are not square are rotated by 0 or 180 degrees.
+    In images that are not square, the rotation is 0 or 180 degrees.
     """
     blocks = block_means(chosen, block_px) > 0.5
     height, width = blocks.shape
@@ -101,10 +102,15 @@ def removal_effect(
     """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
 
     `maps` are (N, height, width); `sign` is 1, or -1 for a map that is weaker on craters. `measure` runs once on the
-    unchanged images, and once for each combination of map, which and how. Columns: map, which ("most", "least",
-    "random": blocks of the brightness of "most", "shifted": blocks of the shape of "most"), how, frame_index, overlap
-    (share of the removed pixels that are among the most attended ones), before, after. If an image is two frames
-    stacked in height, replacements at the seam use pixels of both frames.
+    unchanged images, and once for each combination of map, which and how. If an image is two frames stacked in height,
+    replacements at the seam use pixels of both frames. Columns:
+
+    - map
+    - which: "most" or "least" attended pixels, or the control "random" or "shifted"
+    - how: the filling, "inpaint" or "mean"
+    - frame_index
+    - overlap: share of the removed pixels that are among the most attended pixels
+    - before, after: values of the measure
     """
     before = np.asarray(measure(images))
     tables = []
@@ -132,13 +138,17 @@ def removal_effect(
 
 
 def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFrame:
-    """Mean harm of each removal, and its ratio to the harm of the stronger control, by map and how.
+    """Mean harm of each removal, and its ratio to the harm of the stronger control, by map and filling.
 
     `effects` is the table of `removal_effect`. Harm is the mean over frames of before - after, or of after - before if
-    lower values are better. Columns: map, how; most, least, random, shifted (harms, NaN if no frame has a value);
-    control (the control with the larger harm); ratio (most / control, NaN unless the control's harm is above 0);
-    overlap (mean share of the control's pixels that are among the most attended ones). If only the most attended pixels
-    matter, the ratio is about 1 / overlap.
+    lower values are better. Columns:
+
+    - map, how
+    - most, least, random, shifted: harms; NaN if no frame has a value
+    - control: name of the control with the larger harm
+    - ratio: harm of `most` divided by the harm of this control; NaN unless the control's harm is above 0
+    - overlap: mean share of this control's pixels that are among the most attended pixels. If only the most attended
+      pixels matter, the ratio is about 1 / overlap.
     """
     change = effects["before"] - effects["after"]
     harm = effects.assign(harm=change if higher_is_better else -change)
@@ -157,9 +167,9 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
 
 
 def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:
-    """Means (rows, columns) of the blocks of values (height, width), from the upper left.
+    """Means (rows, columns) of square blocks of values (height, width), from the upper left.
 
-    Blocks at the right and lower edges are smaller if a side of the image is not a multiple of block_px.
+    Blocks at the right and lower edges are smaller if height or width is not a multiple of block_px.
     """
     sums, sizes = (_block_sums(array, block_px) for array in (values, np.ones(values.shape)))
     return sums / sizes
@@ -173,7 +183,7 @@ def _block_sums(values: NDArray, block_px: int) -> NDArray[np.float64]:
 
 
 def _pixels(blocks: NDArray[np.integer], shape: tuple[int, ...], block_px: int) -> NDArray[np.bool_]:
-    """The pixels (height, width) of blocks given by their flat numbers."""
+    """Pixels (height, width) of the blocks with these numbers, counted row by row."""
     rows, columns = (-(-side // block_px) for side in shape)
     chosen = np.zeros((rows, columns), bool)
     chosen.flat[blocks] = True

@@ -1,4 +1,8 @@
-"""Compute means, intervals and tests against null maps, from the long table of values per frame."""
+"""Compute means, intervals and tests against null maps from a long table of values per frame.
+
+The unit of intervals and tests is the scene. If there is only one scene, the unit is the trajectory (the part of
+frame_id before the last "/").
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +16,7 @@ from perilune_train.records.spread import MIN_UNITS, Array, Resamples, Rows, dra
 Signs = Mapping[tuple[str, str, str], float]
 """Sign of the mean on validation frames, 1 or -1, by task, measure and map."""
 LEVEL = 0.05
-"""False discovery rate."""
+"""Significance level, and false discovery rate of `against_nulls`."""
 UNDECIDED = f"undecided: fewer than {MIN_UNITS} scenes"
 UNDEFINED = "undefined: the mask is constant"
 BEATS = "beats every null"
@@ -24,12 +28,13 @@ _GROUP = ["task", "kind", "map", "measure"]
 
 
 def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """One row for each task, kind, map and measure: value, low, high, n_units, unit, undefined, count.
+    """Mean and interval of each measure of each map, in one row for each task, kind, map and measure.
 
-    `value` is the mean over the frames with a defined value. `low` and `high` are the ends of its 95 % interval, by
-    bootstrap over units; they are NaN with fewer than 5 units. The unit is the scene. If there is only one scene, the
-    unit is the trajectory, which is the part of frame_id before the last "/". `undefined` is the number of NaN among
-    the `count` values. For PAIRWISE measures, each pair of frames counts in both frames (`pairwise`).
+    - value: mean over the frames with a defined value
+    - low, high: ends of the 95 % interval of the mean, by bootstrap over units; NaN with fewer than 5 units
+    - n_units, unit: number and kind of units (scene, trajectory or image)
+    - undefined: number of NaN among the values
+    - count: number of values
     """
     rows = []
     for _, task in table.groupby("task", sort=False):
@@ -51,22 +56,22 @@ def validation_signs(table: pd.DataFrame) -> dict[tuple[str, str, str], float]:
 
 
 def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator, kind: str = "gate") -> pd.DataFrame:
-    """One row for each map of `kind` and each null that applies to it: the difference map - null, paired over frames.
+    """Difference between each map of `kind` and each null that applies to the map, paired over frames.
 
-    Columns: task, measure, map, null, value and null_value (means over all frames of the map), difference, low, high,
-    n_units, unit, p_bootstrap, p. The null "edge/stage_3" applies to the gates of stage 3, "untrained/B_11" to B_11,
-    and a name without "/" to all gates. Frames where the map or the null is undefined are left out. A null without any
-    value is left out.
+    Columns: task, measure, map, null, value and null_value (means of the map and of the null over their frames),
+    difference (mean of map - null over the frames where both are defined), low, high, n_units, unit, p_bootstrap, p.
+    The null "edge/stage_3" applies to the gates of stage 3, "untrained/B_11" to B_11, and a name without "/" to all
+    gates. A null without any value is left out.
 
     PCC1 may have either sign. The values of each map are therefore multiplied by the map's sign on validation frames
-    (`signs`), and no sign is chosen on the frames of the table.
+    (`signs`). No sign is chosen on the frames of the table.
 
-    Use p for decisions: it is from a one-sided sign-flip test over units, which is exact if differences are symmetric
-    around 0. The test uses all 2^S flips of S units for S up to 12, and 4096 flips for more. Its resolution is 2^-S:
-    0.031 with 5 scenes, 0.002 with 9 scenes.
+    Use p for decisions. It comes from a one-sided sign-flip test over units, which is exact if differences are
+    symmetric around 0. The test uses all 2^S flips of S units for S up to 12, and 4096 flips for more. Its resolution
+    is 2^-S: 0.031 with 5 scenes, 0.002 with 9 scenes.
 
-    p_bootstrap is one-sided too. It is (1 + the number of resampled differences that are at most 0) / 1001, resampled
-    over units. Its resolution is 0.001, but it reaches 0.001 by chance with probability 2^-S. With fewer than about 20
+    p_bootstrap is also one-sided: (1 + the number of resampled differences that are at most 0) / 1001, resampled over
+    units. Its resolution is 0.001, but it reaches 0.001 by chance with probability 2^-S. With fewer than about 20
     units, p_bootstrap is therefore too small.
 
     Raises ValueError if the sign of a PCC1 measure is missing.
@@ -96,11 +101,11 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
 
 
 def pairwise(measure: str, values: Array) -> Array:
-    """Values (N,) of frames, rescaled if PAIRWISE so that resampling units gives the spread of the mean.
+    """Values (N,) of frames; for PAIRWISE measures, with doubled deviations from the mean.
 
-    The mean over all pairs of frames is a U-statistic of order 2. A unit changes this mean by twice the deviation of
-    the unit's mean over pairs (Hoeffding 1948, doi 10.1214/aoms/1177730196). Deviations from the mean are therefore
-    doubled; the mean does not change.
+    Each pair of frames contributes to the values of both frames, so the mean is a U-statistic of order 2. A unit
+    changes this mean by twice the deviation of the unit's mean (Hoeffding 1948, doi 10.1214/aoms/1177730196). With
+    doubled deviations, resampling units gives the spread of the mean. The mean itself does not change.
     """
     if measure not in PAIRWISE:
         return values
@@ -108,7 +113,7 @@ def pairwise(measure: str, values: Array) -> Array:
 
 
 def unit_sign_flip_p(values: Array) -> float:
-    """One-sided p, by sign flips, of a mean above 0 for the values (U,) of independent units.
+    """One-sided p, by sign flips, of a mean above 0 of the values (U,) of independent units.
 
     Uses all 2^U flips for up to 12 units, else 4096 random flips with a fixed seed. Units with NaN are left out.
     Returns NaN if no unit has a value.
@@ -121,21 +126,24 @@ def unit_sign_flip_p(values: Array) -> float:
 
 
 def _flips(units: int, rng: np.random.Generator) -> Array:
-    """Signs, 1 or -1, of units (flips, units): all combinations, or 4096 of which the first row is all 1."""
+    """Signs, 1 or -1, (flips, units): all combinations, or 4096 random ones. The first row is all 1."""
     if 2**units <= _FLIPS:
         return 1.0 - 2.0 * (np.arange(2**units)[:, None] >> np.arange(units) & 1)
     return np.vstack([np.ones(units), rng.choice([-1.0, 1.0], (_FLIPS - 1, units))])
 
 
 def against_nulls(differences: pd.DataFrame) -> pd.DataFrame:
-    """One row for each task, measure and gate: value, n_units, unit, p, p_adjusted, beats_all, verdict.
+    """Test of each gate against all its nulls together, in one row for each task, measure and gate.
 
-    `differences` is the table of `null_differences`. p is the largest p over all nulls, which tests whether a gate
-    beats all nulls; it needs no correction for their number (Berger 1982, doi 10.1080/00401706.1982.10487790).
-    p_adjusted is corrected for the number of gates of the task and measure (Benjamini & Hochberg 1995, doi
-    10.1111/j.2517-6161.1995.tb02031.x); an undefined p counts as 1. A gate `beats_all` if p_adjusted is below 0.05, the
-    gate's mean exceeds the mean of each null, and at least 5 scenes have values. Trajectories of one scene do not
-    suffice.
+    `differences` is the table of `null_differences`. Columns: task, measure, map, value, n_units, unit, and
+
+    - p: largest p over all nulls; an undefined p counts as 1. It tests whether the gate beats all nulls, and needs no
+      correction for the number of nulls (Berger 1982, doi 10.1080/00401706.1982.10487790).
+    - p_adjusted: p, corrected for the number of gates of the task and measure (Benjamini & Hochberg 1995, doi
+      10.1111/j.2517-6161.1995.tb02031.x)
+    - beats_all: whether p_adjusted is below 0.05, each difference is above 0, and at least 5 scenes have values.
+      Trajectories of one scene do not suffice.
+    - verdict: the result as text
 
     With S scenes, p is at least 2^-S. With 9 scenes or more, a single gate out of 23 can pass alone. With 5 scenes, at
     least 15 gates must pass together.
@@ -168,9 +176,9 @@ class _Mean:
     value: float
     """Mean over frames."""
     low: float
-    """Lower end of the 95 % interval; NaN if there is none."""
+    """Lower end of the 95 % interval; NaN without an interval."""
     high: float
-    """Upper end of the 95 % interval; NaN if there is none."""
+    """Upper end of the 95 % interval; NaN without an interval."""
     n_units: int
     """Number of units with a value."""
     unit: str
@@ -202,7 +210,7 @@ class _Frames:
         return cls(pd.Index(ids), resamples, _flips(resamples.count, rng))
 
     def aligned(self, rows: pd.DataFrame) -> Array:
-        """Values (N,) of one map and measure; NaN where a frame has none."""
+        """Values (N,) of one map and measure, in the order of `ids`; NaN for a frame without a value."""
         values = rows["value"].to_numpy(np.float64)
         aligned = np.full(len(self.ids), np.nan)
         row_of_frame = self.ids.get_indexer(pd.Index(rows["frame_id"].astype(str)))
@@ -212,7 +220,7 @@ class _Frames:
         return aligned
 
     def mean(self, values: Array) -> _Mean:
-        """Mean of the defined values (N,) and its interval; no interval for images, which are not independent."""
+        """Mean of the defined values (N,), with an interval unless units are images, which are not independent."""
         rows = np.flatnonzero(np.isfinite(values))
         spread = spreads(lambda drawn: {"mean": _ratio(drawn, rows, values)}, rows, self.resamples)["mean"]
         unit, n_units = self.resamples.unit, len(np.unique(self.resamples.of_row[rows]))
@@ -220,7 +228,7 @@ class _Frames:
         return _Mean(_mean(values), low, high, n_units, unit)
 
     def bootstrap_p(self, values: Array) -> float:
-        """One-sided p of a mean above 0 of the defined values (N,), by bootstrap; NaN with fewer than 5 units."""
+        """One-sided p, by bootstrap, of a mean above 0 of the values (N,); NaN with fewer than 5 units."""
         rows = self._tested(values)
         if not len(rows):
             return float("nan")
@@ -228,7 +236,7 @@ class _Frames:
         return float((1 + (drawn <= 0).sum()) / (1 + len(drawn)))
 
     def sign_flip_p(self, values: Array) -> float:
-        """One-sided p of a mean above 0 of the defined values (N,), by sign flips; NaN with fewer than 5 units."""
+        """One-sided p, by sign flips, of a mean above 0 of the values (N,); NaN with fewer than 5 units."""
         rows = self._tested(values)
         if not len(rows):
             return float("nan")

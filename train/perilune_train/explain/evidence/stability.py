@@ -1,4 +1,4 @@
-"""Measure how similar masks stay under noise, shifts and another lens, and between two renderings of the poses."""
+"""Measure how similar masks stay if images change: noise, shifts, another lens, another rendering."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ class Changes:
     shifts_px: tuple[tuple[int, int], ...] = ((1, 0), (0, 1), (3, -2))
     """Shifts to the right and down, pixels."""
     lenses: tuple[float, ...] = (-0.05, 0.05)
-    """Radial distortions: relative change of the distance from the centre at half the image width. Negative values are
-    barrel distortion."""
+    """Radial distortions: relative change of the distance from the centre, at half the image width from the centre.
+    Negative values are barrel distortion."""
 
 
 DEFAULT_CHANGES = Changes()
@@ -35,7 +35,7 @@ def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) 
 
 
 def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
-    """Images (..., height, width) moved dx pixels to the right and dy down; edge pixels fill the gap."""
+    """Images (..., height, width) moved dx pixels to the right and dy pixels down; edge pixels fill the gap."""
     height, width = images.shape[-2:]
     rows = np.clip(np.arange(height) - dy, 0, height - 1)
     columns = np.clip(np.arange(width) - dx, 0, width - 1)
@@ -43,10 +43,10 @@ def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
 
 
 def lens_map(height: int, width: int, distortion: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Columns and rows (height, width) in the original image of the pixels seen through another lens.
+    """For each pixel of an image through another lens: the column and row (height, width) in the original image.
 
-    r = r' (1 - distortion r'^2), where r' is the distance from the image centre under the new lens and r under the
-    original lens, both in half widths. Coordinate 0 is the centre of the first pixel, as in cv2.remap.
+    r = r' (1 - distortion r'^2). r is the distance from the image centre in the original image and r' the distance in
+    the new image, both in half image widths. Coordinate 0 is the centre of the first pixel, as in cv2.remap.
     """
     x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
     factor = 1 - distortion * (x**2 + y**2) / (width / 2) ** 2
@@ -61,12 +61,12 @@ def stability(
     changes: Changes = DEFAULT_CHANGES,
     stacked: int = 1,
 ) -> pd.DataFrame:
-    """Pearson correlation of the masks of images (N, height, width) with the masks of the changed images.
+    """Pearson correlation between the masks of images (N, height, width) and the masks of the changed images.
 
     Columns: map, change ("noise 2 DN", "shift 3 -2 px", "lens -5 %"), frame_index, pearson (NaN if a mask is constant).
-    A shift is undone before masks are compared over the pixels that both images show. For another lens, the image and
-    the mask of the original image are resampled (`lens_map`). `stacked` is the number of frames stacked in height in
-    each image; each frame is changed separately.
+    A shift of the masks is undone before the comparison. For another lens (`lens_map`), the original masks are
+    resampled as the images are. Only pixels that both images show are compared. `stacked` is the number of frames that
+    are stacked in height in each image; each frame is changed separately.
     """
     before = masks_of(images)
     tables = []
@@ -104,9 +104,9 @@ def stability(
 def between(
     masks_a: Mapping[str, NDArray[np.floating]], masks_b: Mapping[str, NDArray[np.floating]], change: str
 ) -> pd.DataFrame:
-    """Pearson correlation between masks (N, height, width) of poses that are rendered twice.
+    """Pearson correlation between the masks (N, height, width) of two renderings of the same poses.
 
-    Columns as in `stability`, with `change` as the change's name.
+    The columns are as in `stability`; `change` is the value of the column change.
     """
     return _compared(masks_a, masks_b, change, None)
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 import pandas as pd
 
 TABLES = ("values", "summary", "differences", "tested", "gates", "removal", "randomisation", "stability")
-"""Tables of `Evidence` in the order in which they are computed; each is written as <name>.parquet."""
+"""Fields of `Evidence` that are tables; each table is written as <name>.parquet."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Tables of one network, each with a column `task`."""
+    """Tables of one network. `with_task` adds the column `task` where it is missing."""
 
     values: pd.DataFrame
     """Values of each image: kind, map, measure, frame_id, scene_id, value."""
@@ -31,7 +31,7 @@ class Evidence:
     signs: dict[str, int] = field(default_factory=dict)
     """Sign of each map's craterness on validation images."""
     strongest: str = ""
-    """The gate up to stride 8 with the strongest craterness on validation images."""
+    """The gate up to stride 8 with the strongest craterness (navigator: largest PCC4) on validation images."""
 
     def with_task(self, task: str) -> dict[str, pd.DataFrame]:
         """All tables by name, with the column `task` first."""

@@ -1,6 +1,6 @@
 """Compute attribution maps of the detector by Grad-CAM, integrated gradients and occlusion (Captum).
 
-All maps are float32 (N, height, width) and as large as the given frames. Frames are normalised, so 0 is the mean grey
+All maps are float32 (N, height, width), as large as the frames. Frames must be normalised, so that 0 is the mean grey
 of each frame. The baseline of integrated gradients and of occlusion is 0.
 """
 
@@ -19,7 +19,7 @@ from perilune_train.models.yolo import YOLOv3
 
 
 class DetectorTarget(nn.Module):
-    """Sum of the objectness of the predictors that score at least `min_score` on the unchanged image.
+    """Module that sums the objectness of the predictors that score at least `min_score` on the unchanged image.
 
     The best predictor of an image is always in the sum. The network must be in evaluation mode.
     """
@@ -37,7 +37,7 @@ class DetectorTarget(nn.Module):
 
     @property
     def last_layer(self) -> nn.Module:
-        """The features before the head of the finest stride, on which Grad-CAM is computed by default."""
+        """The layer before the head of the finest stride, the default layer of Grad-CAM."""
         return self.network.branches[str(self.network.strides[0])]
 
     def scores(self, grey: Tensor) -> Tensor:
@@ -47,7 +47,7 @@ class DetectorTarget(nn.Module):
 
     @torch.no_grad()
     def fixed(self, grey: Tensor) -> tuple[Tensor, ...]:
-        """Mask (N, K) of the predictors in the sum; it stays fixed while the images are changed."""
+        """Mask (N, K) of the predictors in the sum. Keep this mask while the images are changed."""
         scores = self.scores(grey)
         return ((scores >= self.min_score) | (scores == scores.amax(1, keepdim=True)),)
 
@@ -57,7 +57,7 @@ class DetectorTarget(nn.Module):
 
 
 def last_of_stage(backbone: AttentionDarknet53, stage: int) -> nn.Module:
-    """Last residual unit of a stage 1..5 of a backbone, or the attention after it."""
+    """Last residual unit of a stage 1..5 of a backbone, or the attention gate after this unit if there is one."""
     name = f"B_{stage}{UNITS[stage - 1]}"
     return backbone.attentions[name] if name in backbone.attentions else backbone.units[name]
 
@@ -65,32 +65,33 @@ def last_of_stage(backbone: AttentionDarknet53, stage: int) -> nn.Module:
 def grad_cam(target: DetectorTarget, frames: NDArray[np.float32], stage: int | None = None) -> NDArray[np.float32]:
     """Grad-CAM (N, height, width) of normalised frames, on the last layer of a stage 1..5, resized to the frames.
 
-    Selvaraju et al. 2017, doi 10.1109/ICCV.2017.74, with their ReLU. The default layer is `target.last_layer`. A map is
-    zero everywhere if every weighted sum is negative; this happens on stage 2 of the installed detector.
+    Selvaraju et al. 2017, doi 10.1109/ICCV.2017.74, with their ReLU. Without a stage, the layer is `target.last_layer`.
+    A map is zero everywhere if every weighted sum is negative; this happens on stage 2 of the installed detector.
     """
     method = LayerGradCam(target, target.last_layer if stage is None else last_of_stage(target.backbone, stage))
 
-    def one(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
+    def attribution(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
         return method.attribute(grey, additional_forward_args=fixed, relu_attributions=True)
 
-    return _each(target, frames, one)
+    return _each(target, frames, attribution)
 
 
 def integrated_gradients(
     target: DetectorTarget, frames: NDArray[np.float32], n_steps: int = 16, signed: bool = False
 ) -> NDArray[np.float32]:
-    """Absolute integrated gradients (N, height, width) of normalised frames; the path is from mean grey to the frame.
+    """Absolute integrated gradients (N, height, width) of normalised frames.
 
-    Sundararajan et al. 2017, arXiv 1703.01365, by Gauss-Legendre quadrature with `n_steps` points. With `signed` the
-    sign is kept, and the sum over pixels is the change of the target from mean grey to the frame.
+    Sundararajan et al. 2017, arXiv 1703.01365, by Gauss-Legendre quadrature with `n_steps` points on the path from mean
+    grey to the frame. With `signed` the sign is kept, and the sum over pixels is the change of the target along this
+    path.
     """
     method = IntegratedGradients(target)
 
-    def one(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
+    def attribution(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
         gradients = method.attribute(grey, additional_forward_args=fixed, n_steps=n_steps, internal_batch_size=_BATCH)
         return gradients if signed else gradients.abs()
 
-    return _each(target, frames, one)
+    return _each(target, frames, attribution)
 
 
 def occlusion(
@@ -103,7 +104,7 @@ def occlusion(
     """
     method = Occlusion(target)
 
-    def one(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
+    def attribution(grey: Tensor, fixed: tuple[Tensor, ...]) -> Tensor:
         return method.attribute(
             grey,
             sliding_window_shapes=(1, window_px, window_px),
@@ -112,7 +113,7 @@ def occlusion(
             perturbations_per_eval=_BATCH,
         )
 
-    return _each(target, frames, one)
+    return _each(target, frames, attribution)
 
 
 _BATCH = 8
@@ -124,7 +125,7 @@ class _Method(Protocol):
 
 
 def _each(target: DetectorTarget, frames: NDArray[np.float32], method: _Method) -> NDArray[np.float32]:
-    """Maps of all frames, one frame at a time, resized to the frames."""
+    """Apply `method` to one frame after the other; returns the maps (N, height, width), resized to the frames."""
     device = next(target.backbone.parameters()).device
     height, width = frames.shape[1:]
     maps = np.empty(frames.shape, np.float32)

@@ -28,7 +28,7 @@ def edge_map(images: Images) -> Map:
 
 
 def contrast_map(images: Images) -> Map:
-    """Standard deviation of brightness (N, height, width) in a square window of 9 px of images (N, height, width)."""
+    """Local standard deviation (N, height, width) of the brightness of images, in windows of 9 x 9 px."""
     window = (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX)
     contrasts = []
     for image in images.astype(np.float64) / 255:
@@ -38,9 +38,9 @@ def contrast_map(images: Images) -> Map:
 
 
 def gradient_map(images: Images) -> Map:
-    """Magnitude (N, height, width) of the gradient of images (N, height, width) smoothed by a Gaussian of 2 px.
+    """Magnitude (N, height, width) of the gradient of images, after smoothing by a Gaussian of 2 px.
 
-    Less sensitive to sensor noise than `edge_map`.
+    This map is less sensitive to sensor noise than `edge_map`.
     """
     return np.stack(
         [_magnitude(cv2.GaussianBlur(image, (0, 0), GRADIENT_SIGMA_PX)) for image in brightness_map(images)]
@@ -56,11 +56,11 @@ BASELINES: dict[str, Callable[[Images], Map]] = {
 
 
 def baseline_maps(images: Images, px_per_input_px: float = 1.0) -> Masks:
-    """Every baseline of images (N, height, width) at the resolution of each stage: "edge/stage_1", "edge/stage_2", ...
+    """Every baseline of images (N, height, width) at the resolution of each stage, named "edge/stage_1" and so on.
 
-    A smooth map correlates better with the smooth ground truth than a sharp map. Each baseline is therefore averaged to
-    the resolution of the stage's feature map (stride 2 to 32) and enlarged as the masks are. `px_per_input_px` is the
-    width of the images divided by the width of the network's input.
+    A smooth map correlates better with the smooth ground truth than a sharp map. For a fair comparison with masks, each
+    baseline is averaged to the resolution of the stage's feature map (stride 2 to 32) and enlarged again, as masks are.
+    `px_per_input_px` is the width of the images divided by the width of the network's input.
     """
     maps: Masks = {}
     for name, function in BASELINES.items():

@@ -17,11 +17,10 @@ _WHITE = (255, 255, 255)
 
 
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Sequence[float]) -> None:
-    """Draw a PNG sheet: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
+    """Draw a PNG sheet of images (N, height, width), each followed by its masks, and one colour bar.
 
-    `height_m` is the height of each frame's camera, metres, which is written below the frame. All masks of the sheet
-    share one scale, from the smallest to the largest value. The range of each mask, or "constant" if the mask does not
-    vary, is written below the mask.
+    `height_m` is the height of each image's camera, metres; it is written below the image. All masks share one colour
+    scale, from the smallest to the largest value. The range of each mask, or "constant", is written below the mask.
     """
     low = min(float(gate_masks.min()) for gate_masks in masks.values())
     high = max(float(gate_masks.max()) for gate_masks in masks.values())
@@ -48,13 +47,13 @@ def caption(block: str, mask: NDArray[np.floating]) -> str:
 
 
 def _coloured(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
-    """Convert values to colours of the sheet's scale, (height, width, 3) BGR."""
+    """Colours (height, width, 3), BGR, of values (height, width) on the scale from `low` to `high`."""
     level = np.clip(255 * (values - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS), np.uint8)
 
 
 def _colour_bar(width_px: int, low: float, high: float) -> NDArray[np.uint8]:
-    """Colour bar of the sheet's scale with five values below it, as wide as the sheet."""
+    """Colour bar of the scale from `low` to `high`, with five values below it."""
     margin = 40
     bar = np.tile(np.linspace(low, high, width_px - 2 * margin), (16, 1))
     picture = cv2.copyMakeBorder(_coloured(bar, low, high), 10, 24, margin, margin, cv2.BORDER_CONSTANT, value=_WHITE)

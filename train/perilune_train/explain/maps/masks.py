@@ -1,4 +1,4 @@
-"""Compute spatial attention masks of trained networks, and write them to a file for an image viewer."""
+"""Compute spatial attention masks of trained networks, and write them to a file for the viewer of the report."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,11 +20,14 @@ Masks = dict[str, NDArray[np.float32]]
 
 _BATCH = 8
 MAX_PX = 64
-"""Largest width of a stored mask, pixels. Native masks of deep gates are smaller."""
+"""Largest width of a stored mask, pixels. Masks of deep gates are stored at their lower resolution."""
 
 
 def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
-    """Attention masks (N, height, width) of the detector for frames (N, height, width)."""
+    """Attention masks (N, height, width) of the detector for frames (N, height, width).
+
+    Raises UserError, which names the checkpoint `where`, if the detector has no attention gates.
+    """
     backbone = detector.backbone
     channels = next(backbone.parameters()).shape[1]
     device = next(backbone.parameters()).device
@@ -41,7 +44,11 @@ def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> 
 
 
 def navigator_masks(navigator: StackNavigator, pairs: NDArray[np.uint8], size_px: int, where: Path) -> Masks:
-    """Masks (N, 2 height, width) of pairs (N, 2 height, width), earlier frame above; the input is `size_px` wide."""
+    """Attention masks (N, 2 height, width) of the stack navigator for pairs (N, 2 height, width) of frames.
+
+    The earlier frame is above the later frame. `size_px` is the width of the network's input. Raises UserError, which
+    names the checkpoint `where`, if the navigator has no attention gates.
+    """
     device = next(navigator.parameters()).device
     first, second = stacked_input(pairs, size_px)
     inputs = [
@@ -55,7 +62,7 @@ def navigator_masks(navigator: StackNavigator, pairs: NDArray[np.uint8], size_px
 
 
 def stacked_input(pairs: NDArray[np.uint8], size_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Earlier and later frames (N, height, size_px) of pairs (N, 2 height, width), shrunk and normalised."""
+    """Earlier and later frames of pairs (N, 2 height, width), shrunk to the width size_px and normalised."""
     first, second = np.split(pairs, 2, axis=1)
     size = size_px, round(first.shape[1] * size_px / first.shape[2])
 
@@ -80,9 +87,10 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
 
 
 def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
-    """Write an .npz file with frame_ids (N,), blocks (B,), low (B,), high (B,), and uint8 masks (N, h, w) by block.
+    """Write an .npz file with frame_ids (N,), blocks (B,), low (B,), high (B,), and the masks of each block.
 
-    Values 0 to 255 represent the range `low` to `high` of the block's masks (N, height, width).
+    `masks` has arrays (N, height, width) by block, the name of a gate. They are stored as uint8 (N, h, w) under the
+    name of the block, at reduced size. Values 0 to 255 represent the range from `low` to `high` of the block's masks.
     """
     arrays: dict[str, np.ndarray] = {}
     for block, block_masks in masks.items():

@@ -1,4 +1,4 @@
-"""Bar charts of every gate: correlations with intervals and nulls, effects of forced gates, randomised weights."""
+"""Charts of all gates: correlations with nulls, harm of interventions, similarity of masks, localisation."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,16 +21,17 @@ _MARKERS = {
     "other pair": ("x", "#CC79A7"),
     "permutation": ("+", "#56B4E9"),
 }
+"""Marker and colour of each null."""
 
 
 def draw_correlations(
     path: Path, summary: pd.DataFrame, differences: pd.DataFrame, tested: pd.DataFrame, measures: Mapping[str, str]
 ) -> None:
-    """Draw one row for each measure: bars of the gates with 95 % intervals, and the means of their nulls as markers.
+    """Draw each measure in one row: the gates as bars with 95 % intervals, the means of their nulls as markers.
 
-    A filled bar beats every null, an open one does not; a missing bar means that the mask is constant in every image.
-    PCC1 of nulls is drawn with the expected sign of the gate, so that magnitudes can be compared. `measures` maps
-    names to labels; the three tables are those of `Evidence`.
+    The bar of a gate that beats every null is filled; the other bars are open. A bar is missing if the mask is constant
+    in every image. For PCC1, a gate and its nulls are drawn on the same side of 0, so that magnitudes can be compared.
+    `measures` maps names of measures to axis labels. The three tables are fields of `Evidence`.
     """
     figure = Figure(figsize=(12, 3.3 * len(measures)), layout="constrained")
     axes = np.atleast_1d(figure.subplots(len(measures), 1))
@@ -62,7 +63,7 @@ def draw_correlations(
 
 
 def _draw_nulls(axis: Axes, gates: pd.DataFrame, differences: pd.DataFrame) -> None:
-    # A gate whose expected sign is -1 is drawn below 0; so are its nulls.
+    # The bar of a gate with a negative PCC1 is below 0. Null values are above 0 (times their sign): move them below 0.
     side = (
         np.where(gates["value"] < 0, -1.0, 1.0) if gates["measure"].iloc[0].startswith("pcc1") else np.ones(len(gates))
     )
@@ -73,7 +74,7 @@ def _draw_nulls(axis: Axes, gates: pd.DataFrame, differences: pd.DataFrame) -> N
 
 
 def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
-    """Draw the mean harm of forcing each gate, each stage and all gates to their means; dots are means per scene."""
+    """Draw the harm of forcing each gate, each stage and all gates to their means: means as bars, scenes as dots."""
     harm = (gates["before"] - gates["after"]) * (1 if higher_is_better else -1)
     table = gates.assign(harm=harm)
     scopes = list(dict.fromkeys(table["scope"]))
@@ -93,7 +94,7 @@ def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: boo
 
 
 def draw_removal(path: Path, removal: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
-    """Draw the mean harm of removing pixels, by map and fill method, for the four choices of pixels."""
+    """Draw the mean harm of removing pixels, by map and filling, for four choices of pixels."""
     harm = (removal["before"] - removal["after"]) * (1 if higher_is_better else -1)
     means = removal.assign(harm=harm).groupby(["map", "how", "which"], sort=False)["harm"].mean()
     groups = list(dict.fromkeys((name, how) for name, how, _ in means.index))
@@ -118,7 +119,7 @@ def draw_removal(path: Path, removal: pd.DataFrame, unit: str, higher_is_better:
 
 
 def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
-    """Draw the rank correlation of each gate's mask with the trained mask as stages are randomised in both orders."""
+    """Draw the rank correlation of each gate's mask with the trained mask as more stages are randomised."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     for axis, (direction, rows) in zip(
         figure.subplots(1, 2), randomisation.groupby("direction", sort=False), strict=True
@@ -133,7 +134,7 @@ def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
 
 
 def draw_stability(path: Path, stability: pd.DataFrame) -> None:
-    """Draw the mean correlation of each gate's mask before and after each change of the image."""
+    """Draw the mean correlation between each gate's masks before and after each change of the image."""
     table = stability.pivot_table(index="change", columns="map", values="pearson", sort=False, dropna=False)
     figure = Figure(figsize=(3 + 0.55 * table.shape[1], 3.6), layout="constrained")
     axis = figure.subplots()
@@ -153,7 +154,7 @@ def draw_localisation(path: Path, summary: pd.DataFrame) -> None:
     """Draw the ROC-AUC of every map on crater pixels: gates, nulls and attribution methods; chance is 0.5."""
     rows = summary[summary["measure"] == "auc"]
     for null in ("untrained", "other frame"):
-        # There is one of these nulls for each gate: draw the strongest.
+        # These nulls have one map for each gate. Draw only the map with the largest value.
         is_null = rows["map"].str.startswith(f"{null}/")
         best = rows.loc[is_null, "value"].max()
         rows = rows[~is_null | (rows["value"] == best)]

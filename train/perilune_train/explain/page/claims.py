@@ -1,4 +1,4 @@
-"""Claims about the gates of a run, each with figure, interval, nulls, verdict and picture."""
+"""Claims about attention gates, each with figure, interval, nulls, verdict and picture."""
 
 import math
 from collections.abc import Collection
@@ -16,9 +16,11 @@ from perilune_train.records.spread import MIN_UNITS
 MIN_DEVIATION = 0.02
 """Smallest standard deviation, over pixels and images, at which a mask does not count as constant."""
 _REMOVES = "removing the 20 %"
+"""Words by which `headline` recognises the claim on removed pixels."""
 STILL_FROM = 37
-"""The paper states that PCC4 is above PCC3 up to B_36, and below PCC3 from B_37 on."""
+"""Number of the gate B_37. The paper states that PCC4 is above PCC3 up to B_36, and below PCC3 from B_37 on."""
 DEEP_GATES = tuple(f"B_4{k}" for k in (8,)) + tuple(f"B_5{k}" for k in (1, 2, 3, 4))
+"""Gates for which the paper reports a PCC2 above `DEEP_ALIKE`."""
 DEEP_ALIKE = 0.75
 LOCALISATION = {"auc": "ROC-AUC", "relevance_mass": "relevance mass", "pointing": "pointing game"}
 """Localisation measures and their display names."""
@@ -28,10 +30,10 @@ HARM_RATIO = 3.0
 
 @dataclass(frozen=True)
 class Claim:
-    """One statement; all fields are texts for a table."""
+    """One statement and its verdict; all fields are texts for a table."""
 
     claim: str
-    """The statement, and its author."""
+    """The statement, with "Paper:" in front if the paper states it."""
     figure: str
     """The measured figure."""
     interval: str
@@ -41,7 +43,7 @@ class Claim:
     verdict: str
     """holds, does not hold, or undecided, with the reason."""
     picture: str
-    """File name of the picture that shows it."""
+    """File name of the picture that shows the figure."""
 
     def plain(self) -> dict[str, str]:
         """The fields as plain data."""
@@ -49,32 +51,33 @@ class Claim:
 
 
 def decided(holds: bool, scenes: int) -> str:
-    """The verdict on a statement that was measured over a number of scenes."""
+    """The verdict "holds" or "does not hold"; undecided with fewer than five scenes."""
     return UNDECIDED if scenes < MIN_UNITS else "holds" if holds else "does not hold"
 
 
 def row_of(evidence: Evidence, measure: str, name: str) -> pd.Series:
-    """The row of the summary of a map and measure."""
+    """The row of the summary for a measure and the map `name`."""
     rows = evidence.summary[(evidence.summary["measure"] == measure) & (evidence.summary["map"] == name)]
     return rows.iloc[0]
 
 
 def interval_text(row: pd.Series) -> str:
-    """Text with the interval and the units of a row of the summary, or that there is no interval."""
+    """The interval of a row of the summary and its number of units, as text; "none" without an interval."""
     if math.isfinite(row["low"]) and math.isfinite(row["high"]):
         return f"{row['low']:.2f} to {row['high']:.2f} ({row['n_units']} units: {row['unit']})"
     return f"none: {row['n_units']} units ({row['unit']})"
 
 
 def scenes_of(rows: pd.DataFrame) -> int:
-    """The number of scenes in rows of a summary; 1 if the units are trajectories of one scene."""
+    """The smallest number of scenes in rows of a summary; 1 if the units are not scenes."""
     return int(rows["n_units"].min()) if len(rows) and (rows["unit"] == "scene").all() else 1
 
 
 def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Collection[str] = ()) -> list[Claim]:
-    """Claims about the detector; `deviations` are the standard deviations of the masks over pixels and images.
+    """Claims about the detector.
 
-    `guided` are gates whose masks were trained to follow labels; the claims mention this.
+    `deviations` are the standard deviations of the masks over pixels and images. `guided` are gates whose masks were
+    trained to follow labels; claims on these gates say so.
     """
     strongest = evidence.strongest
     follows = f"Detector: the mask of {strongest} follows craters"
@@ -94,7 +97,7 @@ def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Co
 
 
 def navigator_claims(evidence: Evidence, deviations: dict[str, float]) -> list[Claim]:
-    """Claims about the stack navigator."""
+    """Claims about the stack navigator; `deviations` are the standard deviations of the masks."""
     strongest, unit = evidence.strongest, "position error of a pair, m"
     alike = f"Navigator: both halves of the mask of {strongest} mark the same ground (PCC4)"
     return [
@@ -108,7 +111,7 @@ def navigator_claims(evidence: Evidence, deviations: dict[str, float]) -> list[C
 
 
 def headline(claims: list[Claim]) -> str:
-    """One sentence for each task: whether its strongest gate beats every null, and whether removal hurts enough."""
+    """One sentence for each network: the verdicts on its strongest gate and on the removal of the gate's pixels."""
     sentences = []
     for task in ("Detector", "Navigator"):
         task_claims = [claim for claim in claims if claim.claim.startswith(task)]
@@ -138,7 +141,7 @@ def _constant(task: str, deviations: dict[str, float], picture: str) -> Claim:
 
 
 def against_nulls(evidence: Evidence, measure: str, gate: str, claim: str, picture: str) -> Claim:
-    """Whether a gate beats every null in a measure."""
+    """A claim about one gate, with the verdict whether the gate beats every null in a measure."""
     row = row_of(evidence, measure, gate)
     tested = evidence.tested[(evidence.tested["measure"] == measure) & (evidence.tested["map"] == gate)]
     verdict = "undefined: no null has a value" if tested.empty else str(tested.iloc[0]["verdict"])
@@ -148,7 +151,7 @@ def against_nulls(evidence: Evidence, measure: str, gate: str, claim: str, pictu
 
 
 def null_means(evidence: Evidence, measure: str, gate: str) -> str:
-    """Means of a gate's nulls, as text. A null whose map is constant in every image is undefined and not tested."""
+    """Means of a gate's nulls, as text. A null is undefined and not tested if its map is constant in every image."""
     rows = evidence.differences[(evidence.differences["measure"] == measure) & (evidence.differences["map"] == gate)]
     texts = [f"{row.null} {row.null_value:.2f}" for row in rows.itertuples()]
     values = evidence.values[(evidence.values["measure"] == measure) & (evidence.values["map"] == f"untrained/{gate}")]
@@ -158,7 +161,7 @@ def null_means(evidence: Evidence, measure: str, gate: str) -> str:
 
 
 def shallow(evidence: Evidence) -> Claim:
-    """Whether each stage up to stride 8 has a gate that follows craters and beats every null."""
+    """The claim that every stage up to stride 8 has a gate that follows craters and beats every null."""
     tested = evidence.tested[(evidence.tested["measure"] == "pcc1_craterness")]
     shallow_gates = tested[tested["map"].str[2].isin(["1", "2", "3"])]
     beating = beating_gates(evidence, "pcc1_craterness")
@@ -175,13 +178,13 @@ def shallow(evidence: Evidence) -> Claim:
 
 
 def beating_gates(evidence: Evidence, measure: str, stages: str = "123") -> list[str]:
-    """Gates of the given stages that beat every null in a measure, corrected for the number of gates."""
+    """Gates of the given stages that beat every null in a measure, after correction for the number of gates."""
     rows = evidence.tested[(evidence.tested["measure"] == measure) & evidence.tested["beats_all"]]
     return rows.loc[rows["map"].str[2].isin(list(stages)), "map"].tolist()
 
 
 def deep_alike(evidence: Evidence) -> Claim:
-    """Whether deep masks of different frames are similar, as the paper claims."""
+    """The paper's claim that the deep masks of different frames are similar."""
     gates = [gate for gate in DEEP_GATES if gate in set(evidence.summary["map"])]
     rows = [row_of(evidence, "pcc2", gate) for gate in gates]
     values = [float(row["value"]) for row in rows]
@@ -207,10 +210,10 @@ def _null_value(evidence: Evidence, measure: str, gate: str, null: str) -> float
 
 
 def located(evidence: Evidence, measure: str) -> Claim:
-    """Whether the strongest gate locates craters better than its nulls and the attribution methods.
+    """The claim that the strongest gate locates craters better than its nulls and the attribution methods.
 
-    Each method is compared with the gate over the frames that have the method's map, paired, by sign flips of scenes.
-    With fewer than five such scenes, the comparison is undecided.
+    The gate is compared with each method on the frames that have the method's map, by a paired sign-flip test over
+    scenes. The comparison is undecided with fewer than five scenes.
     """
     gate = evidence.strongest
     row = row_of(evidence, measure, gate)
@@ -239,7 +242,7 @@ def located(evidence: Evidence, measure: str) -> Claim:
 
 
 def _paired(evidence: Evidence, measure: str, gate: str, name: str) -> tuple[float, float, int]:
-    """Mean of an attribution method, p of "the gate is better" over its frames, and the number of scenes."""
+    """Mean of an attribution method, p of the test that the gate is better, and the number of scenes."""
     rows = evidence.values[evidence.values["measure"] == measure]
     table = rows[rows["map"].isin([gate, name])].pivot_table(
         index=["scene_id", "frame_id"], columns="map", values="value", aggfunc="first"
@@ -252,7 +255,7 @@ def _paired(evidence: Evidence, measure: str, gate: str, name: str) -> tuple[flo
 
 
 def motion(evidence: Evidence, *, moving: bool) -> Claim:
-    """Whether PCC4 - PCC3 has the sign that the paper states, for gates up to B_36 (`moving`) or from B_37 on."""
+    """The paper's claim on the sign of PCC4 - PCC3, for gates up to B_36 (`moving`) or from B_37 on."""
     rows = evidence.summary[(evidence.summary["measure"] == "pcc4_minus_pcc3") & (evidence.summary["kind"] == "gate")]
     number = rows["map"].str[2:].astype(int)
     rows = rows[number < STILL_FROM] if moving else rows[number >= STILL_FROM]
@@ -284,14 +287,14 @@ def motion(evidence: Evidence, *, moving: bool) -> Claim:
 
 
 def removal_row(evidence: Evidence, *, higher_is_better: bool) -> pd.Series:
-    """Harm of removing the strongest gate's pixels (a row of `removal_summary`), for the less favourable filling."""
+    """The row of `removal_summary` for the strongest gate and its filling with the lower ratio."""
     table = removal_summary(evidence.removal, higher_is_better)
     rows = table[table["map"] == evidence.strongest]
     return rows.iloc[int(np.argmin(rows["ratio"].fillna(-np.inf).to_numpy()))]
 
 
 def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
-    """Whether removing attended pixels does at least HARM_RATIO times as much harm as the stronger control."""
+    """The claim that removing attended pixels harms at least HARM_RATIO times as much as the stronger control."""
     row = removal_row(evidence, higher_is_better=higher_is_better)
     controls = (
         f"random {row['random']:.3f}, same shape elsewhere {row['shifted']:.3f}, least attended {row['least']:.3f}"
@@ -315,13 +318,13 @@ def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, hig
 
 
 def forced_harm(evidence: Evidence, *, higher_is_better: bool) -> dict[str, float]:
-    """Mean harm, over frames, of forcing each gate, each stage and all gates to their means, by name."""
+    """Harm of forcing each gate, each stage and all gates to their means, by name; means over frames."""
     harm = _harms(evidence, higher_is_better).groupby("scope", sort=False)["harm"].mean()
     return {str(scope): float(value) for scope, value in harm.items()}
 
 
 def forced_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
-    """Whether the output gets worse if all gates are forced to their means."""
+    """The claim that the output gets worse if all gates are forced to their means."""
     harm = forced_harm(evidence, higher_is_better=higher_is_better)
     single = pd.Series({scope: value for scope, value in harm.items() if scope.startswith("B_")}).dropna()
     table = _harms(evidence, higher_is_better)

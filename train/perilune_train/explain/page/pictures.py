@@ -36,19 +36,17 @@ _NAVIGATE = {
 }
 _SHARED = {
     "masks": "Attention masks of all gates on one scale, at high, middle and low altitude of one descent.",
-    "pcc": "Correlations of all gates, with 95 % intervals over scenes where there are five or more. Filled bars beat"
-    " every null; markers are nulls.",
+    "pcc": "Correlations of all gates, with 95 % intervals if there are five or more scenes. The gates of filled bars"
+    " beat every null. Markers: nulls.",
     "gates": "Harm of forcing masks to their means: single gates, stages, all gates. Dots: scenes.",
     "removal": "Harm of replacing a share of the pixels: most attended, two controls, least attended.",
-    "randomisation": "Similarity of masks to the trained ones when stages get random weights, from the top and from the"
-    " bottom.",
+    "randomisation": "Similarity of the masks to the trained masks after stages got random weights, from the top and"
+    " from the bottom.",
     "stability": "Mean correlation of the masks before and after a change of the image: noise, shift or another lens.",
     "before_after": "One image after inpainting: the most attended pixels, random pixels of equal brightness, the same"
     " shape elsewhere, the least attended pixels.",
 }
-_LOCALISATION = (
-    "ROC-AUC of maps on crater pixels (chance: 0.5). Blue: gates, grey: image maps, orange: attribution methods."
-)
+_LOCALISATION = "ROC-AUC of maps on crater pixels (chance: 0.5). Blue: gates, grey: nulls, orange: attribution methods."
 CAPTIONS = {f"{name}_{task}.png": text for task in ("detect", "navigate") for name, text in _SHARED.items()} | {
     "localisation_detect.png": _LOCALISATION
 }
@@ -84,7 +82,8 @@ def draw_detector(
 ) -> None:
     """Draw all pictures of the detector into a folder.
 
-    `n_drawn` frames of the descent are drawn, from the highest to the lowest, and the middle one of `frames`.
+    Masks are drawn for `n_drawn` frames of the descent, from the highest to the lowest. Removed pixels are drawn for
+    the middle frame of `frames`.
     """
     images = descent.images
     drawn = evenly_spaced(len(images.images), settings.n_drawn)
@@ -99,7 +98,10 @@ def draw_detector(
 def draw_navigator(
     folder: Path, settings: ExplainConfig, evidence: Evidence, pairs: Masked[Pairs], descent: Masked[Pairs]
 ) -> None:
-    """Draw all pictures of the navigator into a folder: all pairs of `descent`, and the middle one of `pairs`."""
+    """Draw all pictures of the navigator into a folder.
+
+    Masks are drawn for all pairs of `descent`, removed pixels for the middle pair of `pairs`.
+    """
     draw_masks(folder / "masks_navigate.png", descent.images.images, descent.masks, descent.images.height_m)
     draw_correlations(folder / "pcc_navigate.png", evidence.summary, evidence.differences, evidence.tested, _NAVIGATE)
     _draw_interventions(folder, "navigate", evidence, "increase of the position error, m", higher_is_better=False)
@@ -123,8 +125,9 @@ def _draw_interventions(folder: Path, task: str, evidence: Evidence, unit: str, 
 def draw_removed(
     path: Path, image: NDArray[np.uint8], map_: NDArray[np.floating], sign: int, share: float, seed: int
 ) -> None:
-    """Draw a PNG row: the image (height, width), its map, and the image with the most attended, random, shifted and
-    least attended pixels inpainted.
+    """Draw, as one PNG row, an image (height, width), its map, and the image with inpainted pixels.
+
+    Four choices of pixels are inpainted: the most attended, random, shifted and the least attended pixels.
     """
     rng = np.random.default_rng(seed)
     most, least = (chosen_pixels(map_, share, which, sign, rng) for which in ("most", "least"))

@@ -6,7 +6,7 @@ the nodes of a grid over the ground (25). Steps for each level of an image pyram
 1. Project the pixels of frame 1 onto the ground and into frame 2 (`_Residuals.normal_equations`).
 2. Compare local contrast (contrast.py), with Tukey's weights (Beaton & Tukey 1974, doi
    10.1080/00401706.1974.10489171).
-3. Take a Gauss-Newton step, with the prior of motion, tilt and heights (`align`).
+3. Take a Gauss-Newton step, with a prior of motion, tilt and heights (`align`).
 
 Sources: Lucas & Kanade 1981; for free heights, direct odometry (Engel et al. 2018, doi 10.1109/TPAMI.2017.2658577).
 Along a trajectory, each pair starts from KLT's motion and the heights of the previous pair (`aligned_trajectory`).
@@ -44,12 +44,12 @@ _LEVELS = 2
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Prior knowledge of a pair of frames."""
+    """What is known about a pair of frames before the alignment."""
 
     motion: ExpectedMotion
     """Expected motion."""
     plane: GroundPlane
-    """The ground plane below frame 1, for a level camera."""
+    """The ground plane below the camera of frame 1, if this camera is level."""
     heights: Heights
     """Heights of the ground that frame 1 shows."""
 
@@ -68,14 +68,14 @@ class State:
     """Heights at the nodes (N_NODES,)."""
 
     def changed(self, step: Array) -> "State":
-        """The state after adding a step of all unknowns (n_unknown,)."""
+        """Return the state after a step (n_unknown,) of the unknowns."""
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
         rotation_c2_from_c1 = matrix_from_rotation_vector(step[:3]) @ self.rotation_c2_from_c1
         translation = self.translation_m - rotation_c2_from_c1.T @ step[3:6]
         return State(translation, rotation_c2_from_c1, self.tilt_rad + step[6:_N_POSE], self.height_m + step[_N_POSE:])
 
     def offset(self, prior: Prior) -> Array:
-        """Difference (n_unknown,) of all unknowns from the prior."""
+        """Difference (n_unknown,) between the unknowns and their prior means."""
         turn = rotation_vectors(self.rotation_c2_from_c1 @ prior.motion.rotation_c2_from_c1.T)
         shift = self.rotation_c2_from_c1 @ (prior.motion.translation_m - self.translation_m)
         return np.concatenate([turn, shift, self.tilt_rad, self.height_m - prior.heights.mean_m])

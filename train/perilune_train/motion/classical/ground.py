@@ -15,7 +15,8 @@ _HEIGHT_SHARE = 0.01
 _LENGTH_SHARE = 0.35
 """Correlation length of the heights, divided by the width of the ground in view."""
 _NEW_SHARE = 0.03
-"""Share of the estimated heights that is forgotten from one frame to the next, since finer relief comes into view."""
+"""Share of the estimated heights that the prior replaces from one frame to the next, since finer relief comes into
+view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ def node_weights(camera: Camera, pixels: Array) -> Array:
 
 
 def unknown_heights(camera: Camera, down_c: Array, altitude_m: float) -> Heights:
-    """The prior: a plane with a Gaussian process around it."""
+    """Prior of the heights: mean 0, with the covariance of the Gaussian process."""
     ground = ground_points(camera, node_pixels(camera), down_c, altitude_m)
     return Heights(np.zeros(N_NODES), _kernel(camera, altitude_m, ground, ground))
 
@@ -60,10 +61,10 @@ def carried(
     altitudes_m: tuple[float, float],
     motion: tuple[Array, Array],
 ) -> Heights:
-    """Heights at the nodes of frame 2 from the heights at the nodes of frame 1, by regression with the prior
-    covariance.
+    """Predict the heights at the nodes of frame 2 from the heights at the nodes of frame 1.
 
-    `downs_c` and `altitudes_m` belong to frames 1 and 2; `motion` is translation_m and rotation_c2_from_c1.
+    This is a regression with the covariance of the prior. `downs_c` and `altitudes_m` belong to frames 1 and 2;
+    `motion` is translation_m and rotation_c2_from_c1.
     """
     translation, rotation_c2_from_c1 = motion
     nodes = node_pixels(camera)

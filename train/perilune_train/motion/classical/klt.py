@@ -1,6 +1,6 @@
 """The classical baseline: corners tracked from frame to frame, and a robust motion fit over the ground plane.
 
-1. Warp frame 2 onto frame 1 by the expected motion, so that only a small residual at one scale is left.
+1. Warp frame 2 onto frame 1 by the expected motion. The frames then have the same scale and a small shift.
 2. Find corners in frame 1, track them into frame 2 and back, and drop tracks that do not return (`_tracks`): Lucas &
    Kanade 1981, with the pyramids of Bouguet 2001, as implemented in OpenCV.
 3. Project the corners of frame 1 onto the ground plane at the estimated altitude.

@@ -1,4 +1,4 @@
-"""Items computed ahead in a background thread, in a known order."""
+"""Compute items in advance in a background thread, in a known order."""
 
 import queue
 import threading
@@ -12,7 +12,7 @@ _POLL_S = 0.1
 
 
 class Ahead(Generic[Key, Item]):
-    """Computes items in a background thread while others are used, at most `n_ahead` in advance.
+    """Computes items in a background thread, at most `n_ahead` before they are needed.
 
     `make(keys)` runs in the thread and yields the items of these keys. `following(key)` yields a key and the keys that
     are needed after it. If `take` is called with a key other than the expected one, the thread restarts at that key.
@@ -24,16 +24,16 @@ class Ahead(Generic[Key, Item]):
         following: Callable[[Key], Iterator[Key]],
         n_ahead: int,
     ):
-        self._make, self._following, self._most = make, following, n_ahead
+        self._make, self._following, self._n_ahead = make, following, n_ahead
         self._expected: Iterator[Key] = iter(())
-        self._made: queue.Queue[tuple[Key, Item] | BaseException] = queue.Queue()
+        self._results: queue.Queue[tuple[Key, Item] | BaseException] = queue.Queue()
         self._stop, self._thread = threading.Event(), threading.Thread()
 
     def take(self, key: Key) -> Item:
         """Wait for the item of a key. Raises the error that computing it raised."""
         if next(self._expected, None) != key:
             self._begin(key)
-        result = self._made.get()
+        result = self._results.get()
         if isinstance(result, BaseException):
             self._expected = iter(())
             raise result
@@ -49,29 +49,29 @@ class Ahead(Generic[Key, Item]):
         self.close()
         self._expected = self._following(key)
         next(self._expected)
-        self._made, self._stop = queue.Queue(self._most), threading.Event()
-        arguments = (self._following(key), self._made, self._stop)
+        self._results, self._stop = queue.Queue(self._n_ahead), threading.Event()
+        arguments = (self._following(key), self._results, self._stop)
         # A daemon thread, so that a process that ends with an error does not wait for it.
         self._thread = threading.Thread(target=self._run, args=arguments, name="ahead", daemon=True)
         self._thread.start()
 
-    def _run(self, keys: Iterator[Key], made: queue.Queue, stop: threading.Event) -> None:
+    def _run(self, keys: Iterator[Key], results: queue.Queue, stop: threading.Event) -> None:
         def put(result: tuple[Key, Item] | BaseException) -> None:
             while not stop.is_set():
                 try:
-                    made.put(result, timeout=_POLL_S)
+                    results.put(result, timeout=_POLL_S)
                     return
                 except queue.Full:
                     continue
 
-        def wanted() -> Iterator[Key]:
+        def keys_until_stopped() -> Iterator[Key]:
             for key in keys:
                 if stop.is_set():
                     return
                 yield key
 
         try:
-            for item in self._make(wanted()):
+            for item in self._make(keys_until_stopped()):
                 put(item)
         except BaseException as error:
             put(error)

@@ -28,9 +28,8 @@ def gyroscope_turns(
 ) -> GyroscopeTurns | None:
     """Rotations between the frames at times (n,) of a trajectory; None if it has no inertial unit of this grade.
 
-    `ids` are scene_id and trajectory_id.
-
-    Raises UserError if measurements are missing between the first and the last frame.
+    `ids` are scene_id and trajectory_id. Raises UserError if measurements are missing between the first and the last
+    frame.
     """
     rows = dataset.table("inertial", ["grade", "time_s", "interval_s", "angular_rate_radps"], *ids).to_pandas()
     rows = rows[rows["grade"] == grade].sort_values("time_s")

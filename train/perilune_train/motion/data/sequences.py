@@ -29,7 +29,8 @@ class Sequence:
     first: np.ndarray
     """Earlier frames, normalised, float32 (n, height, width)."""
     second: np.ndarray
-    """Later frames, normalised; for warp resampled onto the earlier ones, 0 where the later frame has no pixels."""
+    """Later frames, like `first`; for warp resampled onto the earlier frames, and 0 beyond the edge of the later
+    frame."""
     translation_m: Array
     """True translations (n, 3), metres."""
     rotation_c2_from_c1: Array
@@ -39,7 +40,7 @@ class Sequence:
     altitude_m: Array
     """Nominal altitudes (n,), metres, at the earlier frames."""
     down_c: Array
-    """Unit vector (3,), O_C, towards the ground if the body is level; mirrored with the frames."""
+    """Unit vector (3,), O_C, towards the ground if the body is level. Augmentation mirrors it with the frames."""
     flow_px: Array | None = None
     """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), pixels, from first to second."""
 
@@ -56,14 +57,15 @@ def pair_sequence(
     """Pairs start to start + n_pairs - 1 of a trajectory; augmented if a generator is given.
 
     Augmentation applies one of the eight symmetries of the square image to the whole sequence (four if the image is not
-    square). With `jitter` it also moves each second camera at random, so that a pair has new residuals in every epoch:
-    the second frame is resampled over the ground plane to the view of the moved camera. The plane has the nominal
-    altitude and attitude.
+    square). With `jitter` it also moves the second camera of each pair at random, so that a pair has another motion in
+    every epoch. The second frame is then resampled over the ground plane to the view of the moved camera. The plane has
+    the nominal altitude and attitude.
 
-    The result is exact for a pure rotation, or if the ground is flat and the true altitude and attitude are nominal.
-    For true poses that differ from nominal by 8 m and 0.3 degrees, and 0.3 times as much jitter, the jitter moves
-    points by 1.2 px and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of 128 px over 50
-    degrees at 200 to 1500 m; see tests/train/motion/test_data.py.
+    The resampled frame is exact for a pure rotation, or if the ground is flat and the true altitude and attitude are
+    nominal. In other cases it is approximate. Example: the true poses differ from the nominal ones by 8 m and 0.3
+    degrees, and the jitter is 0.3 times as large. The jitter then moves points by 1.2 px with an error of 0.04 px
+    (0.14 px at 200 m). These are RMS values for frames of 128 px over 50 degrees at 200 to 1500 m; see
+    tests/train/motion/test_data.py.
     """
     span = slice(start, start + n_pairs)
     translation, rotation_c2_from_c1 = (values[span] for values in trajectory.motion)

@@ -50,7 +50,7 @@ class Stream:
 
     @property
     def uses(self) -> frozenset[TerrainUse]:
-        """The terrain that was rendered so far, including before the run was resumed."""
+        """The terrain that was rendered so far; in a resumed run also the terrain from before the interruption."""
         with self._lock:
             return frozenset(self._uses.values())
 
@@ -71,10 +71,10 @@ class Stream:
     def rendered(
         self, client: SceneClient, scene: int, following: int | None, part: Trajectory, velocity: Array, index: int
     ) -> Trajectory:
-        """Return the n poses of `part` with images of a scene.
+        """Return the n poses of `part` with rendered images of a scene.
 
-        `velocity` (n, 3) sets the motion blur of the images, `index` their noise. Meanwhile the server generates the
-        `following` scene. Raises UserError if the server fails or the terrain is held out.
+        `velocity` (n, 3) sets the motion blur of the images, and `index` sets their noise. Meanwhile the server
+        generates the scene `following`. Raises UserError if the server fails or the terrain is held out.
         """
         self._record(client, scene)
         if following is not None:
@@ -133,5 +133,5 @@ def _check_camera(address: str, served: Camera, expected_camera: Camera) -> None
         for c, (w, h) in zip((served, expected_camera), sizes, strict=True)
     ]
     if not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
-        expected = f"{expected_camera}, that of the dataset, or one with the same view and another size"
+        expected = f"{expected_camera}, as in the dataset; another image size of the same view is allowed"
         raise UserError(address, "camera", served, expected)

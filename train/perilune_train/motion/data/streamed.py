@@ -1,9 +1,9 @@
-"""Training sequences over new ground, rendered by an image server during training.
+"""Training sequences over scenes that are not in the dataset, rendered by an image server during training.
 
-A rendered sequence shows a scene of the server from the poses of a training trajectory. These poses are rotated about
-the vertical through the site by a random angle. Attitudes relative to the path do not change, because the camera axes
-relative to the path are equal in a descent from another azimuth. So positions, motions and attitudes are distributed as
-in the training trajectories, except for the azimuth, which is uniform.
+A rendered sequence shows a scene of the server along the path of a training trajectory. The positions are rotated about
+the vertical through the site by a random angle. The attitudes in O_L stay unchanged, because they do not depend on the
+azimuth of a descent. So positions, motions and attitudes are distributed as in the training trajectories, except for
+the azimuth, which is uniform.
 """
 
 from collections.abc import Iterator
@@ -29,15 +29,14 @@ _INDICES = 2**30
 class StreamedSequences(TrainingSequences):
     """Training sequences, some of them rendered by a server; the others come from the trajectories.
 
-    Whether a sequence is rendered, over which scene, from which poses and with which noise, depends only on the seeds,
-    the epoch and the sequence's position in it. `size_px` is the width to which frames are shrunk. Call `close` at the
-    end.
+    The seeds, the epoch and the sequence's position in the epoch determine whether a sequence is rendered, and its
+    scene, poses and noise. `size_px` is the width to which frames are shrunk. Call `close` at the end.
     """
 
     def __init__(self, stream: Stream, size_px: int, *arguments: Any, **named: Any):
         super().__init__(*arguments, **named)
         self.stream, self.size_px = stream, size_px
-        self._ahead: Ahead[Key, Sequence] = Ahead(self._made, self._following, _AHEAD)
+        self._ahead: Ahead[Key, Sequence] = Ahead(self._render, self._following, _AHEAD)
 
     def __getitem__(self, key: Key) -> Sequence:
         return self._ahead.take(key) if self.is_rendered(key) else super().__getitem__(key)
@@ -54,14 +53,14 @@ class StreamedSequences(TrainingSequences):
     def scene_of(self, key: Key) -> int:
         """Number, from 1, of the server's scene that a rendered sequence shows.
 
-        Scenes take turns; each shows `pairs_per_scene` consecutive pairs.
+        The scene changes after about `pairs_per_scene` pairs; after the last scene comes the first again.
         """
         settings = self.stream.settings
         before = key[0] * floor(sum(self.counts) * settings.share) + floor(key[1] * settings.share)
         return 1 + before * self.n_pairs // settings.pairs_per_scene % settings.n_scenes
 
     def poses(self, key: Key) -> tuple[Trajectory, np.ndarray, int]:
-        """Poses of a rendered sequence, without images; their velocities (n, 3), O_L; and the first noise index."""
+        """Poses of a rendered sequence, without images; velocities (n, 3), m/s, O_L; first index of the noise."""
         epoch, position, number, start = key
         rng = np.random.default_rng([self.stream.settings.seed, epoch, position])
         angle, index = rng.uniform(0, 2 * np.pi), int(rng.integers(_INDICES))
@@ -86,7 +85,7 @@ class StreamedSequences(TrainingSequences):
             epoch += 1
             keys = self.keys(epoch)
 
-    def _made(self, keys: Iterator[Key]) -> Iterator[tuple[Key, Sequence]]:
+    def _render(self, keys: Iterator[Key]) -> Iterator[tuple[Key, Sequence]]:
         """Render sequences. Raises DataLost if the server fails."""
         try:
             with self.stream.client() as client:

@@ -47,7 +47,8 @@ class Trajectory:
     nominal_rotation_camera_from_site: Array
     """Nominal attitude (3, 3) of the camera on a level body, equal for all frames."""
     gyroscopes: Mapping[InertialGrade, GyroscopeTurns] = field(default_factory=dict)
-    """Rotations measured by a gyroscope, by its grade. Grades that the dataset lacks are absent; empty in training."""
+    """Rotations that a gyroscope measured, by grade. Has no grade that the dataset lacks; empty for training
+    trajectories."""
 
     @property
     def n_pairs(self) -> int:

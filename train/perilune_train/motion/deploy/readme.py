@@ -73,12 +73,12 @@ def readme(metadata: dict[str, Any]) -> str:
         ("second", f"(1, {height}, {width})", "later frame, normalised" + (", resampled (see `step`)" if warp else "")),
         ("nominal_translation_m", "(1, 3)", "expected translation, frame of the earlier camera, metres"),
         ("altitude_m", "(1)", "expected altitude at the earlier frame, metres"),
-        ("hidden", f"(2, 1, {hidden})", "state of the LSTM; zeros at the start of a descent"),
-        ("cell", f"(2, 1, {hidden})", "likewise"),
+        ("hidden", f"(2, 1, {hidden})", "hidden state of the LSTM; zeros at the start of a descent"),
+        ("cell", f"(2, 1, {hidden})", "cell state of the LSTM; zeros at the start of a descent"),
         ("translation_m", "(1, 3)", "output: translation, frame of the earlier camera, metres"),
         ("rotation_c2_from_c1", "(1, 3, 3)", "output: rotation from the earlier to the later camera"),
-        ("hidden_out", f"(2, 1, {hidden})", "output: state for the next pair"),
-        ("cell_out", f"(2, 1, {hidden})", "likewise"),
+        ("hidden_out", f"(2, 1, {hidden})", "output: hidden state for the next pair"),
+        ("cell_out", f"(2, 1, {hidden})", "output: cell state for the next pair"),
     ]
     known = {*metadata["inputs"], *metadata["outputs"]}
     lines = [
@@ -97,15 +97,17 @@ def readme(metadata: dict[str, Any]) -> str:
     if warp:
         lines += [
             "The graph is for one camera, `camera_matrix` in navigator.json (pixels of the input, origin at the outer",
-            "corner of the first pixel), without distortion. For another one, export again with a `--dataset` of it.",
+            "corner of the first pixel), without distortion. For another camera, export again with `--dataset` and a",
+            "dataset of that camera.",
             "",
         ]
     lines += [
-        f"Compared pair by pair with torch over {metadata['compared_pairs']} pairs at once, on",
-        f"{metadata['compared_on']}: largest difference {metadata['largest_difference_from_torch']:.1e} of the",
-        "largest translation, or of 1 for rotations.",
+        f"The file was run pair by pair over {metadata['compared_pairs']} pairs of {metadata['compared_on']} and",
+        "compared with torch, which ran over all pairs at once. Largest difference:",
+        f"{metadata['largest_difference_from_torch']:.1e}, for translations relative to the largest translation (at",
+        "least 1 m).",
         "",
-        "`navigator.json` contains these and all other values; the ONNX file contains most of them as metadata.",
+        "`navigator.json` contains all values of this page and more; the ONNX file contains most of them as metadata.",
         "",
         "```python",
         (_START + (_WARP if warp else _STACK)).rstrip(),

@@ -11,13 +11,13 @@ from perilune_train.motion.geometry import dead_reckoning
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
 _ALTITUDES_M = (0, 200, 400, 800, 1200, 1600, 100_000)
-"""Limits of the altitude bands for pose errors, metres."""
+"""Limits of the altitude bins for pose errors, metres."""
 
 
 def motion_errors(
     trajectories: list[Trajectory], motions: list[Motion], covariances: list[Array] | None = None
 ) -> pd.DataFrame:
-    """Errors of motions, and of positions that are dead reckoned from the true first pose; one row per pair.
+    """Errors of motions, and of the positions dead-reckoned from the true first pose; one row per pair.
 
     Columns: scene_id, trajectory_id, step, altitude_m (nominal).
     Position: position_error_m (length), and its components error_x_m, error_y_m, error_z_m in O_C of the earlier frame.

@@ -41,8 +41,8 @@ def write_evaluation(
 
     Writes navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png, errors.png and
     metrics.json. Keys of metrics.json: <split>/<figure> for the method `network`, <method>/<figure> for another
-    network, baseline/<method>/<figure> for the other methods. `details` are added; they include the mark of the terrain
-    check.
+    network, baseline/<method>/<figure> for the other methods. `details` are further entries of metrics.json, among them
+    terrain/mark, the mark of the terrain check.
     """
     errors = {
         method: motion_errors(trajectories, motions, estimates.covariances.get(method))
@@ -67,8 +67,8 @@ def write_pose_evaluation(
 ) -> str:
     """Write the errors of a pose network and its floors on the trajectories of a split; return the page.
 
-    Writes pose.md, errors.png, and the tables and metrics of `write_evaluation`. The metric evaluation/worse_than names
-    the floor with the lowest position RMSE if the network is not better.
+    Writes pose.md, errors.png, and the tables and metrics of `write_evaluation`. Floors are the baselines of floors.py.
+    The metric evaluation/worse_than names the floor with the lowest position RMSE if the network is not better.
     """
     errors = {method: pose_errors(trajectories, entries) for method, entries in poses.items()}
     rows = {method: pose_summary(table) for method, table in errors.items()}
@@ -92,7 +92,6 @@ def worse_than_floor(network: str, rows: Mapping[str, Mapping[str, float]]) -> s
 
 
 def _pose_page(network: str, split: str, metrics: Metrics, methods: list[str], worse_than: str) -> str:
-    """The page of a pose network as Markdown."""
     cells = []
     for method in methods:
         prefix = _prefix(method, network, split)

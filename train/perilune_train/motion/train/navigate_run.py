@@ -56,12 +56,12 @@ def navigate_run(
 ) -> list[RunFolder]:
     """Train the networks `settings.fusion`; write runs/navigate/<name> (warp) and <name>-stack (stack).
 
-    Resumes interrupted runs with equal settings, dataset and detector, and leaves finished ones unchanged.
+    Resumes interrupted runs with equal settings, dataset and detector, and leaves finished runs unchanged.
 
-    `detector` is the default checkpoint for the stack network's backbone: it is used if it exists and has the same
-    architecture; a checkpoint in `settings.detector` must have that architecture. Raises UserError on bad data, a
-    checkpoint of another architecture, or a detector that was fitted to terrain of the test split (unless
-    `allow_overlap`).
+    `detector` is the default checkpoint for the stack network's backbone. It is used only if it exists and has the
+    backbone's architecture. A checkpoint in `settings.detector` must have this architecture. Raises UserError on bad
+    data, on a checkpoint of another architecture, and on a detector that was fitted to terrain of the test split;
+    `allow_overlap` accepts this detector.
 
     Under torchrun all processes train, and the first one evaluates and writes.
     """
@@ -140,9 +140,9 @@ def _run(
 def _evaluate_motions(
     folders: dict[Fusion, RunFolder], trajectories: list[Trajectory], common: dict[Fusion, Metrics]
 ) -> None:
-    """Evaluate motion networks and methods that need no training; write tables for the networks trained in this run.
+    """Evaluate the motion networks and the methods without a network; write tables for the runs in `common`.
 
-    For each trained run, `common` has the metrics that need no evaluation.
+    `common` has the runs that this command trained, each with its metrics that need no evaluation.
     """
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
@@ -224,9 +224,9 @@ def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
 def _detector_backbone(
     settings: NavigateConfig, default: Path | None
 ) -> tuple[dict[str, Tensor] | None, str, list[Provenance]]:
-    """A detector's backbone weights, their source, and the records of its terrain.
+    """Weights of a detector's backbone, a text about their source, and the record of the detector's terrain.
 
-    If no detector has the same architecture: None, the reason, and no record.
+    If no detector with the backbone's architecture exists: None, a text with the reason, and no record.
     """
     path = settings.detector or default
     if path is None or (settings.detector is None and not path.is_file()):

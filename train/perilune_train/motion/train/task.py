@@ -68,7 +68,7 @@ def learning_rate_factor(
 
 
 def axis_weights(scales: Scales, target: Target) -> Tensor:
-    """Weights (3,) of the standardised errors of the axes in the loss.
+    """Weights (3,) of the standardised position errors along the axes in the loss.
 
     Positions spread over hundreds of metres along the descent and over a few metres across it. Equal weights on
     standardised errors would leave the positions along the descent inaccurate. Equal weights on errors in metres would
@@ -152,8 +152,8 @@ class NavigationTask(lightning.LightningModule):
         self.validation_trajectories = [
             trajectory.shrunk(self.own.size_px) for trajectory in trajectories if trajectory.split == "val"
         ]
-        given = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
-        self.stores = fusion == "stack" and given and self.own.coarse_epochs > 0
+        all_pretrained = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
+        self.stores = fusion == "stack" and all_pretrained and self.own.coarse_epochs > 0
         self.stored: dict[str, list[Tensor]] = {}
         self.windows: Windows | None = None
         self.resumed = (0, 0)
@@ -242,9 +242,9 @@ class NavigationTask(lightning.LightningModule):
             if isinstance(module, nn.BatchNorm2d):
                 # Batch statistics would change the features by more than the spread of the features over the
                 # trajectories, so a network for poses keeps the detector's statistics.
-                kept = self.coarse or self.own.target == "pose"
+                keep_statistics = self.coarse or self.own.target == "pose"
                 # Check the statistics, because the norms of some gates have statistics but no weight.
-                module.train(not (kept and f"{name}.running_mean" in self.pretrained))
+                module.train(not (keep_statistics and f"{name}.running_mean" in self.pretrained))
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
@@ -341,8 +341,8 @@ class NavigationTask(lightning.LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        # Lightning refuses to clip for fused optimizers under mixed precision. Only the scaling of float16 needs this
-        # refusal, so clip here.
+        # Lightning refuses to clip for fused optimizers under mixed precision. The reason is the loss scaling of
+        # float16, which this training does not use, so clip here.
         if gradient_clip_val:
             torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
 
@@ -362,8 +362,8 @@ class NavigationTask(lightning.LightningModule):
             groups.append({"params": own_values, "lr": factor * rate, "weight_decay": 1e-3})
         optimizer = torch.optim.AdamW(
             groups,
-            # Fused: one pass over memory, ten times as fast on a CPU. There the optimizer takes half the time of a step
-            # on stored features.
+            # The fused optimizer passes over memory once and is ten times as fast on a CPU, where the optimizer takes
+            # half the time of a step on stored features.
             fused=True,
         )
         settings = self.own

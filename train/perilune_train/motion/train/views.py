@@ -15,17 +15,17 @@ from perilune_train.motion.metrics.floors import mean_poses
 def other_views(trajectories: list[Trajectory], count: int, spread: float, seed: int) -> list[Trajectory]:
     """`count` further versions of each training trajectory: the first version of all, then the second version of all.
 
-    A version has other poses, but still the original images. The pose of each frame is moved by `spread` times the
-    deviation of a random descent from the mean pose of that frame, with a random sign for each axis of position and
-    attitude. With `spread` 1 the moves are as large as the deviations of real descents. They always change as smoothly
-    along a sequence.
+    A version has other poses, but still the original images; `Windows` warps them. The pose of each frame is moved by
+    `spread` times the deviation of a random training trajectory from the mean pose of that frame, with a random sign
+    for each axis of position and attitude. So the moves change as smoothly from frame to frame as real deviations, and
+    with `spread` 1 they are as large.
     """
     deviations, versions = _deviations(trajectories) if count else [], []
     for version in range(count):
         for number, trajectory in enumerate(trajectories):
             rng = np.random.default_rng([seed, version, number])
             moves = spread * rng.choice([-1.0, 1.0], 6) * deviations[rng.integers(len(deviations))]
-            # If the other descent is shorter, repeat its last deviation.
+            # If the random trajectory is shorter, repeat its last deviation.
             moves = moves[np.minimum(np.arange(len(trajectory.position_m)), len(moves) - 1)]
             turns = np.stack([matrix_from_rotation_vector(vector) for vector in moves[:, 3:]])
             rotation_camera_from_site = turns @ trajectory.rotation_camera_from_site

@@ -1,7 +1,7 @@
-"""Training sequences of a stack network on the training device, gathered from frames, features and truths by index.
+"""Training sequences of a stack network, gathered by index from frames, features and truths on the training device.
 
-Only the indices of a step's sequences are prepared, so that a GPU does not wait. With views (motion/train/views.py),
-version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
+The loader prepares only the indices of a step's sequences, so that a GPU does not wait for it. With views
+(motion/train/views.py), version v of trajectory i of n has the number v n + i; version 0 is the trajectory itself.
 """
 
 from collections.abc import Sequence
@@ -58,8 +58,8 @@ def collated(places: list[tuple[int, int]]) -> Tensor:
 class Windows:
     """Sequences of `n_pairs` consecutive pairs of the trajectories `numbers`, and of their views.
 
-    `views` are further versions of all trajectories, from `other_views`. `places` (batch, 2), on the device, hold the
-    number of the trajectory and of the first pair.
+    `views` are further versions of all trajectories, from `other_views`. In the methods, `places` (batch, 2), on the
+    device, hold for each sequence the numbers of its trajectory and of its first pair.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""The page of the paper's experiment: its tables, figures and claims, with the results of our runs."""
+"""The page of the paper's experiment: the paper's tables, figures and claims beside the results of our runs."""

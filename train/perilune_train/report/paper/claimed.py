@@ -1,17 +1,17 @@
-"""Figures and claims of the paper: Tables II and III, and the text of section V."""
+"""Figures and claims of the paper, from its Tables II and III and the text of its section V."""
 
 DETECTION = {
     "YOLOv3": {"precision": 0.8395, "recall": 0.9258, "ap50_paper": 0.8926, "f1": 0.8805},
     "attention-YOLOv3": {"precision": 0.8458, "recall": 0.9336, "ap50_paper": 0.8963, "f1": 0.8875},
 }
-"""Table II."""
+"""Table II, by network."""
 TARGET_AP = DETECTION["YOLOv3"]["ap50_paper"]
 """The paper's AP of YOLOv3 without attention. The headline ground is selected by this AP."""
 NAVIGATION = {
     "Darknet53-LSTM": {"position_m": 7.61, "orientation_deg": 1.1e-2, "seconds": 0.22},
     "attention-Darknet53-LSTM": {"position_m": 1.14, "orientation_deg": 5.5e-3, "seconds": 0.22},
 }
-"""Table III: RMSE per component, following the paper's formula, and seconds per pair on a Xeon W-10855M. The paper
+"""Table III, by network: RMSE per component by the paper's formula, and seconds per pair on a Xeon W-10855M. The paper
 labels the column of seconds as fps."""
 SHALLOW_CRATER_GATES = ("B_11", "B_35")
 """Gates for which the paper reports a moderate PCC1."""

@@ -25,7 +25,10 @@ _ERRORS = {"position_error_m": "position error (m)", "orientation_error_deg": "o
 
 
 def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -> None:
-    """Draw AP of YOLOv3 against equilibrium_share; mark the paper's AP and the headline. Runs are evenly spaced."""
+    """Draw AP of YOLOv3 against equilibrium_share, with lines at the paper's AP and at the headline ground.
+
+    The shares are evenly spaced along the axis.
+    """
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     shares = list(curve)
@@ -44,7 +47,7 @@ def draw_curve(path: Path, curve: Mapping[str, Metrics], headline: str | None) -
 
 
 def learning_curve(run: Path, key: str) -> list[float]:
-    """Values of a metric at each validation, from a run's TensorBoard events. Of a repeated step, the last value."""
+    """Values of a metric at each validation, from a run's TensorBoard events. A repeated step has its last value."""
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -58,9 +61,9 @@ def learning_curve(run: Path, key: str) -> list[float]:
 
 
 def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]]]) -> bool:
-    """Draw learning curves, one panel per title; return whether there are any curves.
+    """Draw learning curves, one panel per title; returns whether there are any curves.
 
-    A panel has the key of its metric, and the folder of each run by name.
+    `panels` has, by title, the key of a metric and the folders of the runs by name.
     """
     values = {
         title: {name: heights for name, run in runs.items() if (heights := learning_curve(run, key))}
@@ -82,9 +85,9 @@ def draw_learning(path: Path, panels: Mapping[str, tuple[str, Mapping[str, Path]
 
 
 def draw_trajectory_errors(path: Path, readings: Mapping[str, Mapping[str, Path]]) -> bool:
-    """Draw the errors of each network along the first test trajectory, one row per reading.
+    """Draw the errors of each network along the first test trajectory; returns whether there are any errors.
 
-    `readings` has the path of errors.parquet by reading and network. Returns whether there are any errors.
+    `readings` has the path of errors.parquet by reading (a key of `READINGS`) and network. Each reading has a row.
     """
     tables = {
         reading: {network: _first_trajectory(file) for network, file in files.items() if file.is_file()}

@@ -1,4 +1,4 @@
-"""Crater widths and pictures like the paper's, from the detections of a finished detect run on its test split."""
+"""Detections of a finished run on its test split: widths of large craters, and pictures like the paper's."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +37,7 @@ class Detected:
 def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
     """Read a run's detections. Raises UserError if they are missing, damaged or from other frames.
 
-    `trained` is the folder of the training, which has the settings and the threshold; by default it is `run`.
+    `trained` is the folder of the training run, which has the settings and the threshold; by default it is `run`.
     """
     trained = trained or run
     split = load_split(open_single(dataset), "test", config_of_run(trained).labels)
@@ -73,11 +73,11 @@ class WidthRatio:
     median: float
     """Median over the craters."""
     interval: Interval | None
-    """95 % interval over scenes or trajectories; None with fewer than five of them."""
+    """95 % interval over scenes, or over trajectories of one scene; None with fewer than five units."""
 
 
 def width_ratio(detected: Detected) -> WidthRatio | None:
-    """Width of the detected large craters relative to the ground truth; None if no large crater was detected."""
+    """Width of the detected large craters relative to their labels; None if no large crater was detected."""
     split = detected.split
     height, width = split.frames.images.shape[1:]
     sizes = np.tile((width, height), (len(split), 1))
@@ -105,9 +105,10 @@ def width_ratio(detected: Detected) -> WidthRatio | None:
 
 
 def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:
-    """Draw the frames with the smallest and the largest labels; ground truth red, detections cyan, as in the paper.
+    """Draw the labels and detections of the frames with the smallest and the largest craters.
 
-    Each frame has at least a quarter as many labels as the frame with the most labels.
+    Ground truth is red and detections are cyan, as in the paper. Frames with less than a quarter of the largest number
+    of labels are not considered.
     """
     split = next(iter(by_network.values())).split
     counts = np.array([int(labels.selected.sum()) for labels in split.labels])

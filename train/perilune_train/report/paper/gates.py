@@ -1,4 +1,4 @@
-"""The attention gates of the explain run: PCC1 to PCC4 with their nulls, and the paper's claims about the gates."""
+"""The paper's claims about attention gates, and PCC1 to PCC4 of our gates with their nulls."""
 
 from collections.abc import Callable, Sequence
 
@@ -30,10 +30,11 @@ _CORRELATIONS = {
 
 
 def gate_verdicts(explained: Metrics) -> list[Verdict]:
-    """Verdicts on the claims about gates.
+    """Verdicts on the paper's claims about gates, from the metrics of an explain run.
 
-    A claim holds if it is true for all its gates, does not hold if it is true for no gate, and is open otherwise. The
-    figure of a gate has no interval, so every claim is open with fewer than `MIN_UNITS` scenes.
+    A claim names some gates. The claim holds if it is true for all of them, does not hold if it is true for none of
+    them, and is open in all other cases. The figures of gates have no intervals, so every claim is open with fewer than
+    `MIN_UNITS` scenes.
     """
     shallow = f"PCC1 of {' and '.join(SHALLOW_CRATER_GATES)} is moderate (here: at least {MODERATE} in size)"
     deep = f"PCC2 of {', '.join(DEEP_ALIKE_GATES)} is above {DEEP_ALIKE}"
@@ -73,7 +74,10 @@ def _of(explained: Metrics, measure: str, gates: Sequence[str]) -> dict[str, flo
 def _judged(
     explained: Metrics, claim: tuple[str, str], values: dict[str, float], ok: Callable[[float], bool], null: str
 ) -> Verdict:
-    """Verdict on a claim (text, the paper's figure) from the value of each gate; `null` names the nulls, if any."""
+    """Verdict on a claim (text, the paper's figure) from the value of each gate.
+
+    `null` is the measure whose nulls are listed; an empty string lists none.
+    """
     if not values:
         return Verdict(*claim, "-", "-", "not measured")
     scenes = explained.get("pair_scenes" if "PCC4" in claim[0] else "scenes")
@@ -89,7 +93,7 @@ def _judged(
 
 
 def gate_table(explained: Metrics) -> list[str]:
-    """Table of the ranges of PCC1 to PCC4 and their nulls over all gates, as lines of Markdown."""
+    """Table of the ranges of PCC1 to PCC4 over all gates, and of their nulls, as lines of Markdown."""
     rows = []
     for measure, title in _CORRELATIONS.items():
         names = [key.removeprefix(f"{measure}/") for key in explained if key.startswith(f"{measure}/B_")]
@@ -104,7 +108,7 @@ def gate_table(explained: Metrics) -> list[str]:
 
 
 def _nulls(explained: Metrics, measure: str, gates: dict[str, float]) -> str:
-    """Range of each null over the gates, as text; empty without nulls."""
+    """Range of each null over the gates, as text; empty if the gates have no nulls."""
     nulls: dict[str, list[float]] = {}
     for gate in gates:
         prefix = f"{measure}_null/{gate}/"

@@ -41,19 +41,19 @@ PAGE, FIGURES = "paper.md", "paper.json"
 NOT_RUN = "Not run."
 _EXPLAINED = ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png")
 _READINGS = {
-    "pose": "Pose in O_L: position and attitude in the landing frame, the reading of the paper",
-    "attitude": "Pose in O_L over descents with attitude noise, on the backbones of the descents without",
-    "motion": "Motion from frame to frame",
+    "pose": "Pose in O_L: position and attitude in the landing frame (our reading of the paper)",
+    "attitude": "Pose in O_L over descents with attitude noise, with the backbones trained on descents without it",
+    "motion": "Motion between consecutive frames",
 }
 
 
 def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline_share: str | None = None) -> Path:
     """Write paper.md, paper.json and pictures into the folder of the experiment's runs; return the page's path.
 
-    `dataset` is the detection dataset of the headline ground. `about` has lines on how the experiment was run and what
-    was left out. `headline_share` is the equilibrium_share of the headline ground; by default, it is the point of the
-    curve whose AP is nearest to the paper's AP. Sections without finished runs contain a note instead. Raises UserError
-    if no run is finished.
+    `dataset` is the detection dataset of the headline ground, the ground on which networks are compared. `about` has
+    lines on how the experiment was run and what was left out. `headline_share` is the equilibrium_share of the headline
+    ground; by default, it is the point of the curve whose AP is nearest to the paper's AP. A section without finished
+    runs contains only a note. Raises UserError if no run is finished.
     """
     runs = PaperRuns(root)
     if not root.is_dir():
@@ -87,7 +87,7 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
 
 
 def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
-    """Detections of the finished training runs on the headline ground, by network."""
+    """Detections of the finished detectors on the headline ground, by network."""
     folders = {
         network: runs.detector(detect_name(network)) for network, trainings in runs.detections().items() if trainings
     }
@@ -99,7 +99,7 @@ def _detected(runs: PaperRuns, dataset: Address) -> dict[str, Detected]:
 
 
 def _settings(runs: PaperRuns) -> list[str]:
-    """Settings of the detectors on the headline ground, from the first finished detector."""
+    """A line with the settings of the detectors on the headline ground; empty if no detector is finished."""
     folders = [runs.detector(detect_name(network)) for network, trainings in runs.detections().items() if trainings]
     known = [folder for folder in folders if (folder / "config.yaml").is_file()]
     if not known:
@@ -200,8 +200,8 @@ def _table_3(runs: PaperRuns) -> list[str]:
         lines += ["![Errors along a test trajectory](trajectory.png)", ""]
     if any(runs.scored(name) for name in NAVIGATORS.values()):
         lines += [
-            "*The locked benchmark has 40 frames per descent. If the experiment has more, steps of the benchmark are "
-            "longer than in training, so the error there is not caused by new ground alone.*",
+            "*The locked benchmark has 40 frames per descent. If the experiment has more frames per descent, steps of "
+            "the benchmark are longer than in training, so its errors are not caused by new ground alone.*",
             "",
         ]
     return lines[:-1]
@@ -239,8 +239,9 @@ def _attention(runs: PaperRuns) -> list[str]:
     if explained is None:
         return [NOT_RUN]
     lines = [
-        "Correlations do not depend on the range of a mask. Read them beside the masks: some may be nearly constant. A "
-        "gate beats a null if a test over scenes finds its mean above the null's mean; one scene is too few for this.",
+        "Correlations do not depend on the range of a mask, and some masks may be nearly constant. Therefore look at "
+        "the masks too. A gate beats a null if, by a test over scenes, the gate's mean is above the null's mean; one "
+        "scene is too few for this test.",
         "",
         *gate_table(explained),
     ]
@@ -252,7 +253,7 @@ def _attention(runs: PaperRuns) -> list[str]:
 
 
 def _figures(read: dict[str, Metrics], answered: list[Verdict]) -> Metrics:
-    """All figures of the page, with flat keys: <folder of a run>/<metric>, verdict/<number>/<part>."""
+    """All figures of the page by flat keys: <folder of a run>/<metric> and verdict/<number>/<part>."""
     figures: Metrics = {}
     for folder, metrics in read.items():
         figures |= {f"{folder}/{key}": value for key, value in metrics.items() if not key.startswith("run/")}

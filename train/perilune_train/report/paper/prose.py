@@ -1,4 +1,4 @@
-"""Sentences of the page: the first paragraph, the rule for verdicts, the three causes, the deviations."""
+"""Texts of the page: the first paragraph, the rule for verdicts, the three causes, the deviations."""
 
 from perilune_train.records.markdown import number
 from perilune_train.report.paper.claimed import DETECTION, TARGET_AP
@@ -15,7 +15,7 @@ CAUSES = {
     "ground": "**Ground.** perilune's usual ground has many craters, and many of them are too faint to see. The "
     "paper's rule labels them all. The curve above shows the network on sparser ground.",
 }
-"""Text on each cause, by the first part of the keys of paper-causes.json."""
+"""Text on each cause, by the first part of its keys in paper-causes.json."""
 
 DEVIATIONS = (
     "Frames are rendered by perilune instead of PANGU. The paper does not publish its data, camera or Sun. The "
@@ -100,7 +100,8 @@ def _scoring(runs: PaperRuns) -> str:
     text = (
         "**Scoring.** Labels follow the paper's rule, radii of 2 to 50 px. Headline figures use the usual scoring "
         "rule, which ignores detections that the labels cannot decide. The strict rule counts a detected crater just "
-        "below 2 px as a false positive. The paper mentions no ignored detections, so it must have used the strict rule"
+        "below 2 px as a false positive. The paper mentions no ignored detections, so either its rule was strict, or "
+        "its images had few craters just below 2 px"
     )
     trainings = runs.detections()["yolov3"] or runs.halves()["yolov3"][:1]
     usual, strict, recall = (numbers(trainings, f"test/{key}") for key in ("precision", "strict/precision", "recall"))

@@ -3,7 +3,7 @@
 The rule treats better and worse symmetrically. With at least `MIN_TRAININGS` training runs of each network, a claim
 holds if every run with attention is better than every run without attention, and does not hold if every run with
 attention is worse than every run without. With one training run of each network, the claim holds or does not hold only
-if the intervals are separated. Otherwise the claim is open.
+if the intervals of the two runs do not overlap. In all other cases the claim is open.
 """
 
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ from perilune_train.report.paper.tables import numbers
 
 Answer = Literal["holds", "does not hold", "open", "not measured"]
 AS_FAST = 1.05
-"""Largest ratio of two times, the longer divided by the shorter, at which they count as equal."""
+"""Two times count as equal if the longer time divided by the shorter time is at most this ratio."""
 MIN_TRAININGS = 3
-"""Smallest number of training runs of each network at which their order decides. With three runs of each, chance alone
-puts all runs of either network above all runs of the other network in one of ten cases."""
+"""Smallest number of training runs of each network at which the order of the runs decides. With three runs of each
+network, chance alone puts all runs of one network above all runs of the other network in one of ten cases."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Verdict:
     """One claim of the paper and the answer to it."""
 
     claim: str
-    """What the paper says."""
+    """The claim."""
     claimed: str
-    """The paper's figures."""
+    """The paper's figures, with against without attention."""
     measured: str
-    """Our figures, with and without attention."""
+    """Our figures, with against without attention."""
     trainings: str
     """Number of training runs on which the answer is based."""
     answer: Answer
@@ -55,7 +55,7 @@ def compared(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics], *,
 
 
 def by_order(ours: Interval | None, other: Interval | None, higher: bool) -> Answer:
-    """Answer from the order of two ranges; open if they overlap or if one is unknown."""
+    """Answer from the order of two ranges; open if the ranges overlap or if a range is unknown."""
     if ours is None or other is None:
         return "open"
     above, below = ours[0] > other[1], ours[1] < other[0]

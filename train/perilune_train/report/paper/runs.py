@@ -42,25 +42,26 @@ NAMES = {
 SEEDS = (0, 1, 2)
 """Random seeds of the training runs at half width."""
 HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
-"""First parts of the names of runs: three grounds, then two variants of the headline ground (after transfer, and with
-more epochs)."""
+"""First parts of the names of runs. HEADLINE, SPARSE and USUAL are grounds. TRANSFER and LONG are variants of training
+on the headline ground: after transfer, and with more epochs."""
 SPARSE_SHARE = "0.1"
 """equilibrium_share of the sparse ground."""
 CURVE = "curve"
 """First part of the names of the runs on grounds of rising density."""
 NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
-"""First part of the names of the navigate runs, by the paper's name. The names of their folders end in -stack."""
+"""First part of the names of the navigate runs, by the paper's name of the network. Folder names end in -stack."""
 READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
-"""Ending of the names of the navigate runs: pose in O_L, pose in O_L with attitude noise, motion between frames."""
+"""Last part of the names of the navigate runs, for what they estimate: pose in O_L, pose in O_L with attitude noise,
+motion between frames."""
 EXPLAINED = "attention"
 """Name of the explain run."""
 CAUSES = "paper-causes.json"
-"""Ablations of the three causes."""
+"""File with the ablations of the three causes."""
 BENCHMARK_FILE = "benchmark.json"
 
 
 def detect_name(network: str, ground: str = HEADLINE, seed: int | None = None) -> str:
-    """Name of a detector's training run. `network` is a key of `ATTENTION`; a seed selects the run at half width."""
+    """Name of a detector's training run. `network` is a key of `ATTENTION`; with a seed, the run is at half width."""
     half = [] if seed is None else ["half", str(seed)]
     return "-".join([*([ground] if ground else []), network, *half])
 
@@ -73,8 +74,8 @@ def navigate_name(navigator: str, reading: str = "pose") -> str:
 def nearest_share(curve: Mapping[str, Metrics], prefix: str = "") -> str | None:
     """The equilibrium_share at which the validation AP is nearest to the AP of the paper's YOLOv3.
 
-    The point `lunar` of the curve is left out. `prefix` selects the scoring rule: "" (usual) or "strict/". None if the
-    curve has no AP.
+    The point `lunar` of the curve is not considered. `prefix` selects the scoring rule: "" (usual) or "strict/".
+    Returns None if no point has an AP.
     """
     ap_of_share = {share: metrics.get(f"val/{prefix}ap50_paper") for share, metrics in curve.items() if share != USUAL}
     known = {share: abs(ap - TARGET_AP) for share, ap in ap_of_share.items() if isinstance(ap, int | float)}
@@ -145,7 +146,7 @@ class PaperRuns:
         return finished(self.explained)
 
     def scored(self, name: str) -> Metrics | None:
-        """Figures of a detector or navigator on the locked benchmark; None if they are missing."""
+        """Metrics of a detector or navigator on the locked benchmark; None if they are missing."""
         return finished(self.benchmark(name), BENCHMARK_FILE)
 
     def all_finished(self) -> dict[str, Metrics]:

@@ -1,4 +1,4 @@
-"""Tables of the page: Table II, the curve, Table III, and the ablations of the causes."""
+"""Tables of the page: Table II, AP by density of craters, Table III, and the ablations of the causes."""
 
 import json
 import math
@@ -46,7 +46,7 @@ _IDENTITY_ONLY = (_GROUNDS[USUAL],)
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 _NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
-"""Number of decimals of each column of Table III."""
+"""Metric of each column of Table III, with its number of decimals."""
 FLOORS = {
     "mean_pose": "mean pose of the training",
     "mean_pose_at_frame": "mean pose of the training at that frame",
@@ -55,12 +55,12 @@ FLOORS = {
     "mean_at_step": "mean motion of the training at that step",
     "nominal": "nominal motion",
 }
-"""Baselines of a navigator: methods without images, and linear regression on the navigator's initial features."""
+"""Names of a navigator's baselines: methods without images, and ridge regression on the frozen features."""
 _METHODS = {"klt": "KLT tracks, without training", "alignment": "direct alignment, without training"}
 
 
 def table_2(runs: PaperRuns) -> list[str]:
-    """Table II as lines of Markdown, with one line that names the missing training runs."""
+    """Table II as lines of Markdown, with a line that names the missing training runs."""
     rows, missing = [], []
     for network, figures in DETECTION.items():
         cells = [f"{figures[key]:.4f}" if key in figures else "-" for key in _DETECTION]
@@ -99,7 +99,7 @@ def table_2(runs: PaperRuns) -> list[str]:
 
 
 def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]:
-    """The curve of AP against equilibrium_share as lines of Markdown, with a mark on the headline ground."""
+    """Table of AP against equilibrium_share as lines of Markdown; the headline ground is in bold."""
     rows = []
     for share, metrics in curve.items():
         name = "lunar (our usual ground)" if share == USUAL else share
@@ -137,14 +137,14 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
 
 
 def floor(metrics: Metrics) -> str | None:
-    """The floor of a navigate run (`FLOORS`) with the lowest position RMSE; None if the run has no floors."""
+    """The baseline (`FLOORS`) with the lowest position RMSE in a navigate run; None if the run has no baselines."""
     errors = {name: metrics.get(f"baseline/{name}/{_POSITION}") for name in FLOORS}
     known = {name: value for name, value in errors.items() if isinstance(value, int | float)}
     return min(known, key=lambda name: known[name], default=None)
 
 
 def lost_to(metrics: Metrics) -> str | None:
-    """The best floor, if the network of a navigate run is not better; otherwise None."""
+    """The best baseline (`floor`) if the network of a navigate run is not better than it; otherwise None."""
     best, error = floor(metrics), metrics.get(f"test/{_POSITION}")
     if best is None or not isinstance(error, int | float):
         return None
@@ -153,10 +153,10 @@ def lost_to(metrics: Metrics) -> str | None:
 
 
 def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
-    """Tables of the ablations by cause, as lines of Markdown; empty if there are no ablations.
+    """Tables of the ablations by cause, as lines of Markdown; empty if there is no paper-causes.json.
 
-    Keys of paper-causes.json are <cause>/<row>/<column>, with cause loss, gates or ground. Values are numbers or
-    strings. Other keys are not shown.
+    The keys of this file are <cause>/<row>/<column>, where cause is loss, gates or ground. Values are numbers or
+    strings. Entries of another form are not shown. Raises UserError if the file is damaged.
     """
     path = runs.root / CAUSES
     if not path.is_file():
@@ -185,7 +185,7 @@ def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
 
 
 def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
-    """A figure with its interval as text. For several training runs: mean and range. A dash if undefined."""
+    """A figure as text: with its interval for one training run, mean and range for several; a dash if undefined."""
     known = numbers(trainings, key)
     if not known:
         return "-"
@@ -196,7 +196,7 @@ def values(trainings: Sequence[Metrics], key: str, places: int = 3) -> str:
 
 
 def numbers(trainings: Sequence[Metrics], key: str) -> list[float]:
-    """The finite values of a figure in training runs."""
+    """The finite values of a figure over training runs."""
     values = [metrics.get(key) for metrics in trainings]
     return [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
 

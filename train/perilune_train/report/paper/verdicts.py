@@ -1,4 +1,4 @@
-"""The paper's claims, each with our measurement and the answer whether the claim holds (rule.py)."""
+"""Verdicts on all claims of the paper: our measurement, and whether the claim holds by the rule in rule.py."""
 
 import math
 from collections.abc import Sequence
@@ -13,15 +13,16 @@ from perilune_train.report.paper.tables import FLOORS, lost_to, numbers, values
 
 ONE = "one training run each"
 _CONSTANT_DEG = 1e-4
-"""The orientation counts as constant if its mean has an error below this limit, degrees (no attitude noise)."""
+"""The orientation counts as constant if predicting its mean has an error below this limit, degrees. This is the case
+without attitude noise."""
 GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from identity"}
-"""Detectors with attention."""
+"""Form of the gates of each detector with attention, in words."""
 
 
 def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
     """Verdicts on all claims in the order of the paper.
 
-    `large` is the width ratio of the large craters that attention-YOLOv3 detects; None if unknown.
+    `large` is the width ratio of the large craters detected by attention-YOLOv3; None if unknown.
     """
     answers = []
     for key, (name, claimed) in _detection_claims().items():
@@ -35,7 +36,7 @@ def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
 
 
 def _detection_claims() -> dict[str, tuple[str, str]]:
-    """Text of each claim and the paper's figures, by the key in metrics.json."""
+    """Name of each compared figure and the paper's values, by the figure's key in metrics.json."""
     names = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
     plain, attended = DETECTION.values()
     compared = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
@@ -48,7 +49,10 @@ def _detection_claims() -> dict[str, tuple[str, str]]:
 
 
 def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) -> Verdict:
-    """Compare the training runs at half width if there are several, and add the single run at full width."""
+    """Verdict from the training runs at half width if there are several, with the run at full width added.
+
+    With fewer than two training runs at half width, the verdict is from the run at full width.
+    """
     full, half = runs.detections(), runs.halves()
     counts = [len(numbers(half[network], key)) for network in (gates, "yolov3")]
     pair = full[gates], full["yolov3"]
@@ -117,9 +121,9 @@ def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
 
 
 def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
-    """Whether the orientation is nearly constant: predicting the mean pose or motion has a small error.
+    """Whether the true orientation is nearly constant, so that predicting its mean has a small error.
 
-    Without figures of the mean, the errors of all networks must be small.
+    If the error of the mean was not measured, the errors of all networks must be small.
     """
     means = [f"baseline/{name}/{key.removeprefix('test/')}" for name in ("mean", "mean_pose")]
     known = [value for mean in means for value in numbers(trained, mean)] or numbers(trained, key)
@@ -127,9 +131,9 @@ def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
 
 
 def _as_fast(runs: PaperRuns) -> Verdict:
-    """Compare seconds per pair in each of the `READINGS`, and on the benchmark.
+    """Verdict from the seconds per pair in each of the `READINGS` and on the benchmark.
 
-    Times are compared only if one kind of machine and one command measured both networks.
+    Times of two networks are compared only if they were measured on equal hardware by the same command.
     """
     claim, claimed = "a pair takes as long with attention as without", "0.22 s both"
     pairs = {reading: list(runs.navigation(reading).values()) for reading in READINGS}

@@ -12,13 +12,13 @@
   theme.hidden = false;
   nameTheme();
 
-  // Paper shows the settings of every run; the page shows them on demand.
+  // Print the content of closed parts too, such as the settings of every run.
   const closed = () => document.querySelectorAll("details:not([open])");
   let opened = [];
-  addEventListener("beforeprint", () => { opened = [...closed()]; opened.forEach((one) => { one.open = true; }); });
-  addEventListener("afterprint", () => { opened.forEach((one) => { one.open = false; }); });
+  addEventListener("beforeprint", () => { opened = [...closed()]; opened.forEach((part) => { part.open = true; }); });
+  addEventListener("afterprint", () => { opened.forEach((part) => { part.open = false; }); });
 
-  // A link to something in a closed part opens the part.
+  // Open the closed part that contains the target of a link.
   function reveal() {
     let inside = element(decodeURIComponent(location.hash.slice(1)));
     const target = inside;
@@ -36,10 +36,10 @@
   const SVG = "http://www.w3.org/2000/svg";
 
   function shape(tag, kind, attributes) {
-    const made = document.createElementNS(SVG, tag);
-    made.setAttribute("class", kind);
-    for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-    return made;
+    const node = document.createElementNS(SVG, tag);
+    node.setAttribute("class", kind);
+    for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+    return node;
   }
   const ellipse = ([kind, cx, cy, rx, ry, degrees]) =>
     shape("ellipse", kind, { cx, cy, rx, ry, transform: `rotate(${degrees} ${cx} ${cy})` });
@@ -94,13 +94,13 @@
     l: () => toggle("labels"), d: () => toggle("detections"), m: toggleMask,
   };
   addEventListener("keydown", (event) => {
-    // A slider or a list uses these keys itself.
+    // Sliders, lists and scrollable areas use some of these keys themselves.
     const handlesKeys = event.target.matches("select, input[type=range]") || event.target.closest("[tabindex]");
     if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
     if (handlesKeys && (event.key.startsWith("Arrow") || event.target === gate)) return;
     keys[event.key]();
     event.preventDefault();
   });
-  document.querySelectorAll(".controls[hidden]").forEach((one) => { one.hidden = false; });
+  document.querySelectorAll(".controls[hidden]").forEach((controls) => { controls.hidden = false; });
   show();
 })();
