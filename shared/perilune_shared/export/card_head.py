@@ -60,9 +60,9 @@ def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
     the column `split` of frames states the split of each frame. For frames in separate files, use `export_hugging_face`
     to write files for each split.
     """
-    counts = dataset.info.counts.model_dump()
+    counts = dataset.info.counts
     names = ["frames", *(name for name in TABLES if name != "frames")]
-    configs = [_config(name, {"mixed": f"manifest/{name}/*.parquet"}) for name in names if counts[name]]
+    configs = [_config(name, {"mixed": f"manifest/{name}/*.parquet"}) for name in names if getattr(counts, name)]
     if dataset.info.images == "packed":
         splits = [split for split in SPLITS if shards_of(dataset.store, split)]
         configs.insert(0, _config("packed", {split: f"{FOLDER}/{split}-*.parquet" for split in splits}))

@@ -100,7 +100,7 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
     [
         ("perilune_render.terrain.scene", '^r"""', 'r"""Another docstring. '),
         ("perilune_render.imaging.sensor", '    """Grey image', '    """Another docstring'),
-        ("perilune_render.terrain.scene", '"""Share of a crater', '"""Another text'),
+        ("perilune_render.terrain.scene", '"""Smallest remaining', '"""Another text'),
         ("perilune_render.terrain.craters.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
         ("perilune_render.terrain.relief", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli.main", '"Folder', '"Another folder'),
