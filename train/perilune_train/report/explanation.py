@@ -1,6 +1,7 @@
 """The report's sections on attention gates and on the paper's claims: verdicts, tables and pictures.
 
-An explain run is a run of `perilune-train explain`; its folder contains claims.json, captions.json and pictures.
+An explain run is a run of `perilune-train explain` or `perilune-train causal`; its folder contains claims.json,
+captions.json and pictures.
 """
 
 import re
