@@ -119,7 +119,7 @@ def _fit(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array) -> _Fit
 
 
 def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
-    """Radius of the crest in each direction (N, A), crater radii, and whether there is a crest (N, A).
+    """Radius (N, A) of the crest in each direction, in crater radii, and whether there is a crest (N, A).
 
     A crest is a maximum of the profile (N, A, R) inside a range around the highest point of the median profile; a
     maximum at the end of this range does not count.
