@@ -103,7 +103,7 @@ class _End(NamedTuple):
     """One end of a cubic."""
 
     x: float
-    """Distance from the crater's centre, radii."""
+    """Distance from the crater's centre, in crater radii."""
     value: float
     """Value at x."""
     slope: float

@@ -24,7 +24,7 @@ _PLANE_FROM = 1.5
 _MIN_SHARE = 0.7
 """Smallest share of directions in which a crest must be found."""
 _LARGEST_RMS = 0.1
-"""Largest r.m.s. distance of the crest from the ellipse, in radii of the crater."""
+"""Largest r.m.s. distance of the crest from the ellipse, in mean radii of the ellipse."""
 _MIN_RATIO = 0.7
 """Smallest ratio of the ellipse's axes."""
 _LARGEST_SHIFT = 0.4
