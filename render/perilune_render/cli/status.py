@@ -30,5 +30,5 @@ def status(
         if state.n_silent:
             lines.append(f"  silent        {state.n_silent} processes, for {SILENT_S:.0f} s or more")
         lines += [f"  failed        {name}: {error}" for name, error in state.failed.items()]
-        # Other processes wrote the names and messages; a line break in one must not start a line.
+        # Other processes wrote the names and messages. Remove line breaks, which could imitate further output lines.
         answer_page("\n".join("".join(line.splitlines()) for line in lines))

@@ -1,7 +1,8 @@
-"""Poses of the camera during one frame, for the readout of the rows and for the exposure.
+"""Poses of the camera during one frame, for rolling shutter and motion blur.
 
 The velocity in O_L and the angular velocity in O_C are constant during a frame. Times are seconds from the middle of
-the exposure of the middle row, to which the pose of a frame refers.
+the exposure of the middle row, to which the pose of a frame refers. The engine renders in the pixels of its own camera,
+a pinhole (`exr_camera`) that covers the view of the sensor's camera.
 """
 
 from collections.abc import Callable
@@ -30,7 +31,7 @@ class RowPoses:
     """Poses of the rows of one frame with a rolling shutter of N rows."""
 
     row: np.ndarray
-    """Row of the sensor, from 0, that sees each pixel of the engine's camera (h, w) int64."""
+    """Row of the sensor, from 0, in which each pixel of the engine's camera appears (h, w) int64."""
     time_s: Array
     """Time of the middle of each row's exposure (N,)."""
     pose_at: Callable[[float], Pose]
@@ -43,7 +44,7 @@ class RowPoses:
         return [(of_pixel == k, self.pose_at(float(self.time_s[band == k].mean()))) for k in range(n_bands)]
 
     def motion_px(self, depth_m: np.ndarray, camera: Camera) -> float:
-        """Largest motion in the image of the engine's `camera` while all rows are read out, pixels.
+        """Largest motion in the image of the engine's `camera` between the exposures of the first and last row, pixels.
 
         depth_m (h, w) is the depth at the middle pose.
         """
@@ -62,9 +63,9 @@ def row_times_s(n_rows: int, row_time_s: float) -> Array:
 
 
 def sensor_rows(camera: Camera, exr_camera: Camera) -> np.ndarray:
-    """Row of `camera` that sees each pixel of `exr_camera` (h, w) int64.
+    """Row of the sensor in which each pixel of the engine's camera `exr_camera` appears (h, w) int64.
 
-    Pixels outside the image of `camera` get the nearest row.
+    `camera` is the sensor's camera. Pixels outside its image get the nearest row.
     """
     row = camera.project(exr_camera.rays(exr_camera.pixel_centres()))[..., 1]
     # Far outside the image the distortion may fold back; those pixels are not used.

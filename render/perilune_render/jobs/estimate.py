@@ -63,8 +63,8 @@ def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecu
     """Estimate the remaining work of a job at an address, with an executor of `n_workers` processes.
 
     Each process renders up to ten frames of one trajectory; the trajectories come from different scenes if there are
-    enough scenes. Nothing is written to the address. Raises UserError like `check` and if a pose does not fit the
-    ground, and RenderingFailed if frames cannot be rendered.
+    enough scenes. Nothing is written to the address. Raises UserError like `check` and if a pose fails
+    `check_poses`, and RenderingFailed if frames cannot be rendered.
     """
     out = open_store(address)
     check(job)

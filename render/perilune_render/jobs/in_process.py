@@ -27,14 +27,15 @@ class InProcess:
         self._renderer.__exit__(kind, error, trace)
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene and check its poses. Raises UserError if a pose does not fit the ground."""
+        """Generate a scene and check its poses (`check_poses`). Raises UserError if a check fails."""
         for line in self._renderer.check(scene_id):
             say(line)
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
+        Raises only errors that would stop every trajectory, such as a full disk. Any other error
+        is recorded in the work list as a failed attempt.
         """
         while (index := work.take(self._renderer.scene_id)) is not None:
             report.started(index)

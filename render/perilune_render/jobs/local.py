@@ -58,7 +58,7 @@ class LocalWorkers:
         self._scratch.cleanup()
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene in a worker and check its poses. Raises UserError if a pose does not fit the ground."""
+        """Generate a scene in a worker and check its poses (`check_poses`). Raises UserError if a check fails."""
         asked: list[Worker] = []
         while True:
             self._start(min(self._n_workers, len(self._job.plan.trajectories)) or 1)
@@ -80,7 +80,8 @@ class LocalWorkers:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
+        Raises only errors that would stop every trajectory, such as a full disk. Any other error
+        is recorded in the work list as a failed attempt.
         """
         while True:
             n_busy = sum(worker.trajectory is not None for worker in self._workers.values())

@@ -105,7 +105,7 @@ class RayActors:
             ray.shutdown()
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene in an actor and check its poses. Raises UserError if a pose does not fit the ground."""
+        """Generate a scene in an actor and check its poses (`check_poses`). Raises UserError if a check fails."""
         while True:
             self._start(1)
             actor = self._actors[0]
@@ -125,7 +125,8 @@ class RayActors:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
+        Raises only errors that would stop every trajectory, such as a full disk. Any other error
+        is recorded in the work list as a failed attempt.
         """
         while True:
             busy = [actor for actor in self._actors if actor.trajectory is not None]

@@ -41,12 +41,13 @@ class Executor(Protocol):
     """Renders trajectories of a job in this process, in other processes or on other machines."""
 
     def check_scene(self, scene_id: str) -> None:
-        """Generate a scene and check its poses. Raises UserError if a pose does not fit the ground."""
+        """Generate a scene and check its poses (`check_poses`). Raises UserError if a check fails."""
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list.
 
-        Raises only errors that would stop every trajectory, such as a full disk. Other errors go to the work list.
+        Raises only errors that would stop every trajectory, such as a full disk. Any other error
+        is recorded in the work list as a failed attempt.
         """
 
 
@@ -84,7 +85,7 @@ def render_job(job: Job, address: Address, progress: Progress, executor: MakeExe
     """Render a job into the dataset at an address, or resume it.
 
     The poses of the first scene are checked before anything is written, the poses of every other scene before its first
-    frame is rendered. Raises UserError if a pose does not fit the ground, if the address holds something else, or if
+    frame is rendered. Raises UserError if a pose fails `check_poses`, if the address holds something else, or if
     another run is writing there. Raises RenderingFailed at the end if trajectories failed repeatedly.
     """
     out = open_store(address)
@@ -153,8 +154,8 @@ def check(job: Job) -> None:
 def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> DatasetInfo:
     """Begin the dataset at `out`, or check that an existing dataset belongs to the job; return its dataset.json.
 
-    Before a dataset is begun, `check_scene` is called for its first scene. Raises UserError if a pose does not fit the
-    ground, or if `out` holds other files, or a dataset with different settings, code or plan.
+    Before a dataset is begun, `check_scene` is called for its first scene. Raises UserError if a pose fails
+    `check_poses`, or if `out` holds other files, or a dataset with different settings, code or plan.
     """
     if not is_begun(out) and job.plan.scenes:
         check_scene(job.plan.scenes[0].scene_id)

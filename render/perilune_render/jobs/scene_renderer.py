@@ -50,7 +50,7 @@ class SceneRenderer:
         return self._grown[0] if self._grown is not None else None
 
     def grow(self, scene_id: str) -> Scene:
-        """Generate the ground of a scene and check its poses. Raises UserError if a pose does not fit the ground."""
+        """Generate the ground of a scene and check its poses. Raises UserError if a pose fails `check_poses`."""
         if self._grown is None or self._grown[0] != scene_id:
             self.close()  # frees the ground of the previous scene first
             job = self._job

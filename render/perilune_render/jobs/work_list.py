@@ -28,7 +28,7 @@ class WorkList:
 
     @property
     def n_waiting(self) -> int:
-        """Number of trajectories that are not being rendered."""
+        """Number of trajectories that wait for a process, for a first or a further attempt."""
         return sum(map(len, self._waiting.values()))
 
     def take(self, scene_id: str | None) -> int | None:

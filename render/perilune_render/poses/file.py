@@ -11,7 +11,8 @@ The frame of the positions is stated in the file: in text files by a comment lin
 
 Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns qw, qx, qy, qz, like `rotation_wxyz` in
 a manifest. `# rotation: site_from_camera` states the opposite direction, which TUM, EuRoC and KITTI files always have.
-`# camera_axes: blender`, or three axes, states camera axes other than x right, y down, z forward.
+If the camera's axes are not x right, y down, z forward, a comment line states the axes that point right, down and
+forward: by name (`# camera_axes: blender`) or one by one (`# camera_axes: x,-y,-z`).
 
 `# site: latitude longitude`, degrees, is optional; poses of a site that differs from the scene's are rejected.
 """
@@ -98,8 +99,8 @@ class GivenPoses:
 def read_poses(path: Path, latitude_deg: float, longitude_deg: float, axes: str | None = None) -> GivenPoses:
     """Read the poses of a file, for a site at these coordinates.
 
-    `axes` states the camera's axes as in `camera_axes`, if the file does not state them. Raises UserError with the
-    first faulty line.
+    `axes` is the option `--camera-axes`, for files without the line `# camera_axes`. If both are present, they must be
+    equal. Raises UserError with the first faulty line.
     """
     table = read_pose_table(path)
     columns, stated = table.columns, table.stated

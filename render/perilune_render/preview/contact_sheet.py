@@ -37,8 +37,8 @@ def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, 
 
     The frames are evenly spaced in time. Each frame is shown twice: without labels, and with labels and the outline of
     the elevation model, if there is one. The map shows all trajectories over the scene's ground. Prints a warning for
-    each Sun that leaves the site in shadow. Raises UserError if the engine is not installed or if poses do not fit the
-    ground; `where` names the source of the poses in the message.
+    each Sun that leaves the site in shadow. Raises UserError if the engine is not installed or if a pose fails
+    `check_poses`; `where` names the source of the poses in the message.
     """
     check_installed(config.render.engine)
     scene_plan = plan.scenes[0]

@@ -19,7 +19,7 @@ from perilune_shared.geometry.frames import Array
 _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
 """Wavelength, metres, and relative amplitude of each layer of patches."""
 RAYS_REACH = 9.0
-"""Length of the longest ray from the centre, crater radii."""
+"""Length of the longest ray from the centre, in crater radii."""
 RAYED_WEAR = 0.004
 """Smallest wear K/R^2 of craters that cannot have rays; K is `Craters.wear_m2` and R the radius."""
 
@@ -48,7 +48,7 @@ class _Rays(NamedTuple):
     width: Array
     """Angular standard deviation of the brightness across each ray, rad (N,)."""
     length: Array
-    """Lengths of the rays from the crater's centre, crater radii (N,)."""
+    """Lengths (N,) of the rays from the crater's centre, in crater radii."""
     fresh: float
     """Relative brightening of the rays at the crater's rim."""
 

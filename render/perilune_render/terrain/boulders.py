@@ -3,8 +3,9 @@
 Shapes are convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (short to
 intermediate axis 0.770, intermediate to long axis 0.758). Some are cut by planes, like fractured rocks.
 
-Deviation: near fresh craters, observed counts fall more steeply above 4.4 m (exponent -4). Here one exponent applies
-everywhere, and no boulder in the field around a crater is larger than a twentieth of the crater's diameter.
+Deviation from observations: near fresh craters, the observed number of boulders larger than D falls as D^-4 above
+4.4 m. Here it falls as D^-2.482 everywhere (`BoulderLaw`), and no boulder in the field around a crater is larger than a
+twentieth of the crater's diameter.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ if TYPE_CHECKING:
     import trimesh
 
 MAX_BOULDERS = 3_000_000
-"""Largest expected number of boulders on the plain, and also of boulders in all fields around craters. A boulder needs
-about 1 kB in a renderer."""
+"""Largest expected number of boulders in a scene. The limit applies separately to boulders spread over the whole ground
+and to boulders in the fields around craters. A boulder needs about 1 kB in a renderer."""
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
 _FIELD_DECAY = 0.7
-"""Decay length of a boulder field's density beyond the crater's rim, crater radii."""
+"""Decay length of a boulder field's density beyond the crater's rim, in crater radii."""
 FULL_SPACINGS = 5.0
-"""Smallest diameter of a boulder with the finer mesh, local vertex spacings."""
+"""Smallest diameter of a boulder with the finer of two meshes, in vertex spacings of the ground below the boulder."""
 _FARTHEST = 0.9
-"""Largest distance of a rock's surface from its centre, mean diameters; reached by the flattest, longest rock."""
+"""Largest distance of a rock's surface from its centre, in mean diameters. The flattest, longest rock reaches it."""
 N_POINTS, N_FEW_POINTS = 60, 14
 """Numbers of points from which the finer and the coarser mesh of a rock are made."""
 
@@ -73,12 +74,15 @@ class Boulders:
 def draw_boulders(
     config: BouldersConfig, grid: Grid, craters: Craters, seed: int, removed: Sequence[int] | np.ndarray = ()
 ) -> Boulders:
-    """Draw the boulders of a scene: a uniform density on the plain, and fields around young craters.
+    """Draw the boulders of a scene: a uniform density on the whole ground, and fields around young craters.
 
     Fields surround primary craters with a diameter of at least 10 m. At the rim of a newly formed crater the density of
-    its field is `field_density` times the density of the plain. It falls with distance as exp(-(x - 1) / 0.7), where x
-    = r/R, with age as (1 - age / 4 Gyr)^3, and with the crater's wear as exp(-K / 0.05 R^2); the last factor is our
-    choice.
+    its field is `field_density` times the uniform density. Three factors lower the density of a field:
+
+    - exp(-(x - 1) / 0.7), where x is the distance from the crater's centre in crater radii R;
+    - (1 - age / 4 Gyr)^3;
+    - exp(-K / (0.05 R^2)), where K is the crater's wear (`Craters.wear_m2`). This factor is our choice.
+
     The fields of `removed` craters (indices) are drawn and then omitted, so that all other fields stay unchanged.
     """
     rng = stream(seed, "boulders")
@@ -103,7 +107,8 @@ def draw_boulders(
 def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]:
     """The size law, the edges of the size bins (B + 1,), and a half-width for each bin (B,), metres.
 
-    Within this half-width, the ground is fine enough for the bin.
+    Boulders of a bin are drawn in a square with this half-width around the site. Farther out, the vertex spacing is too
+    large for boulders of the bin's smallest diameter (`min_diameter_spacings`).
     """
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
     edges = log_bins(smallest, config.max_diameter_m, 20)
@@ -112,7 +117,7 @@ def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]
 
 
 def check_boulders(config: BouldersConfig, grid: Grid) -> None:
-    """Raise UserError, before drawing, if the boulders of the plain would not fit in memory."""
+    """Raise UserError, before drawing, if the uniformly spread boulders would not fit in memory."""
     if config.density > 0 and config.min_diameter_spacings * float(grid.spacings_m.min()) < config.max_diameter_m:
         law, edges, half = _bins(config, grid)
         _check_number(float(expected_numbers(law, edges, np.square(2 * half)).sum()), "density")
@@ -136,7 +141,7 @@ def _fields(
     # The boulders of a field have at most a twentieth of the crater's diameter.
     largest = np.minimum(config.max_diameter_m, craters.diameter_m / 20)
     per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
-    # The integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
+    # With a = _FIELD_DECAY, the integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
     area = 2 * np.pi * radius**2 * (_FIELD_DECAY + _FIELD_DECAY**2)
     expected = config.field_density * young * per_area * area
     _check_number(float(expected.sum()), "field_density")

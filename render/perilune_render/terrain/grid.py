@@ -87,7 +87,7 @@ class Grid:
         return self.spacings_m[np.minimum(ring, len(self.half_widths_m) - 1)]
 
     def spacing_under(self, x_m: Array, y_m: Array) -> Array:
-        """Vertex spacing, metres, at positions in O_L (...), metres."""
+        """Vertex spacing, metres, at positions in O_L, metres; all arrays have one shape."""
         return self.spacing_at(np.maximum(np.abs(x_m - self.centre_x_m), np.abs(y_m - self.centre_y_m)))
 
     def half_width_for(self, spacing_m: float) -> float:

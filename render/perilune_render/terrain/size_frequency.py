@@ -1,7 +1,8 @@
 """Size-frequency laws of craters and boulders: one class for each published law.
 
-A law gives `csfd`, the cumulative number per square metre of objects with at least a given diameter. Its support is the
-range of diameters for which it is used, `min_diameter_m` to `max_diameter_m`. `draw_diameters` draws a population.
+A law gives `csfd`, the cumulative number per square metre of objects with at least a given diameter. Its support,
+`min_diameter_m` to `max_diameter_m`, is the range of diameters for which we use the law. The support is not enforced:
+the caller of `draw_diameters` chooses the range in which it draws a population.
 """
 
 from abc import ABC, abstractmethod
@@ -25,7 +26,7 @@ _NEUKUM_2001 = (
     8.25e-4,
     5.54e-5,
 )
-"""Coefficients of the powers 1 to 11 of log10(D / 1 km), in the decimal logarithm of the cumulative number."""
+"""Coefficients a_1 to a_11 of log10 N(>D) = a_0 + sum of a_i log10(D / 1 km)^i. `csfd` computes a_0 from the age."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,9 +34,9 @@ class SizeFrequency(ABC):
     """A size-frequency law over its support."""
 
     min_diameter_m: float
-    """Smallest diameter drawn, metres."""
+    """Lower end of the support, metres."""
     max_diameter_m: float
-    """Largest diameter drawn, metres."""
+    """Upper end of the support, metres."""
 
     @abstractmethod
     def csfd(self, diameter_m: ArrayLike) -> Array:
@@ -79,7 +80,7 @@ class TraskEquilibrium(SizeFrequency):
     """
 
     share: float = 1.0
-    """Density relative to the law; counts on other ground are lower."""
+    """Density as a multiple of the law. Counts on ground other than mare are lower than the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 1000.0
 
@@ -95,7 +96,7 @@ class MintonEquilibrium(SizeFrequency):
     """
 
     share: float = 1.0
-    """Density relative to the law."""
+    """Density as a multiple of the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 1000.0
 
@@ -107,11 +108,13 @@ class MintonEquilibrium(SizeFrequency):
 class ViperEquilibrium(SizeFrequency):
     """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per km^2 up to 80 m.
 
-    Above 80 m the law is extrapolated (our extension); there, production is lower than this law for most surface ages.
+    Above 80 m the law is extrapolated (our extension). The extrapolation matters for old surfaces: the production
+    function is above this law for diameters up to 74 m at an age of 1 Gyr, but up to 263 m at 3.5 Gyr. The law was
+    taken from a summary of the literature; its paper is unknown.
     """
 
     share: float = 1.0
-    """Density relative to the law."""
+    """Density as a multiple of the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 80.0
 
@@ -130,7 +133,7 @@ class ChangE4Equilibrium(SizeFrequency):
     """
 
     share: float = 1.0
-    """Density relative to the law."""
+    """Density as a multiple of the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 1000.0
 
@@ -142,10 +145,13 @@ class ChangE4Equilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoulderLaw(SizeFrequency):
-    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, used for the VIPER landing area."""
+    """Boulders of the VIPER landing area, N(>D) = 3e-4 D^-2.482 per square metre.
+
+    The law was taken from a summary of the literature; its paper is unknown.
+    """
 
     density: float = 1.0
-    """Density relative to the published law."""
+    """Density as a multiple of the law."""
     min_diameter_m: float = 0.2
     max_diameter_m: float = 5.0
 

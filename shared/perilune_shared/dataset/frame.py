@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
 ELLIPSE_COLUMNS = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
-"""Columns of the table labels that describe an ellipse."""
+"""Columns of the table `labels` that describe an ellipse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,9 @@ class Frame:
     """A frame, as returned by `dataset[i]`."""
 
     row: dict[str, Any]
-    """The frame's row in the table frames: pose, time, split, ...; column names contain the units."""
+    """The frame's row in the table `frames`: pose, time, split, ...; column names contain the units."""
     labels: pd.DataFrame
-    """The frame's rows in the table labels, one per crater."""
+    """The frame's rows in the table `labels`, one per crater."""
     png: bytes
     """Content of the PNG file."""
 

@@ -50,7 +50,7 @@ def index_rows(written: Iterable[WrittenFile]) -> pa.Table:
 
 
 def frame_rows(frames: pa.Table) -> pa.Table:
-    """Return the index rows of all files named in the table frames, by kind, then by row of frames.
+    """Return the index rows of all files named in the table `frames`, by kind, then by row of frames.
 
     Raises UserError if a frame has a path without size or hash.
     """
@@ -58,7 +58,7 @@ def frame_rows(frames: pa.Table) -> pa.Table:
 
 
 def scene_file_rows(scenes: pa.Table) -> pa.Table:
-    """Return the index rows of all files named in the table scenes.
+    """Return the index rows of all files named in the table `scenes`.
 
     Raises UserError if a scene has a path without size or hash.
     """

@@ -60,7 +60,7 @@ class KeyCheck:
     def __init__(self, dataset: Dataset, frames: pa.Table):
         """Check the keys of all tables except labels.
 
-        `frames` is the table frames with at least FRAME_COLUMNS. Raises UserError if a key is broken.
+        `frames` has at least the columns FRAME_COLUMNS of the table `frames`. Raises UserError if a key is broken.
         """
         self._dataset = dataset
         scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
@@ -83,7 +83,7 @@ class KeyCheck:
         self._seen: list[NDArray[np.int64]] = []
 
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
-        """Return the row number (N,) of each label's frame in the table frames.
+        """Return the row number (N,) of each label's frame in the table `frames`.
 
         `rows` has frame_id and crater_id. Raises UserError if a frame or crater is missing, or if a label and its frame
         have different scene_ids.

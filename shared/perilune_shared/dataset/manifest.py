@@ -78,11 +78,11 @@ class Dataset:
         return self.info.camera.intrinsics()
 
     def camera_of(self, row: Mapping[str, Any]) -> Camera:
-        """Return the camera of a frame, given its row in the table frames with the column `camera`."""
+        """Return the camera of a frame, given its row in the table `frames` with the column `camera`."""
         return self.info.camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     def exr_camera_of(self, row: Mapping[str, Any]) -> Camera:
-        """Return the camera of a frame's EXR, given its row in the table frames with the column `camera`."""
+        """Return the camera of a frame's EXR, given its row in the table `frames` with the column `camera`."""
         return self.info.exr_camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     @property
@@ -92,22 +92,22 @@ class Dataset:
 
     @functools.cached_property
     def scenes(self) -> pd.DataFrame:
-        """The table scenes; cached."""
+        """The table `scenes`; cached."""
         return self.table("scenes").to_pandas()
 
     @functools.cached_property
     def trajectories(self) -> pd.DataFrame:
-        """The table trajectories; cached."""
+        """The table `trajectories`; cached."""
         return self.table("trajectories").to_pandas()
 
     @functools.cached_property
     def frames(self) -> pd.DataFrame:
-        """The table frames; cached. Row i is frame `dataset[i]`."""
+        """The table `frames`; cached. Row i is frame `dataset[i]`."""
         return self.table("frames").to_pandas()
 
     @functools.cached_property
     def labels(self) -> pd.DataFrame:
-        """The table labels; cached, about 200 bytes of memory per label.
+        """The table `labels`; cached, about 200 bytes of memory per label.
 
         `table` can read single columns or a split.
         """
@@ -115,7 +115,7 @@ class Dataset:
 
     @functools.cached_property
     def craters(self) -> pd.DataFrame:
-        """The table craters; cached."""
+        """The table `craters`; cached."""
         return self.table("craters").to_pandas()
 
     def __len__(self) -> int:

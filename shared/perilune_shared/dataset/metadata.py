@@ -209,7 +209,7 @@ class DatasetInfo(_Info):
     cameras: dict[_CameraName, CameraRecord] | None = None
     """Cameras by name; null if there is only one camera.
 
-    The column `camera` of the table frames contains the name. The field `camera` above is the first of these cameras.
+    The column `camera` of the table `frames` contains the name. The field `camera` above is the first of these cameras.
     """
     exr_cameras: dict[_CameraName, CameraRecord] | None = None
     """Cameras of the EXRs by name; null without EXRs or if there is only one camera."""

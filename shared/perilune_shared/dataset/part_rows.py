@@ -35,7 +35,7 @@ def rows_of_part(
     columns = part.schema.names
     equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
     equal = {name: value for name, value in equal.items() if value is not None and name in columns}
-    # The table labels has no trajectory_id.
+    # The table `labels` has no trajectory_id.
     by_frame = trajectory_id is not None and "trajectory_id" not in columns and "frame_id" in columns
     prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
     groups = None

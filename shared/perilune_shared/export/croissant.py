@@ -108,8 +108,8 @@ def export_croissant(
 def metadata_of(dataset: Dataset) -> dict[str, Any]:
     """Return the description of a dataset as a JSON-LD object.
 
-    A table with one part is a FileObject with a hash. A table with several parts is a FileSet without a hash; the index
-    has the hashes of the parts. dataset.json is a FileSet too, since the description cannot contain its hash:
+    A table that is one file (part) is a FileObject with a hash. A table of several files is a FileSet without a hash;
+    the index has the hashes of its parts. dataset.json is a FileSet too, since the description cannot contain its hash:
     dataset.json contains the hash of the index, and the index contains the hash of the description.
     """
     info, hashes = dataset.info, table_hashes(dataset)

@@ -78,7 +78,7 @@ test = load_dataset("FOLDER", split="test")
 
 
 def schema_of() -> pa.Schema:
-    """Return the schema of the files: columns of the table frames, the image, and the list of labels."""
+    """Return the schema of the files: columns of the table `frames`, the image, and the list of labels."""
     columns = [TABLES["frames"].field("frame_id"), IMAGE]
     columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_OMITTED)]
     columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))

@@ -46,9 +46,9 @@ class SceneRows:
     scene_id: str
     """Id of the scene."""
     frames: pd.DataFrame
-    """Rows of the table frames, sorted by frame_id, with the added column `image_id`."""
+    """Rows of the table `frames`, sorted by frame_id, with the added column `image_id`."""
     labels: pd.DataFrame
-    """Rows of the table labels, sorted by frame_id and crater_id, with the added columns `label_id` and `chosen`."""
+    """Rows of the table `labels`, sorted by frame_id and crater_id, with the added columns `label_id` and `chosen`."""
 
 
 def scenes_of(

@@ -67,7 +67,7 @@ def export_kitti(dataset: Dataset, out: Address, progress: Progress, split: str 
 
 
 def poses_site_from_camera(frames: pd.DataFrame) -> Array:
-    """Return the camera poses of N rows of the table frames: matrices (N, 4, 4) from O_C to O_L, metres."""
+    """Return the camera poses of N rows of the table `frames`: matrices (N, 4, 4) from O_C to O_L, metres."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = matrix_from_quaternion(np.stack(frames["rotation_wxyz"].to_list())).swapaxes(1, 2)
     poses[:, :3, 3] = np.stack(frames["position_m"].to_list())

@@ -24,7 +24,7 @@ NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
 """Default mounting: the camera looks along -Z_B, and its x axis points along X_B.
 
-For a level body this is the paper's viewing direction, "along the negative axis of Z_L"."""
+For a level body this is the viewing direction in the paper by Song et al., "along the negative axis of Z_L"."""
 _MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""
 

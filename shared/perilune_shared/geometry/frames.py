@@ -1,6 +1,6 @@
 """Frames of reference and rotations.
 
-Names follow the paper (section "Coordinates"):
+Names follow the section "Coordinates" of the paper by Song et al. (cited in README.md):
 
 - O_S selenographic: latitude (north positive) and longitude (east positive) on a sphere of the IAU mean radius.
 - O_L landing site: origin at the ideal landing point, Z up, Y towards the Moon's south pole, X west
@@ -105,8 +105,8 @@ def selenographic_from_site(
     """Convert x and y in O_L, metres, to latitude and longitude, degrees.
 
     Inverse of `site_from_selenographic`; the site is at (latitude_deg, longitude_deg). The projection is azimuthal
-    equidistant: it preserves distance and bearing from the site. At a pole, where "towards the south pole" is
-    ambiguous, -Y is along the meridian longitude_deg.
+    equidistant: it preserves distance and bearing from the site. At a pole, "towards the south pole"
+    does not define Y: there, the meridian longitude_deg leaves the site along +Y (north pole) or -Y (south pole).
     """
     west, south = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
     distance = np.hypot(west, south)

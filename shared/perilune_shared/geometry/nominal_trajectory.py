@@ -1,8 +1,8 @@
 """The nominal trajectory: the planned path, which the guidance knows before the flight.
 
-The paper uses "a parabola" from 1500 m to 200 m without details. Here the vertical speed is constant, and the
-horizontal speed decreases linearly to zero at the end point: p(t) = p0 + v0 t + a t^2 / 2 with a horizontal a. The path
-is a parabola with a horizontal axis; it is vertical at its end.
+The paper by Song et al. uses "a parabola" from 1500 m to 200 m without details. Here the vertical speed is constant,
+and the horizontal speed decreases linearly to zero at the end point: p(t) = p0 + v0 t + a t^2 / 2 with a horizontal a.
+The path is a parabola with a horizontal axis; it is vertical at its end.
 """
 
 from collections.abc import Sequence

@@ -73,7 +73,7 @@ def label_bound_px(info: DatasetInfo) -> float:
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:
     """Return the labels of one split or all, with the columns that `selected` needs and `columns`.
 
-    Rows are in the order of the table labels. Depth and diameter (metres) come from the table craters, joined by
+    Rows are in the order of the table `labels`. Depth and diameter (metres) come from the table `craters`, joined by
     scene_id and crater_id. Raises UserError if a part cannot be read, or if keys of labels and frames are inconsistent.
     """
     names = list(dict.fromkeys(["frame_id", "scene_id", "crater_id", *_THRESHOLDED, *columns]))

@@ -173,8 +173,8 @@ def check_plain_file(path: Path) -> int:
 def new_folder(out: Path) -> Iterator[Path]:
     """Yield a hidden folder beside `out`; rename it to `out` on success, remove it on any failure.
 
-    Files are synchronised to disk before the rename. Hidden folders that killed writers left for the same `out` are
-    removed. Raises UserError if `out` is not empty or another process is writing to it.
+    Files are synchronised to disk before the rename. If an earlier process was killed while it wrote to the same `out`,
+    its hidden folder is removed. Raises UserError if `out` is not empty or another process is writing to it.
     """
     check_free(out)
     out = out.absolute()  # "." has no name from which to form a temporary name

@@ -10,7 +10,7 @@ _MAX_BYTES = 8 * 2**30
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 """Limits of compression: n bytes may become _SPARE_BYTES + _MAX_COMPRESSION n bytes. Real data compresses less."""
 _NESTED_ROWS = "labels."
-"""Prefix of the columns of a shard that contain rows of the table labels: any number of rows for each frame."""
+"""Prefix of the columns of a shard that contain rows of the table `labels`: any number of rows for each frame."""
 
 
 @dataclass(frozen=True, slots=True)

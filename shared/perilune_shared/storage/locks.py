@@ -32,7 +32,7 @@ TEMPORARY_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder that is written in place; remove temporary files left by killed writers.
+    """Hold the lock of a folder that is written in place; remove temporary files of killed processes.
 
     Creates the folder and its parents if they do not exist, and removes them again if they stay empty. Raises UserError
     if another process holds the lock.
@@ -50,7 +50,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove temporary files of killed writers at any depth.
+    """Remove temporary files that killed processes left, at any depth.
 
     Call it only if no other process writes in the folder.
     """

@@ -30,7 +30,8 @@ def file_system(kind: str, address: str) -> Any:
 
     options: dict[str, Any] = {} if kind == "memory" else {"use_listings_cache": False}
     if kind == "s3":
-        # fsspec caches file systems by their options, so pass the variable: it may change within a process.
+        # fsspec reuses a file system if the options are equal. With AWS_ENDPOINT_URL among the options, a new value
+        # of the variable opens a new file system.
         options |= {"endpoint_url": os.environ.get("AWS_ENDPOINT_URL"), "config_kwargs": _TIMEOUTS_S}
     try:
         with store_faults(address):
@@ -49,8 +50,8 @@ def is_missing_bucket(error: Exception) -> bool:
 def store_faults(address: str) -> Iterator[None]:
     """Convert any exception of an object store to a UserError that names `address`.
 
-    Requests are not repeated, since the library has already done so. FileExistsError and FileNotFoundError about a
-    single object are not converted, since callers handle them.
+    Failed requests are not repeated here, since the library of the store repeats them. FileExistsError and
+    FileNotFoundError about a single object are not converted, since callers handle them.
     """
     try:
         yield

@@ -16,10 +16,11 @@ _COLUMNS = ["frame_id", "trajectory_id", "frame_index", "time_s", "split", "posi
 
 
 def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault]:
-    """Yield the faults of a scene's frames in a dataset with several cameras; `where` is their file.
+    """Yield the faults of a scene's frames in a dataset with several cameras.
 
-    The pose of the body is computed from the pose and the mounting of each camera. Body pose, time and split must be
-    equal for all cameras at one instant. Frames of unknown cameras are skipped; `trajectory_faults` reports them.
+    `where` is the file of the frames. The pose of the body is computed from the pose and the mounting of each camera.
+    Body pose, time and split must be equal for all cameras at one instant. Frames of unknown cameras are skipped;
+    `trajectory_faults` reports them.
     """
     cameras = dataset.info.cameras or {}
     rows = dataset.table("frames", _COLUMNS, scene_id=scene_id).to_pandas()
@@ -38,8 +39,8 @@ def camera_faults(dataset: Dataset, scene_id: str, where: str) -> Iterator[Fault
         off = np.abs(numbers - numbers[first]).max(axis=1)
     for row in np.flatnonzero(~(off <= _TOLERANCE))[:1]:
         other = rows["frame_id"][first[row]]
-        expected = f"the pose and time of {other} by the mountings in dataset.json, to {_TOLERANCE:g}"
-        found = f"{rows['frame_id'][row]}, a difference of {off[row]:.3g}"
+        expected = f"at most {_TOLERANCE:g}, with the mountings in dataset.json"
+        found = f"a difference of {off[row]:.3g} between body pose or time of {rows['frame_id'][row]} and {other}"
         yield Fault.of(where, None, "position_m+rotation_wxyz", found, expected)
     splits = rows["split"].to_numpy()
     for row in np.flatnonzero(splits != splits[first])[:1]:

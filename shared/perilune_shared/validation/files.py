@@ -108,7 +108,7 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
 
 
 def _named_files(dataset: Dataset, table: str, kinds: Sequence[ImageKind | SceneFileKind]) -> pa.Table:
-    """Return path, bytes and sha256 of the files that the table frames or scenes names."""
+    """Return path, bytes and sha256 of the files that the table `frames` or `scenes` names."""
     pieces = [pa.schema([field.with_nullable(True) for field in INDEX]).empty_table()]
     if dataset.info.images == "files":
         columns = [f"{kind}_{name}" for kind in kinds for name in ("path", "bytes", "sha256")]
@@ -188,7 +188,7 @@ def _cure(path: str) -> str:
 
 
 def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]:
-    """Compare the index with the files that the table frames or scenes names.
+    """Compare the index with the files that the table `frames` or `scenes` names.
 
     Yields the first difference in path, in size and in hash. These faults name the index folder as their file.
     """

@@ -64,7 +64,7 @@ def _file_faults(dataset: Dataset, frame: dict, kind: str, row: int, where: str)
 def png_faults(dataset: Dataset, png: bytes, frame: dict, row: int, where: str) -> Iterator[Fault]:
     """Yield the faults of a PNG in size, hash and header; `where` is the file to report.
 
-    `frame` is the row of the PNG in the table frames, and `row` its number to report.
+    `frame` is the row of the PNG in the table `frames`, and `row` its number to report.
     """
     if len(png) != frame["png_bytes"]:
         yield Fault.of(where, row, "png_bytes", len(png), frame["png_bytes"])

@@ -78,7 +78,7 @@ def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_
 
 
 def _manifest_rows(dataset: Dataset, rows: pa.Table) -> tuple[pa.Table, pa.Table]:
-    """Return the rows of the tables frames and labels for all trajectories in a row group."""
+    """Return the rows of the tables `frames` and `labels` for all trajectories in a row group."""
     keys = rows.group_by(["scene_id", "trajectory_id"]).aggregate([]).to_pylist()
     tables = []
     for name in ("frames", "labels"):

@@ -43,7 +43,7 @@ _MAX_OPEN_SHARDS = 16
 """Largest number of shards that a worker keeps open. An open shard of an object store holds its footer."""
 _NESTED = ("image", "labels")
 COLUMNS = tuple(name for name in SHARDS.names if name not in _NESTED)
-"""Columns of the table frames; all are read by default."""
+"""Columns of the table `frames`; all are read by default."""
 _STATE = ("batch_size", "seed", "processes", "workers", "frames")
 
 
@@ -54,11 +54,11 @@ class StreamedFrame:
     number: int
     """Number of the frame within its split, from 0, in the order of the shards."""
     row: dict[str, Any]
-    """The frame's row of the table frames."""
+    """The frame's row of the table `frames`."""
     png: bytes
     """Content of the PNG file."""
     labels: pa.StructArray
-    """The frame's rows of the table labels, without the columns that `row` has."""
+    """The frame's rows of the table `labels`, without the columns that `row` has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class FrameContent:
     """What a stream reads of each frame."""
 
     columns: tuple[str, ...] = COLUMNS
-    """Columns of the table frames."""
+    """Columns of the table `frames`."""
     images: bool = True
     """Whether to read the images; otherwise `StreamedFrame.png` is empty."""
 

@@ -1,5 +1,7 @@
 """Relative poses of a moving camera, homographies of the ground plane, and dead reckoning.
 
+O_L is the frame of the landing site, O_C the frame of the camera (perilune_shared.geometry.frames).
+
 The motion from frame 1 to frame 2 is given in O_C of frame 1: `translation_m` = R1 (p2 - p1) and
 `rotation_c2_from_c1` = R2 R1^T, with R = rotation_camera_from_site and p = position_m in O_L.
 A point X1 in O_C of frame 1 has the coordinates X2 = rotation_c2_from_c1 (X1 - translation_m) in O_C of frame 2.

@@ -1,4 +1,7 @@
-"""The datasets of the locked benchmark, checked against the shared manifests."""
+"""The datasets of the locked benchmark, checked against the manifests that the repository provides.
+
+The locked benchmark is a test set for final figures (docs/how-to/benchmark.md). Its manifests are in data_manifests/.
+"""
 
 from dataclasses import dataclass
 
@@ -16,7 +19,8 @@ REGIONS = {
     "npb": "elevation model",
     "npc": "elevation model",
 }
-"""Region of each part, by the end of the part's name."""
+"""Group in which the results of each dataset are listed, by the last word of the dataset's name. npb and npc are the
+elevation models NPB_1km.tif and NPC_2km.tif."""
 _POSE = ("position_m", "rotation_wxyz", "sun_direction")
 
 
@@ -25,11 +29,11 @@ class Part:
     """One rendered dataset of the benchmark."""
 
     name: str
-    """Name of the dataset and of its manifest: benchmark-<kind>-<part>."""
+    """Name of the dataset and of its manifest: benchmark-<detect or nav>-<key of `REGIONS`>."""
     dataset: Dataset
     """The rendered frames."""
     n_locked: int
-    """Number of frames in the shared manifest; the dataset may have fewer."""
+    """Number of frames in the manifest; the dataset may have fewer."""
 
     @property
     def region(self) -> str:
@@ -43,9 +47,10 @@ def part_names(kind: str) -> list[str]:
 
 
 def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
-    """Open the benchmark's datasets of a kind in the folder `data`, and compare them with the shared manifests.
+    """Open the benchmark's datasets of a kind in the folder `data`, and compare them with their manifests.
 
-    Raises UserError if there is no such dataset, or if a scene or a frame differs from the manifest.
+    Raises UserError if there is no such dataset, if a dataset is not finished, or if a scene or a frame differs from
+    the manifest.
     """
     store, locked = open_store(data), open_store(manifests)
     parts = []

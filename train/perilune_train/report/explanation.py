@@ -1,4 +1,8 @@
-"""The report's sections on explain runs and on the paper's claims: verdicts, tables and pictures."""
+"""The report's sections on attention gates and on the paper's claims: verdicts, tables and pictures.
+
+An explain run is a run of `perilune-train explain` or `perilune-train causal`; its folder contains claims.json,
+captions.json and pictures.
+"""
 
 import re
 from collections.abc import Mapping
@@ -39,9 +43,10 @@ def explanation_section(run: Run, key: str, title: str) -> Section:
 
 
 def headline_of(run: Run) -> str:
-    """The headline of an explain run on one line; empty if the run has no headline (rendered interventions).
+    """The headline of an explain run on one line; empty if the run has no headline.
 
-    If the headline contains only undecided verdicts, the text gives the reason once.
+    Runs of `perilune-train causal` have no headline. If no verdict of the headline is decided, the text is one sentence
+    with the first undecided verdict, which includes its reason.
     """
     headline = run.metrics.get("headline")
     if not isinstance(headline, str):
@@ -56,7 +61,7 @@ def headline_of(run: Run) -> str:
 def paper_section(folder: Path, run: Run) -> Section:
     """The section on the paper's claims, with verdicts and pictures.
 
-    `folder` is the folder of the experiment; `run` has the content of its paper.json.
+    `folder` is the folder of the experiment. `run.metrics` is the content of paper.json in this folder.
     """
     rows, number = [], 1
     while f"verdict/{number}/claim" in run.metrics:
@@ -87,7 +92,8 @@ def _counted(verdicts: list[str]) -> str:
 def read_claims(path: Path) -> list[dict[str, str]]:
     """Read claims.json, a list of objects whose values are strings; an empty list if there is no such file.
 
-    The keys are claim, figure, interval, nulls, verdict, picture; a missing value becomes "-". Raises UserError on
+    The keys are the fields of `explain.page.claims.Claim`: claim, figure (the measured number), interval, nulls (the
+    numbers for null maps or controls), verdict, picture (a file name). A missing value becomes "-". Raises UserError on
     other content.
     """
     if not path.is_file():

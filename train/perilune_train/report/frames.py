@@ -38,7 +38,7 @@ class LabelledFrames:
     matches: Matches
     """Detections matched at IoU 0.5."""
     first_label: NDArray[np.intp]
-    """Index (N,) of each frame's first label among the labels of all frames, which `matches` uses."""
+    """Index (N,) of each frame's first label in `matches`, which numbers the labels of all frames consecutively."""
     has_detections: bool
     """Whether the detections come from a run; False if there is no run."""
     provenance: Provenance
@@ -52,7 +52,7 @@ class LabelledFrames:
         return np.divide(2 * hits, hits + false + labels, out=np.full(count, np.nan), where=labels > 0)
 
     def picture(self, index: int, first_words: str = "") -> FramePicture:
-        """One frame with the marks of its labels and detections."""
+        """One frame with the marks of its labels and detections. The caption begins with `first_words`."""
         frame_labels = self.split.labels[index]
         rows = np.flatnonzero(self.matches.frame == index)
         missed = frame_labels.selected.copy()
@@ -127,8 +127,8 @@ def frame_uri(image: NDArray[np.uint8]) -> str:
 def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Provenance | None) -> Viewer:
     """The descent that the viewer shows, with at most 60 frames.
 
-    It is the descent of the masks, or the first test trajectory without a file of masks. Raises UserError if the file
-    of masks is damaged or contains other frames.
+    This is the descent in the file `masks`; if `masks` is None, it is the first test trajectory. Raises UserError if
+    the file is damaged or does not begin with a test frame of the dataset.
     """
     names = frames.split.frames.table["frame_id"].tolist()
     content = None if masks is None else read_masks(masks)
@@ -151,8 +151,10 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
 def read_masks(path: Path) -> dict[str, NDArray[Any]]:
     """Read a file of masks, as written by `explain.maps.masks.save_masks`: all arrays by name.
 
-    The arrays are frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) for each block. Raises
-    UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
+    The arrays are frame_ids (N,), blocks (B,), finite low and high (B,), and uint8 (N, h, w) for each block. A block is
+    the name of a gate, such as B_11.
+
+    Raises UserError if an array is missing or has another shape, type or range, or if the file is damaged or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -185,7 +185,7 @@ def _check_inputs(run: RunFolder, inputs: Hashes, skip_missing: bool) -> None:
 
 
 def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
-    """Key, old value and new value of each setting in which plain settings differ from a section."""
+    """Key, old value and new value of each setting in which a dictionary of settings differs from a section."""
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
         key, value = f"{where}.{name}", getattr(config, name)

@@ -80,8 +80,8 @@ class StopDiverged(Callback):
 class KeepBest(Callback):
     """Save the weights whenever the validation metric `monitor` improves; NaN is no improvement.
 
-    The task has `architecture` (plain settings) and `evaluated` (the network to evaluate and save), and may have
-    `terrain` (the record of its training terrain, as plain data).
+    The task has `architecture` and `evaluated`, the network to evaluate and save. It may have `terrain`, the record of
+    its training terrain. `save_weights` describes `architecture` and `terrain`.
     """
 
     def __init__(self, run: RunFolder, monitor: str, mode: Literal["min", "max"]):

@@ -49,7 +49,11 @@ class RunFolder:
 
     @property
     def best(self) -> Path:
-        """Weights with the best validation metric, from `save_weights`; weights.safetensors of a shipped model."""
+        """The weights with the best validation metric.
+
+        The file is weights.safetensors if it exists (in the folder of an installed model), otherwise
+        checkpoints/best.ckpt, which `save_weights` writes.
+        """
         shipped = self.root / ("weights" + SUFFIX)
         return shipped if shipped.is_file() else self.root / "checkpoints" / "best.ckpt"
 
@@ -103,9 +107,10 @@ def is_first_process() -> bool:
 def save_weights(
     path: Path, architecture: Mapping[str, Any], network: nn.Module, terrain: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a network's weights with the plain settings (`architecture`) that rebuild it.
+    """Write a network's weights with the settings (`architecture`) that rebuild the network.
 
-    `terrain` is the plain record of the terrain that the network was fitted to (provenance.py); None leaves it unknown.
+    `terrain` is the record of the terrain that the network was fitted to (`records.provenance.Provenance.plain`). With
+    None, the file has no such record. Both consist of numbers, texts, lists and dictionaries only.
     """
     # Save to memory first: torch reports a full disk as a RuntimeError, not as an OSError.
     content = io.BytesIO()
@@ -117,8 +122,8 @@ def save_weights(
 def load_weights(path: Path) -> dict[str, Any]:
     """Read a file that `save_weights` or `write_half` wrote: `{"architecture": settings, "state_dict": tensors}`.
 
-    The tensors are on the CPU, and finite. The architecture is a dictionary of plain values; the loader of each kind of
-    network checks them. The key `terrain` (provenance.py) may be present.
+    The tensors are on the CPU, and finite. The architecture is a dictionary of numbers, texts, lists and dictionaries;
+    the loader of each kind of network checks them. The key `terrain` may be present (see `save_weights`).
 
     Raises UserError if the file is missing, is damaged or has other content.
     """
@@ -177,7 +182,7 @@ def choose_device(device: str) -> str:
 
 
 def choose_bf16(precision: Precision, device: str) -> bool:
-    """Whether to compute in bfloat16: as set, and with `auto` if the hardware supports it."""
+    """Whether to compute in bfloat16. With `auto`, true if the hardware supports bfloat16."""
     if precision != "auto":
         return precision == "bf16"
     if device == "cuda":

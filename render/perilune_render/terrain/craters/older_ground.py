@@ -12,7 +12,7 @@ from perilune_render.terrain.craters.profile import REACH
 from perilune_shared.geometry.frames import Array
 
 _PLANE_REACH = 1.3
-"""Radius of the circle within which the plane is fitted, fresh crater radii."""
+"""Radius of the circle within which the plane is fitted, in radii of the fresh crater."""
 
 
 class Window(NamedTuple):

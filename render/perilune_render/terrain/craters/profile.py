@@ -32,13 +32,13 @@ from scipy import ndimage
 from perilune_shared.geometry.frames import Array
 
 REACH = 3.0
-"""Distance at which profiles end, crater radii."""
+"""Distance at which profiles end, in crater radii."""
 DEPTH_OVER_RIM = np.linspace(1.5, 9.0, 16)
 """Ratios of fresh depth to fresh rim height for which the crest's radius is tabulated."""
 _FARTHEST_CREST = 1.5
-"""Largest radius of a worn crest, fresh crater radii."""
+"""Largest radius of a worn crest, in radii of the fresh crater."""
 _DOMAIN, _N_RADIAL = 6.0, 600
-"""Radius of the grid on which diffusion is solved, crater radii, and its number of cells."""
+"""Radius, in crater radii, of the grid on which diffusion is solved, and the number of its cells."""
 _CREST = 0.036822
 """Height of Fassett & Thomson's inner polynomial at x = 0.98, where the crest begins, divided by the diameter."""
 MIN_WEAR, MAX_WEAR, N_WEAR = 2e-4, 0.6, 56
@@ -103,7 +103,7 @@ class _End(NamedTuple):
     """One end of a cubic."""
 
     x: float
-    """Distance from the crater's centre, radii."""
+    """Distance from the crater's centre, in crater radii."""
     value: float
     """Value at x."""
     slope: float

@@ -9,8 +9,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
 REACH_RADII = 4.0
-"""Distance from a removed crater beyond which no height changes, crater radii. Profiles end at 3 radii. Younger craters
-on the changed ground change heights farther out, by less than a millimetre; this is neglected."""
+"""Distance from a removed crater beyond which no height changes, in crater radii. Profiles end at 3 radii. Younger
+craters on the changed ground change heights farther out, by less than a millimetre; this is neglected."""
 
 
 def indices_of(crater_ids: Sequence[int], n_real: int, n_craters: int, seed: int) -> np.ndarray:

@@ -21,15 +21,17 @@ class Rims:
     normal: Array
     """Unit normal of the plane through the rim, O_L (N, 3)."""
     depth_m: Array
-    """Depths, at least 0, metres (N,): mean height of the rim, minus the height of the floor, minus `Stamped.sag_m`.
-    The height of the floor is the mean of the height at the centre and the mean height at a fifth of the radius."""
+    """Depths, metres (N,), at least 0: mean height of the rim, minus height of the floor, minus the `sag_m` of
+    `measure_rims`. For the height of the floor, heights at a fifth of the radius are averaged; the floor is halfway
+    between this average and the height at the centre."""
 
 
 def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:
     """Fit a plane to 16 points of each rim by least squares, and measure the depth below the rim.
 
-    `sag_m` (N,) is subtracted from the depth: the bowl of a large old crater must not count as depth of a small worn
-    crater on its floor.
+    `sag_m` (N,), metres, is the height difference from rim to centre of the older ground under each crater
+    (`stamp.Stamped`). It is subtracted from the depth, because the bowl of a large old crater must not count as depth
+    of a small worn crater on its floor.
     """
     angle = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
     cos, sin = np.cos(angle), np.sin(angle)

@@ -27,9 +27,9 @@ def margin_m(sides_m: tuple[float, float]) -> float:
 
 
 def fade(distance_m: Array, wavelength_m: float) -> Array:
-    """Share (...) of the model's relief of one wavelength L that remains at a distance d from the model.
+    """Share of the model's relief of one wavelength L that remains at distances d from the model.
 
-    It is exp(-(d / 0.3 L)^2), with slope 0 at the edge. Both arguments are in metres.
+    The share is exp(-(d / (0.3 L))^2), with slope 0 at the edge. Both arguments are in metres.
     """
     return np.exp(-((distance_m * _WAVES / (_FADE * wavelength_m)) ** 2))
 

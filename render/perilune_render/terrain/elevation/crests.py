@@ -13,26 +13,26 @@ from perilune_render.terrain.elevation.model import ElevationModel, raster_place
 from perilune_shared.geometry.frames import Array
 
 MIN_PIXELS = 8.0
-"""Smallest diameter for which a crest is measured, pixels of the model."""
+"""Smallest diameter for which a crest is measured, in pixels of the model."""
 _N_AZIMUTHS, _N_RADII = 36, 64
 _NEAR, _FAR = 0.5, 2.0
-"""Inner and outer end of the profiles, radii of the crater."""
+"""Inner and outer end of the profiles, in radii of the crater."""
 _SEARCH = 0.3
 """Half-width of the search for a crest, as a share of the radius at which the median profile is highest."""
 _PLANE_FROM = 1.5
-"""Inner radius of the ground to which the plane is fitted, radii of the crater."""
+"""Inner radius of the ground to which the plane is fitted, in radii of the crater."""
 _MIN_SHARE = 0.7
 """Smallest share of directions in which a crest must be found."""
 _LARGEST_RMS = 0.1
-"""Largest r.m.s. distance of the crest from the ellipse, radii."""
+"""Largest r.m.s. distance of the crest from the ellipse, in mean radii of the ellipse."""
 _MIN_RATIO = 0.7
 """Smallest ratio of the ellipse's axes."""
 _LARGEST_SHIFT = 0.4
-"""Largest distance between the catalogued and the measured centre, radii of the crater."""
+"""Largest distance between the catalogued and the measured centre, in radii of the crater."""
 _MIN_DEPTH = 0.02
-"""Smallest depth of the centre below the crest, diameters."""
+"""Smallest depth of the centre below the crest, in diameters of the crater."""
 _OUTLIER = 2.5
-"""Distance from the ellipse above which a direction is excluded from the fit, standard deviations."""
+"""Distance from the ellipse above which a direction is excluded from the fit, in standard deviations."""
 _CHUNK = 256
 """Number of craters that are measured at once."""
 
@@ -119,7 +119,7 @@ def _fit(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array) -> _Fit
 
 
 def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
-    """Radius of the crest in each direction (N, A), crater radii, and whether there is a crest (N, A).
+    """Radius (N, A) of the crest in each direction, in crater radii, and whether there is a crest (N, A).
 
     A crest is a maximum of the profile (N, A, R) inside a range around the highest point of the median profile; a
     maximum at the end of this range does not count.

@@ -141,9 +141,9 @@ def _source_of(files: RasterFiles, used: set[str]) -> str:
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Column and row of positions (...) on O_L's plane, metres.
+    """Column and row in the raster of the positions x_m, y_m on O_L's plane; all arrays have one shape.
 
-    Both are 0 at the raster's top left corner.
+    Column and row are 0 at the raster's top left corner.
     """
     lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
     column, row = model.raster.places(np.ravel(lat), np.ravel(lon))
@@ -169,7 +169,7 @@ def resolved_m(model: ElevationModel) -> float:
 
 
 def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
-    """Distance, metres, of raster coordinates (...) from known ground; above 0 in holes and outside."""
+    """Distance, metres, of raster coordinates from known ground; above 0 in holes and outside the model."""
     rows, columns = model.height_m.shape
     down = np.maximum(np.maximum(-row, row - rows), 0) * model.pixel_sides_m[0]
     across = np.maximum(np.maximum(-column, column - columns), 0) * model.pixel_sides_m[1]

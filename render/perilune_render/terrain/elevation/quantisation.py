@@ -6,19 +6,19 @@ from scipy import ndimage
 from perilune_shared.geometry.frames import Array
 
 _MIN_SLOPE = 1e-3
-"""Largest step that makes no visible terraces, as a multiple of the pixel size."""
+"""Slope (step divided by pixel size) up to which terraces are not visible."""
 _MIN_REPEATS = 4
-"""Smallest mean number of pixels per distinct height of quantised heights."""
+"""Heights count as quantised only if each distinct value occurs in at least this number of pixels, on average."""
 _WIDEST_TERRACE_PX = 64
 _GENTLE = 3.5
 """Range of heights over 3 x 3 pixels, in steps, below which roughness is attributed to rounding, not to the ground."""
 
 
 def step_of(height_m: Array, pixel_m: float) -> float:
-    """The quantisation step, metres, of known heights (N,); 0 without a step that makes visible terraces.
+    """Quantisation step, metres, of finite heights (N,); 0 if no step makes visible terraces.
 
-    Heights are quantised if values repeat and each height above the lowest is within a twentieth of a step of a
-    multiple of the step.
+    Heights are quantised if values repeat and all differences from the lowest height are multiples of the step, to
+    within a twentieth of the step.
     """
     distinct = np.unique(height_m)
     if len(distinct) < 3 or len(height_m) < _MIN_REPEATS * len(distinct):

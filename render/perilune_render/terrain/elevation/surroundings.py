@@ -104,7 +104,7 @@ def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
 
 
 def _response(ratio: Array) -> Array:
-    """`second_differences` of gradient noise of amplitude 1, for ratios (...) of baseline to wavelength."""
+    """`second_differences` of gradient noise of amplitude 1, for ratios of baseline to wavelength."""
     baselines, deviations = _measured_response()
     return np.interp(ratio, baselines, deviations)
 

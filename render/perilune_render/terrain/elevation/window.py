@@ -117,14 +117,18 @@ def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
 
 
 def places_of(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Column and row of positions (...) on O_L's plane, metres."""
+    """Column and row in the raster of the positions x_m, y_m on O_L's plane; all arrays have one shape."""
     latitude, longitude = selenographic_from_site(x_m, y_m, site.latitude_deg, site.longitude_deg)
     column, row = raster.places(np.ravel(latitude), np.ravel(longitude))
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
 
 
 def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Finite columns and rows of positions (N,); in a map that repeats, columns nearest to the site."""
+    """Columns and rows of the positions that the map can show, followed by the site's own column and row.
+
+    If the map repeats every 360 degrees of longitude, a position has many columns; the column nearest to the site is
+    returned.
+    """
     column, row = places_of(raster, site, x_m, y_m)
     good = np.isfinite(column) & np.isfinite(row)
     column, row = column[good], row[good]

@@ -36,8 +36,8 @@ def test_light_from_all_sides_does_not_agree():
     agreement, count = agreement_of_light(image, found)
     assert count == 12 and agreement < 0.01
     assert doubt_of(image, found) == (
-        f"agreement of the light on 12 craters: got {agreement:.2f}, expected at least 0.8 from one Sun; is it a "
-        "picture of the Moon?"
+        f"agreement (0 to 1) of the light directions of 12 craters: got {agreement:.2f}, expected at least 0.8 under "
+        "one Sun; is it a picture of the Moon?"
     )
 
 
@@ -68,7 +68,7 @@ def test_predict_warns_of_a_collage_and_not_of_the_moon(tmp_path):
     done = in_process.call(main, "detect", "predict", LUNAR, tmp_path / "collage.png", "--out", tmp_path / "out")
     warnings = [line for line in done.stderr.splitlines() if line.startswith("warning")]
     assert done.returncode == 0 and len(warnings) == 1
-    assert warnings[0].startswith("warning: collage.png: agreement of the light on ")
+    assert warnings[0].startswith("warning: collage.png: agreement (0 to 1) of the light directions of ")
 
 
 def test_many_doubts_are_counted(tmp_path):

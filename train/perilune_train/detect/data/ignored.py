@@ -55,8 +55,8 @@ def unlabelled_craters(
     """Shapes (M, 10) of the craters to ignore in a frame.
 
     The columns are box (x0, y0, x1, y1), radius and ellipse (centre x and y, semi-axes, all in pixels, and direction in
-    radians). `frame` is a row of the table frames, `radius_px` the range of labelled radii, and `labelled` has the ids
-    of the craters with a label in this frame.
+    radians). `frame` is a row of the table `frames`, `radius_px` the range of labelled radii, and `labelled` has the
+    ids of the craters with a label in this frame.
 
     Craters within a factor of sqrt(2) of the range, and craters centred off the image, are ignored, as COCO ignores
     objects outside its area range. A crater of 1.9 px looks like a crater of 2.1 px. If the smaller crater were

@@ -152,8 +152,8 @@ def frame_labels(
 ) -> FrameLabels:
     """Labels and ignored craters of one frame.
 
-    `row` is its row of the table frames, `labels` its rows of the table labels, and `craters` the craters of its scene.
-    Raises UserError if the crater of a label is missing.
+    `row` is the frame's row of the table `frames`, `labels` its rows of the table `labels`, and `craters` the craters
+    of its scene. Raises UserError if the crater of a label is missing.
     """
     ids = labels["crater_id"].to_numpy()
     known = (np.append(craters.crater_id, -1)[np.searchsorted(craters.crater_id, ids)] == ids) & (ids >= 0)
@@ -182,7 +182,7 @@ class _SceneLabels:
 
     @classmethod
     def of(cls, labels: pa.Table, craters: Craters, selection: Selection) -> "_SceneLabels":
-        """Convert rows of the table labels; all their craters must exist."""
+        """Convert rows of the table `labels`; all their craters must exist."""
         ids = labels["crater_id"].to_numpy()
         row = np.searchsorted(craters.crater_id, ids)
         depth_m, diameter_m = craters.depth_m[row], craters.diameter_m[row]

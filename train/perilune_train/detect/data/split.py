@@ -57,9 +57,10 @@ def load_split(
 ) -> DetectSplit:
     """Load the frames and labels of a split, or of one process's share of it.
 
-    `scale` has the smallest and the largest zoom factor that will be applied to frames; the range of ignored craters is
-    extended accordingly. For the edge scoring rule, pass a largest factor of 1 / EDGE, so that the ignored craters
-    extend below EDGE times the smallest radius.
+    Training and evaluation ignore craters whose radius is slightly outside the labelled range (`detect.data.ignored`).
+    `scale` has the smallest and the largest factor by which frames will be resized; a wider interval makes the range of
+    ignored craters wider. The edge scoring rule counts false positives down to EDGE (`detect.evaluate.matching`) times
+    the smallest labelled radius, so it needs ignored craters below this radius: pass 1 / EDGE as the largest factor.
 
     Raises UserError if a file is damaged, if the network cannot use the frame size, or if there are fewer frames than
     processes.
@@ -88,8 +89,8 @@ def check_frame_size(dataset: Dataset) -> None:
 def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
     """Smallest and largest selected radius, pixels.
 
-    If the settings have no radii, these are the extremes of all labels of the dataset, NaN without labels. If the
-    settings have no largest radius, it is the largest radius that the dataset labels.
+    If the settings have no radii, returns the extremes of all labels of the dataset; NaN if there are no labels. If the
+    settings have only a smallest radius, the largest radius is the dataset's upper limit for labels (`label_bound_px`).
     """
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()

@@ -158,7 +158,7 @@ class ExportedFiles:
     size_px: int = 256
     """Width and height of the network's input, pixels."""
     int8: bool = False
-    """Whether to try quantisation to 8-bit integers."""
+    """Whether to try quantisation to 8-bit integers, which is kept only if it is faster and nearly as accurate."""
 
 
 def export_run(
@@ -170,9 +170,11 @@ def export_run(
 ) -> Int8Verdict | None:
     """Export a run's detector to the new folder `out`, and check the files.
 
-    Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (metadata)
-    and README.md. Compares the outputs of the files with torch's on frames of the dataset's validation split, or on
-    noise without a dataset.
+    Writes detector.onnx, detector.xml and .bin (as selected), detector.json (metadata) and README.md. Also writes
+    detector-int8.onnx if quantisation makes the network faster and loses little AP (`Int8Verdict.kept`).
+
+    Compares the outputs of the files with torch's on frames of the dataset's validation split, or on noise without a
+    dataset.
 
     Raises UserError, and writes nothing, if a file's output differs from torch's, if the dataset has frames of another
     size, or if int8 would be calibrated on terrain of a test split (of the run or of the dataset). `allow_overlap`

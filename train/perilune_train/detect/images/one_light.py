@@ -1,14 +1,14 @@
 """Warn about pictures that are not of the Moon.
 
-In a lunar picture, the Sun lights all craters from the same side. The grey levels inside the box of a crater change
-from its lit to its shaded side. `agreement_of_light` is the length of the mean of the unit vectors of these directions:
-1 if all directions are equal, near 0 if they are random.
+In a lunar picture, the Sun lights all craters from the same side. The grey levels inside the box of a crater
+increase in a direction that depends on the Sun. `agreement_of_light` is the length of the mean of these directions
+(unit vectors): 1 if all directions are equal, near 0 if they are random.
 
 With the installed detector, 192 lunar pictures (12 crops of Narrow Angle Camera images, 180 rendered frames) have an
 agreement of 0.87 to 0.99. Of 35 other pictures (from the wheels of scikit-image 0.26 and scikit-learn 1.9, and six
-charts of docs/pictures), 26 have ten or more detections, with an agreement of 0.04 to 0.79. The threshold was chosen on
-every second picture. In the other half, it flags 0 of 96 lunar pictures and 12 of 12 other pictures
-(`benchmarks/train/one_light.py`, `--most 60`).
+charts of docs/pictures), 26 have ten or more detections, with an agreement of 0.04 to 0.79. `MIN_AGREEMENT` was chosen
+on every second picture. Among the remaining pictures with ten or more detections, it flags none of the 96 lunar
+pictures and all 12 pictures of other things (`benchmarks/train/one_light.py`, `--most 60`).
 """
 
 import cv2
@@ -27,7 +27,9 @@ _SIDE, _FLAT = 16, 1e-6
 _STEPS = np.linspace(-1, 1, _SIDE)
 _IN_DISC = np.hypot(_STEPS, _STEPS[:, None]) <= 1
 _WEIGHTS = np.stack([np.where(_IN_DISC, _STEPS, 0.0), np.where(_IN_DISC, _STEPS[:, None], 0.0)])
-"""Weights (2, 16, 16) of the slope of grey levels along x and y in the disc inside a box."""
+"""Weights (2, 16, 16) of the grey levels of a box that is resized to 16 x 16 pixels.
+
+The two weighted sums are proportional to the slope of the grey levels along x and y, in the disc inside the box."""
 
 
 def doubt_of(image: NDArray[np.uint8], detections: Detections) -> str | None:
@@ -35,8 +37,8 @@ def doubt_of(image: NDArray[np.uint8], detections: Detections) -> str | None:
     agreement, count = agreement_of_light(image, detections)
     if count < MIN_CRATERS or agreement >= MIN_AGREEMENT:
         return None
-    got = f"got {agreement:.2f}, expected at least {MIN_AGREEMENT} from one Sun; is it a picture of the Moon?"
-    return f"agreement of the light on {count} craters: {got}"
+    got = f"got {agreement:.2f}, expected at least {MIN_AGREEMENT} under one Sun; is it a picture of the Moon?"
+    return f"agreement (0 to 1) of the light directions of {count} craters: {got}"
 
 
 def agreement_of_light(image: NDArray[np.uint8], detections: Detections) -> tuple[float, int]:

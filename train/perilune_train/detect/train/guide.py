@@ -13,8 +13,8 @@ _REACHES = (1.0, 1.1, 1.2, 1.3, 1.4)
 _LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """1 - G in the crater, in each ring and beyond the last ring, where G is the paper's mask."""
 _WINDOWS = (4.0, 16.0)
-"""Craters are painted in three groups. These are the largest radii of the first two groups, rings included, in map
-pixels."""
+"""Craters are painted in three groups by size. These are the largest radii of the first two groups, rings included, in
+pixels of the array that is painted."""
 _TINY = 1e-6
 
 
@@ -22,8 +22,9 @@ _TINY = 1e-6
 def craterness(targets: Targets, frames: int, height: int, width: int, stride: int) -> Tensor:
     """1 - G (frames, 1, height, width): 1 in craters, steps down to 0.2 in rings around them, 0 elsewhere.
 
-    G is the paper's mask. Craters are the ellipses in the label boxes that predictors of any scale learn. A pixel of
-    the map is `stride` image pixels wide; values are computed at pixel centres.
+    G is the paper's mask. A crater is the ellipse inscribed in a label box, with axes along the image axes. Only labels
+    that are assigned to a predictor (`targets`) count. A pixel of the result is `stride` image pixels wide; values are
+    computed at pixel centres.
     """
     boxes = torch.cat([assignment.boxes for assignment in targets]).float()
     frame = torch.cat([assignment.predictors[0] for assignment in targets])
@@ -45,7 +46,7 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
 def _paint(painted: Tensor, rows: Tensor, side: int) -> None:
     """Paint craters into `painted`, each in a window of `side` pixels.
 
-    `rows` (N, 5) are the frame and the box of each crater, in map pixels.
+    `rows` (N, 5) are the frame and the box of each crater, in pixels of `painted`.
     """
     _, height, width = painted.shape
     centre, half = (rows[:, 1:3] + rows[:, 3:]) / 2, ((rows[:, 3:] - rows[:, 1:3]) / 2).clamp(min=_TINY)

@@ -21,7 +21,10 @@ _BATCH = 8
 
 @dataclass(frozen=True)
 class DetectionPerformance:
-    """Average precision of a detector on single labelled frames, to be called with images of these frames."""
+    """Function from images (N, height, width) to a detector's average precision on each image.
+
+    The images show N labelled frames, unchanged or after an intervention.
+    """
 
     detector: Detector
     """The detector, at scale 1 only, because an attention mask belongs to one scale."""
@@ -52,12 +55,16 @@ class DetectionPerformance:
 
 @dataclass(frozen=True)
 class MotionPerformance:
-    """Position error of a stack navigator on runs of pairs. Each run starts from the initial state of the LSTM."""
+    """Function from images of stacked frame pairs to a stack navigator's position error on each pair.
+
+    A run is a sequence of consecutive pairs. Each run starts from the initial state of the LSTM.
+    """
 
     navigator: StackNavigator
     """The network, in evaluation mode."""
     truth_m: Values
-    """True translations in O_C of the earlier frame, or positions in O_L, (runs, pairs, 3), metres."""
+    """Truth of the network's first three outputs (runs, pairs, 3), metres: for a network that estimates motion, the
+    translation in O_C of the earlier frame; for a network that estimates the pose, the position in O_L."""
     mean_m: Values
     """Mean of the truth over the training set (3,), metres."""
     spread_m: Values

@@ -1,4 +1,4 @@
-"""Measure how similar masks stay if images change: noise, shifts, another lens, another rendering."""
+"""Measure how similar attention masks stay if images change: noise, shifts, another lens, another rendering."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ class Changes:
     shifts_px: tuple[tuple[int, int], ...] = ((1, 0), (0, 1), (3, -2))
     """Shifts to the right and down, pixels."""
     lenses: tuple[float, ...] = (-0.05, 0.05)
-    """Radial distortions: relative change of the distance from the centre, at half the image width from the centre.
-    Negative values are barrel distortion."""
+    """Radial distortions: a point at half the image width from the centre moves outwards by this fraction of its
+    distance. Negative values (barrel distortion) move it inwards."""
 
 
 DEFAULT_CHANGES = Changes()
@@ -30,7 +30,7 @@ DEFAULT_CHANGES = Changes()
 
 
 def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Images with Gaussian noise of a standard deviation in grey values, rounded and limited to 0..255."""
+    """Images with added Gaussian noise of standard deviation sigma_dn, rounded and limited to 0..255."""
     return np.clip(np.rint(images + rng.normal(0, sigma_dn, images.shape)), 0, 255).astype(np.uint8)
 
 
@@ -61,12 +61,12 @@ def stability(
     changes: Changes = DEFAULT_CHANGES,
     stacked: int = 1,
 ) -> pd.DataFrame:
-    """Pearson correlation between the masks of images (N, height, width) and the masks of the changed images.
+    """Pearson correlation between attention masks of images (N, height, width) and of the changed images.
 
-    Columns: map, change ("noise 2 DN", "shift 3 -2 px", "lens -5 %"), frame_index, pearson (NaN if a mask is constant).
-    A shift of the masks is undone before the comparison. For another lens (`lens_map`), the original masks are
-    resampled as the images are. Only pixels that both images show are compared. `stacked` is the number of frames that
-    are stacked in height in each image; each frame is changed separately.
+    Columns: map (name of the mask's gate), change ("noise 2 DN", "shift 3 -2 px", "lens -5 %"), frame_index, pearson
+    (NaN if a mask is constant). A shift of the masks is undone before the comparison. For another lens (`lens_map`),
+    the original masks are resampled as the images are. Only pixels that both images show are compared. `stacked` is the
+    number of frames that are stacked in height in each image; each frame is changed separately.
     """
     before = masks_of(images)
     tables = []

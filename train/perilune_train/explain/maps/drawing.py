@@ -41,7 +41,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Se
 
 
 def caption(block: str, mask: NDArray[np.floating]) -> str:
-    """A block's name with the range of its mask, or with "constant" and the value if the mask does not vary."""
+    """A gate's name with the range of its mask, or with "constant" and the value if the mask does not vary."""
     span = f"constant {mask.mean():.3f}" if is_constant(mask) else f"{mask.min():.3f}-{mask.max():.3f}"
     return f"{block} {span}"
 

@@ -16,7 +16,8 @@ from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
 
 Masks = dict[str, NDArray[np.float32]]
-"""Masks (N, height, width) of N images by block "B_ij", resized to the size of the frames."""
+"""Masks (N, height, width) of N images, resized to the size of the images, by the name of the gate. The gate after
+residual unit j of stage i is called block "B_ij" (`AttentionDarknet53`)."""
 
 _BATCH = 8
 MAX_PX = 64
@@ -89,8 +90,8 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
 def save_masks(path: Path, frame_ids: Sequence[str], masks: Masks) -> None:
     """Write an .npz file with frame_ids (N,), blocks (B,), low (B,), high (B,), and the masks of each block.
 
-    `masks` has arrays (N, height, width) by block, the name of a gate. They are stored as uint8 (N, h, w) under the
-    name of the block, at reduced size. Values 0 to 255 represent the range from `low` to `high` of the block's masks.
+    `masks` has arrays (N, height, width) by block. They are stored as uint8 (N, h, w) under the name of the block, at
+    reduced size. Values 0 to 255 represent the range from `low` to `high` of the block's masks.
     """
     arrays: dict[str, np.ndarray] = {}
     for block, block_masks in masks.items():

@@ -12,10 +12,11 @@ _POLL_S = 0.1
 
 
 class Ahead(Generic[Key, Item]):
-    """Computes items in a background thread, at most `n_ahead` before they are needed.
+    """Computes items in a background thread, before they are needed.
 
-    `make(keys)` runs in the thread and yields the items of these keys. `following(key)` yields a key and the keys that
-    are needed after it. If `take` is called with a key other than the expected one, the thread restarts at that key.
+    At most `n_ahead` finished items wait. `make(keys)` runs in the thread and yields (key, item) for each of `keys`.
+    `following(key)` yields `key` and the keys that are needed after it. If `take` is called with a key other than the
+    expected one, the thread restarts at that key.
     """
 
     def __init__(

@@ -56,7 +56,7 @@ class Pairs:
 def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> float:
     """Export a run's navigator to the new folder `out`; returns its largest relative difference from torch.
 
-    Writes navigator.onnx, navigator.json (metadata) and README.md. The graph is for the camera of the dataset, or
+    Writes navigator.onnx, navigator.json (metadata) and README.md. The ONNX graph is for the camera of the dataset, or
     without a dataset for the camera of the training. For the comparison, ONNX Runtime runs pair by pair and passes the
     state on; torch runs over the whole sequence at once. The input is the first validation descent of the dataset, or
     noise. Raises UserError, and writes nothing, if the outputs differ by more than MAX_DIFFERENCE.

@@ -1,4 +1,7 @@
-"""A trained navigator as one graph, from one pair of frames and the LSTM's state to the motion and the new state."""
+"""A trained navigator as one torch module for the export to ONNX.
+
+Its inputs are one pair of frames and the state of the LSTM; its outputs are the motion and the new state.
+"""
 
 import copy
 from typing import Any
@@ -14,7 +17,7 @@ INPUTS = {
     "warp": ("first", "second", "nominal_translation_m", "altitude_m", "hidden", "cell"),
     "stack": ("first", "second", "hidden", "cell"),
 }
-"""Names of the graph's inputs, by fusion."""
+"""Names of the inputs of the ONNX graph, by the navigator's setting `fusion` (how it combines both frames)."""
 OUTPUTS = ("translation_m", "rotation_c2_from_c1", "hidden_out", "cell_out")
 
 
@@ -22,8 +25,9 @@ class FlightNavigator(nn.Module):
     """A navigation network together with the scaling of its output.
 
     Inputs: two frames (1, height, width), normalised; the hidden and the cell state (2, 1, hidden), zero at the start
-    of a descent; for warp also the nominal translation (1, 3) and altitude (1,), metres. Outputs: the translation
-    (1, 3), metres, O_C of the earlier frame; the rotation (1, 3, 3); the new hidden and cell state.
+    of a descent. With fusion `warp` also the nominal (planned) translation (1, 3), O_C of the earlier frame, and the
+    nominal altitude (1,), both in metres. Outputs: the translation (1, 3), metres, O_C of the earlier frame; the
+    rotation (1, 3, 3) from the earlier to the later camera; the new hidden and cell state.
     """
 
     def __init__(self, network: nn.Module, architecture: dict[str, Any], focal_over_width: float):
@@ -37,7 +41,7 @@ class FlightNavigator(nn.Module):
             self.network.focal_over_width = focal_over_width
             # ONNX has no operator that solves linear equations.
             self.network.solved = solved_by_elimination  # type: ignore[method-assign]
-        # The exporter sets all parts to the mode of the whole module.
+        # The exporter switches all submodules to the mode (training or evaluation) of this module.
         self.eval()
 
     def forward(self, first: Tensor, second: Tensor, *known: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

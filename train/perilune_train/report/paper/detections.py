@@ -35,7 +35,7 @@ class Detected:
 
 
 def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
-    """Read a run's detections. Raises UserError if they are missing, damaged or from other frames.
+    """Read a run's detections. Raises UserError if they are missing, damaged or not from the test split.
 
     `trained` is the folder of the training run, which has the settings and the threshold; by default it is `run`.
     """

@@ -1,4 +1,4 @@
-"""Write the page of the paper's experiment from the finished runs: verdicts, tables, figures, deviations."""
+"""Write the page of the paper's experiment from the finished runs: verdicts, tables, pictures, deviations."""
 
 import shutil
 from collections.abc import Sequence
@@ -51,9 +51,11 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
     """Write paper.md, paper.json and pictures into the folder of the experiment's runs; return the page's path.
 
     `dataset` is the detection dataset of the headline ground, the ground on which networks are compared. `about` has
-    lines on how the experiment was run and what was left out. `headline_share` is the equilibrium_share of the headline
-    ground; by default, it is the point of the curve whose AP is nearest to the paper's AP. A section without finished
-    runs contains only a note. Raises UserError if no run is finished.
+    lines on how the experiment was run and what was left out. `headline_share` is the equilibrium_share (crater
+    density) of the headline ground. By default, it is the equilibrium_share at which the validation AP of our YOLOv3
+    without attention is nearest to the paper's AP.
+
+    A section without finished runs contains only a note. Raises UserError if no run is finished.
     """
     runs = PaperRuns(root)
     if not root.is_dir():
@@ -122,7 +124,7 @@ def _claims(answered: list[Verdict]) -> list[str]:
         [verdict.claim, verdict.claimed, verdict.measured, verdict.trainings, f"**{verdict.answer}**"]
         for verdict in answered
     ]
-    head = ["claim", "the paper", "measured here, with against without attention", "training runs", "verdict"]
+    head = ["claim", "the paper", "measured here: with attention against without", "training runs", "verdict"]
     return [f"{len(answered)} claims of the paper: {counted}.", "", *table(head, rows), "", verdict_note()]
 
 
@@ -253,7 +255,7 @@ def _attention(runs: PaperRuns) -> list[str]:
 
 
 def _figures(read: dict[str, Metrics], answered: list[Verdict]) -> Metrics:
-    """All figures of the page by flat keys: <folder of a run>/<metric> and verdict/<number>/<part>."""
+    """Numbers and verdicts of the page by flat keys: <folder of a run>/<metric> and verdict/<number>/<part>."""
     figures: Metrics = {}
     for folder, metrics in read.items():
         figures |= {f"{folder}/{key}": value for key, value in metrics.items() if not key.startswith("run/")}

@@ -29,9 +29,9 @@ class Verdict:
     claim: str
     """The claim."""
     claimed: str
-    """The paper's figures, with against without attention."""
+    """The paper's values: with attention against without, such as 0.9 against 0.8."""
     measured: str
-    """Our figures, with against without attention."""
+    """Our values: with attention against without."""
     trainings: str
     """Number of training runs on which the answer is based."""
     answer: Answer

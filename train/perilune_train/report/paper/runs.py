@@ -1,15 +1,20 @@
 """The runs of the paper's experiment: the names of their folders, and which runs are finished.
 
+A ground is the terrain under the frames of one dataset. Grounds differ in `equilibrium_share`, the density of small
+craters as a share of the equilibrium density. The headline ground is the ground on which networks are compared. Our
+usual ground, `lunar`, has the craters and the relief of the preset `paper`.
+
 Folders and files below the root of the runs:
 
-    detect/curve-<share>            YOLOv3 without attention on grounds of rising density; <share> is the
-                                    equilibrium_share as text, or `lunar` for our usual ground
+    detect/curve-<share>            YOLOv3 without attention on grounds of increasing crater density; <share> is the
+                                    equilibrium_share as text, or `lunar`
     detect/<network>                headline ground, full width; networks are the keys of `ATTENTION`
     detect/<network>-half-<seed>    headline ground, half width, seeds `SEEDS`
     detect/sparse-<network>         sparse ground, full width
     detect/lunar-<network>          our usual ground, with labels by the paper's rule
     detect/long-<network>           headline ground, full width, more epochs
-    detect/transfer-<network>       headline ground, started from our own network, with frozen epochs
+    detect/transfer-<network>       headline ground, started from our own network; the backbone, except its attention
+                                    gates, is frozen in the first epochs
     navigate/<navigator>-stack, navigate/<navigator>-attitude-stack, navigate/<navigator>-motion-stack
                                     pose in O_L (as we read the paper), pose in O_L with attitude noise, and motion
                                     between frames
@@ -43,20 +48,21 @@ SEEDS = (0, 1, 2)
 """Random seeds of the training runs at half width."""
 HEADLINE, SPARSE, USUAL, TRANSFER, LONG = "", "sparse", "lunar", "transfer", "long"
 """First parts of the names of runs. HEADLINE, SPARSE and USUAL are grounds. TRANSFER and LONG are variants of training
-on the headline ground: after transfer, and with more epochs."""
+on the headline ground: started from our own network, and with more epochs."""
 SPARSE_SHARE = "0.1"
 """equilibrium_share of the sparse ground."""
 CURVE = "curve"
-"""First part of the names of the runs on grounds of rising density."""
+"""First part of the names of the runs on grounds of increasing crater density."""
 NAVIGATORS = {"Darknet53-LSTM": "darknet53-lstm", "attention-Darknet53-LSTM": "attention-darknet53-lstm"}
-"""First part of the names of the navigate runs, by the paper's name of the network. Folder names end in -stack."""
+"""First part of the names of the navigate runs, by the paper's name of the network."""
 READINGS = {"pose": "", "attitude": "-attitude", "motion": "-motion"}
-"""Last part of the names of the navigate runs, for what they estimate: pose in O_L, pose in O_L with attitude noise,
-motion between frames."""
+"""What a navigator estimates, by our two readings of the paper: the pose in O_L (without and with attitude noise), or
+the motion between frames. The values are the last parts of the names of the navigate runs. Folders have these names
+followed by -stack."""
 EXPLAINED = "attention"
 """Name of the explain run."""
 CAUSES = "paper-causes.json"
-"""File with the ablations of the three causes."""
+"""File with the ablations of three possible causes of a low AP: loss, gates and ground."""
 BENCHMARK_FILE = "benchmark.json"
 
 
@@ -136,7 +142,7 @@ class PaperRuns:
         return {share: metrics for share, metrics in ordered.items() if metrics is not None}
 
     def navigation(self, reading: str) -> dict[str, Metrics]:
-        """Metrics of the finished navigators in one of the `READINGS`, by the paper's names."""
+        """Metrics of the finished navigate runs for one reading, a key of `READINGS`, by the paper's names."""
         folders = {name: self.navigator(navigate_name(network, reading)) for name, network in NAVIGATORS.items()}
         read = {name: finished(folder) for name, folder in folders.items()}
         return {name: metrics for name, metrics in read.items() if metrics is not None}

@@ -111,7 +111,7 @@ def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]
 
 
 def table_3(runs: PaperRuns, reading: str) -> list[str]:
-    """Table III for one of the `READINGS` as lines of Markdown, with the RMSE per component and of the vector."""
+    """Table III for one reading, a key of `READINGS`, as lines of Markdown: RMSE per component and of the vector."""
     rows = []
     navigation = runs.navigation(reading)
     for network, claimed in NAVIGATION.items():

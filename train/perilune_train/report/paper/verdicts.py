@@ -131,7 +131,7 @@ def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
 
 
 def _as_fast(runs: PaperRuns) -> Verdict:
-    """Verdict from the seconds per pair in each of the `READINGS` and on the benchmark.
+    """Verdict from the seconds per pair for each reading (key of `READINGS`) and on the benchmark.
 
     Times of two networks are compared only if they were measured on equal hardware by the same command.
     """
