@@ -428,11 +428,12 @@ def descent(
     seed: Annotated[int, typer.Option(help="Random seed of the errors of the prior and the catalogue.")] = 0,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Write a descent of a dataset as the input files of `navigate fly`.
+    """Write a descent as files for `navigate fly`.
 
-    Writes frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv. The prior has random
-    errors. The catalogue has the errors of a catalogue made from orbit: 1 m in position, 3 % in diameter, one in ten
-    craters missing, one in twenty false.
+    Writes frames/, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml and truth.csv, and star_tracker.csv
+    and doppler_lidar.csv if the dataset has such measurements. The prior has random errors. The catalogue has the
+    errors of a catalogue made from orbit: 1 m in position, 3 % in diameter, one in ten craters missing, one in twenty
+    false.
     """
     ids = tuple(trajectory.split("/"))
     if len(ids) != 2:
@@ -449,8 +450,7 @@ def descent(
 
     with replaceable(out, ("camera.yaml", "prior.yaml"), overwrite=overwrite, inputs=(dataset,)) as folder:
         count = unpack_descent(open_single(dataset), (ids[0], ids[1]), folder, grade, exact, offset, seed)
-    names = "frames, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml, truth.csv"
-    say(f"{out}: {count} frames; {names}")
+    say(f"{out}: {count} frames; {', '.join(sorted(path.name for path in out.iterdir()))}")
 
 
 add_renamed(app, "unpack", "descent", descent)

@@ -7,15 +7,16 @@ import pytest
 from tests.train.landing.craters.crater_world import CAMERA, ground_m, sighted, world
 
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
+from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
 from perilune_train.landing.craters.catalogue import CatalogueErrors, with_errors
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.landing.filter.flight import Instruments, fly, fly_together, together
-from perilune_train.landing.filter.lander import Lander, Surroundings
+from perilune_train.landing.filter.lander import Beam, Lander, LidarErrors, Surroundings
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
-from perilune_train.landing.filter.state import N_ERRORS, State
+from perilune_train.landing.filter.state import EXACT_CAMERA, N_ERRORS, CameraErrors, State
 
 GRADE = GRADES["tactical"]
 NOISE = InertialNoise.of(GRADE)
@@ -25,18 +26,18 @@ POSITION_M, VELOCITY_MPS = np.array([-300.0, 100, 1400]), np.array([9.0, -4, -35
 NOTHING = Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
-def lander(seed, off_m=20.0, claimed_m=20.0, moved_m=0.0):
+def lander(seed, off_m=20.0, claimed_m=20.0, moved_m=0.0, camera=EXACT_CAMERA):
     """A lander whose start is off, its catalogue with errors, and the generator of its measurements."""
     rng = np.random.default_rng(seed)
     biases = np.radians(GRADE.gyro_bias_deg_per_h) / HOUR_S, GRADE.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
     sigmas = np.repeat([claimed_m, 1.0, np.radians(0.3), *biases], 3)
     position = POSITION_M + off_m * rng.normal(size=3) + [moved_m, 0, 0]
-    start = State.starting(position, VELOCITY_MPS + rng.normal(size=3), np.eye(3), sigmas, 5.0)
+    start = State.starting(position, VELOCITY_MPS + rng.normal(size=3), np.eye(3), sigmas, 5.0, camera)
     catalogue = with_errors(WORLD, CatalogueErrors(), rng)
     return Lander(start, NOISE, Surroundings(CAMERA, MOUNTING, catalogue, 2.0, 5.0)), rng, biases
 
 
-def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda k: True):
+def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda k: True, mounting=MOUNTING, late_s=0.0):
     """Fly a straight line; returns position errors (n, 3), normalised errors squared (n,), and statuses by frame."""
     # What repeats with a crater is drawn once.
     shift = STATIC_SHARE * WORLD.radius_m[:, None] * rng.normal(size=(len(WORLD), 3)) * [1, 1, 0]
@@ -46,7 +47,7 @@ def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda 
     position, errors, squared, status = POSITION_M, [], [], []
     for k in range(round(seconds / STEP_S)):
         if k * STEP_S % 1 == 0:
-            seen = sighted(apparent, Pose(position, MOUNTING), rng, static=False)
+            seen = sighted(apparent, Pose(position + late_s * VELOCITY_MPS, mounting), rng, static=False)
             craft.sightings(see(k * STEP_S, seen))
             errors.append(craft.state.position_m - position)
             own = [*range(3), *range(6, 9)]
@@ -182,9 +183,86 @@ def test_senseless_measurements_change_nothing(value):
     before = craft.state
     assert not craft.range(value)
     assert not craft.range(-3.0)
+    assert not craft.attitude(np.full((3, 3), value), np.full(3, 1e-4))
+    craft.beam(Beam(np.array([0.3, 0.0, -0.95]), value, value), LidarErrors(0.05, 2.0, 0.2))
     craft.inertial(Increments.single(0.05, 0.05, np.full(3, value), np.zeros(3)))
     craft.inertial(Increments.single(-1.0, 0.05, np.zeros(3), np.zeros(3)))
     assert craft.state is before
+
+
+STAR_SIGMAS_RAD = np.radians(np.array([10.0, 10.0, 60.0]) / 3600)
+
+
+def with_stars(craft, rng):
+    """Feed an attitude of a star tracker before each frame."""
+
+    def see(t, seen):
+        noise = STAR_SIGMAS_RAD * rng.normal(size=3)
+        assert craft.attitude(matrix_from_rotation_vector(noise), STAR_SIGMAS_RAD)
+        return seen
+
+    return see
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 0.15])
+def test_a_star_tracker_and_an_unknown_mounting(turn_deg):
+    """The mounting's error about each axis is estimated; with an exact mounting the attitude becomes more accurate."""
+    turn = np.radians(turn_deg) * np.array([1.0, -1.0, 0.5])
+    craft, rng, biases = lander(3, camera=CameraErrors(mounting_sigma_deg=0.1 if turn_deg else 0.0))
+    mounting = matrix_from_rotation_vector(turn) @ MOUNTING
+    errors, _, status = flown(craft, rng, biases, see=with_stars(craft, rng), mounting=mounting)
+    assert set(status) == {"tracking"}
+    state = craft.state
+    sigma = np.sqrt(np.diag(state.covariance))
+    np.testing.assert_allclose(state.mounting_rad, turn, atol=3.5 * sigma[21] + 1e-12)
+    assert np.linalg.norm(errors[-1]) < 2.0
+    # Without a star tracker the attitude is known to about 0.03 degrees.
+    assert np.degrees(sigma[6:8]).max() < 0.01
+    assert np.degrees(np.linalg.norm(rotation_vectors(state.rotation_site_from_body))) < 0.05
+
+
+def test_time_tags_that_are_late():
+    """The error of the position is along the velocity, and its stated size grows with the doubt about the time."""
+    late_s, sigmas = 0.05, {}
+    for sigma_s in (0.0, 0.05):
+        craft, rng, biases = lander(4, camera=CameraErrors(time_tag_sigma_s=sigma_s))
+        errors, _, status = flown(craft, rng, biases, late_s=late_s)
+        assert set(status) == {"tracking"}
+        along = VELOCITY_MPS / np.linalg.norm(VELOCITY_MPS)
+        sigmas[sigma_s] = np.sqrt(along @ craft.state.covariance[:3, :3] @ along)
+        last = errors[-1]
+    # The last flight, which doubts its times.
+    assert abs(last @ along) < 3 * sigmas[0.05]
+    assert np.linalg.norm(last - along * (last @ along)) < 1.5
+    assert sigmas[0.05] > 2 * sigmas[0.0]
+
+
+def test_a_camera_that_is_mounted_upside_down_is_not_tracked_for_long():
+    upside_down = np.diag([-1.0, -1.0, 1.0]) @ MOUNTING
+    errors, _, status = flown(*lander(5), mounting=upside_down)
+    wrong = np.linalg.norm(errors, axis=1) > 20
+    assert not any(status[k] == "tracking" for k in np.flatnonzero(wrong))
+    assert "lost" in status
+
+
+def test_beams_of_a_lidar_give_the_velocity():
+    speeds = {}
+    directions = np.array([[0.38, 0, -0.925], [-0.19, 0.33, -0.925], [-0.19, -0.33, -0.925]])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    for with_lidar in (False, True):
+        craft, rng, biases = lander(2)
+
+        def see(t, seen, craft=craft, rng=rng, with_lidar=with_lidar):
+            for direction in directions if with_lidar else ():
+                end_m = (POSITION_M[2] + VELOCITY_MPS[2] * t) / -direction[2]
+                beam = Beam(direction, VELOCITY_MPS @ direction + 0.02 * rng.normal(), end_m + 2 * rng.normal())
+                craft.beam(beam, LidarErrors(0.02, 2.0, 1.0))
+            return seen
+
+        flown(craft, rng, biases, see=see, seconds=8)
+        speeds[with_lidar] = np.sqrt(np.trace(craft.state.covariance[3:6, 3:6]))
+        assert np.linalg.norm(craft.state.velocity_mps - VELOCITY_MPS) < 4 * speeds[with_lidar]
+    assert speeds[True] < 0.7 * speeds[False]
 
 
 def test_no_sightings_for_long_is_lost():

@@ -99,6 +99,50 @@ def test_one_line_exit_code_2_and_nothing_written(tmp_path, change, words, monke
     assert sorted(path.name for path in tmp_path.iterdir()) == ["descent"]
 
 
+STARS = "time_s,rotation_w,rotation_x,rotation_y,rotation_z\n10.5,1,0,0,0\n11.5,,,,\n"
+LIDAR = "time_s,beam_x_body,beam_y_body,beam_z_body,speed_mps,range_m\n10.5,0.6,0,-0.8,24,1100\n10.5,0,0,-1,30,\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("star_tracker", STARS.replace("1,0,0,0", "1,1,0,0"), ["csv:2: rotation_w", "a unit quaternion, or nothing"]),
+        ("star_tracker", STARS.replace("11.5", "10.5"), ["csv:3: time_s", "above 10.5"]),
+        ("star_tracker", STARS.replace("rotation_y", "rotation_k"), ["columns", "no rotation_y"]),
+        ("star_tracker", STARS.replace("10.5", "1.05e19").replace("11.5", "1.15e19"), ["time_s", "divide by 1e9"]),
+        ("doppler_lidar", LIDAR.replace("0.6", "0.7"), ["csv:2: beam_z_body", "a unit vector"]),
+        ("doppler_lidar", LIDAR.replace("0,0,-1", "0,0,1"), ["csv:3: beam_z_body", "1.0", "points down"]),
+        ("doppler_lidar", LIDAR.replace("10.5,0,", "10.4,0,"), ["csv:3: time_s", "at least 10.5"]),
+        ("doppler_lidar", LIDAR.replace("24", "fast"), ["csv:2: speed_mps", "fast", "a number"]),
+        ("doppler_lidar", LIDAR.replace("10.5", "510.5"), ["time_s", "the clock of"]),
+    ],
+)
+def test_wrong_measurements_of_other_sensors(tmp_path, file, content, words, monkeypatch):
+    folder = write_descent(tmp_path / "descent")
+    (folder / f"{file}.csv").write_text(content, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    option = "--" + file.replace("_", "-"), folder / f"{file}.csv"
+    done = in_process.call(main, "navigate", "fly", *options(folder), *option, "--out", "flight")
+    assert done.returncode == 2, done.stdout + done.stderr
+    (line,) = done.stderr.strip().splitlines()
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "flight").exists()
+
+
+@pytest.mark.parametrize("change", [["--no-imu"], []], ids=["both", "neither"])
+def test_an_inertial_unit_is_given_or_refused(tmp_path, change):
+    folder = write_descent(tmp_path / "descent")
+    words = options(folder)
+    if not change:
+        del words[words.index("--imu") : words.index("--imu") + 2]
+    done = in_process.call(main, "navigate", "fly", *words, *change, "--out", tmp_path / "flight")
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert "--imu" in line and "--no-imu" in line
+    assert not (tmp_path / "flight").exists()
+
+
 @pytest.mark.parametrize("live", ["live.txt", "live"])
 def test_a_live_picture_that_is_no_png(tmp_path, live):
     folder = write_descent(tmp_path / "descent")

@@ -60,6 +60,39 @@ def test_without_craters_it_follows_the_inertial_unit_and_says_so(plain):
     assert sigma[-1, 0] > sigma[0, 0]
 
 
+def test_a_star_tracker_and_a_doppler_lidar_make_it_more_certain(tmp_path, plain):
+    folder = write_descent(tmp_path / "descent")
+    time_s = np.arange(9.0, 12.5, 0.5)
+    level = {f"rotation_{axis}": float(axis == "w") for axis in "wxyz"}
+    pd.DataFrame({"time_s": time_s, **level}).to_csv(folder / "star_tracker.csv", index=False)
+    beams = {"beam_x_body": 0.6, "beam_y_body": 0.0, "beam_z_body": -0.8}
+    along = VELOCITY_MPS @ list(beams.values())
+    rows = {"time_s": time_s, **beams, "speed_mps": along, "range_m": [None] * len(time_s)}
+    pd.DataFrame(rows).to_csv(folder / "doppler_lidar.csv", index=False)
+    more = "--star-tracker", folder / "star_tracker.csv", "--doppler-lidar", folder / "doppler_lidar.csv"
+    table, shown = flown(folder, tmp_path / "flight", *more)
+    assert table["n_refused"].tolist() == [0, 0, 0] and "refused" not in shown
+    for name in ("sigma_attitude_x_deg", "sigma_x_m"):
+        assert table[name].iloc[-1] < plain[1][name].iloc[-1]
+    # An attitude that contradicts the state is refused, and counted.
+    level |= {"rotation_w": 0.0, "rotation_x": 1.0}
+    pd.DataFrame({"time_s": time_s, **level}).to_csv(folder / "star_tracker.csv", index=False)
+    table, _ = flown(folder, tmp_path / "other", *more)
+    assert table["n_refused"].tolist() == [1, 2, 2]
+
+
+def test_without_an_inertial_unit_it_keeps_its_velocity(tmp_path, plain):
+    folder = write_descent(tmp_path / "descent")
+    (folder / "imu.csv").unlink()
+    words = options(folder)
+    del words[words.index("--imu") : words.index("--imu") + 2]
+    done = in_process.call(main, "navigate", "fly", *words, "--no-imu", "--out", tmp_path / "flight")
+    assert done.returncode == 0, done.stderr
+    table = pd.read_parquet(tmp_path / "flight" / "estimates.parquet")
+    assert np.allclose(position(table), position(plain[1]), atol=1.5)
+    assert table["sigma_x_m"].iloc[-1] > 1.3 * plain[1]["sigma_x_m"].iloc[-1]
+
+
 def test_a_damaged_frame_is_flown_over_and_named(tmp_path, plain):
     folder = write_descent(tmp_path / "descent")
     image = folder / "frames" / "1.png"

@@ -164,9 +164,7 @@ def fly_together(
         elif kind[k] == _BEAM and lidar is not None:
             beam_update(stretch, lidar.beams[number[k]], lidar.errors, surroundings)
         elif stars is not None:
-            rotation_body_from_site = stars.rotation_body_from_site[number[k]]
-            if np.isfinite(rotation_body_from_site).all():
-                stretch.attitude(rotation_body_from_site.T, stars.sigmas_rad)
+            stretch.attitude(stars.rotation_body_from_site[number[k]].T, stars.sigmas_rad)
     for lander, state in zip(landers, stretch.states(), strict=True):
         lander.state = state
 

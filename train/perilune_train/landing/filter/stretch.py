@@ -170,11 +170,15 @@ class Stretch:
     def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
         """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
 
-        `sigmas_rad` (3,) are the standard deviations about the body's axes.
+        `sigmas_rad` (3,) are the standard deviations about the body's axes. An attitude that is not finite is missing.
         """
+        if not np.isfinite(rotation_site_from_body).all():
+            return np.zeros(len(self._covariance), bool)
         spread = self._covariance[:, ATTITUDE, ATTITUDE] + np.diag(sigmas_rad**2)
         turn = self._turn_to(rotation_site_from_body)
-        accepted = (turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3)
+        # Rotation vectors are wrong near half a turn: refuse turns above 90 degrees, which have a smaller trace.
+        is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
+        accepted = is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
         for axis, sigma_rad in enumerate(sigmas_rad):
             by_error = np.zeros((len(turn), len(CORE)))
             by_error[:, ATTITUDE.start + axis] = 1

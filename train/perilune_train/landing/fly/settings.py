@@ -77,9 +77,9 @@ class FlightPrior(Section):
     """Standard deviation of a speed along a beam of the Doppler lidar."""
     doppler_range_sigma_m: _Deviation = 2.0
     """Standard deviation of a range along a beam of the Doppler lidar."""
-    camera_mounting_sigma_deg: Annotated[float, Field(ge=0, le=10)] = 0.02
+    camera_mounting_sigma_deg: Annotated[float, Field(ge=0, le=10)] = 0.1
     """Standard deviation of the camera's mounting about each axis."""
-    camera_time_sigma_s: Annotated[float, Field(ge=0, le=1)] = 0.02
+    camera_time_sigma_s: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Standard deviation of the constant difference between the exposure of the frames and their times."""
     coast_acceleration_sigma_mps2: _Positive = COAST_MPS2
     """Standard deviation of the acceleration while inertial measurements are missing."""

@@ -84,7 +84,7 @@ def unpack_descent(
         prior = _prior(frames, np.array(dataset.info.camera.rotation_camera_from_body), grade, catalogue, offset, rng)
         prior["sun_elevation_deg"] = sun_elevation_deg
         # The frames of a dataset have exact mounting and times.
-        prior |= {"camera_mounting_sigma_deg": 0.0, "camera_time_sigma_s": 0.0}
+        prior |= {"camera_mounting_sigma_deg": 0.0, "camera_time_sigma_s": 0.0, **_recorded_sigmas(dataset, ids[0])}
         (folder / "prior.yaml").write_text(to_yaml_text(prior), encoding="utf-8")
         poses = np.column_stack([frames[name].to_pylist() for name in ("time_s", "position_m", "rotation_wxyz")])
         write_csv(pd.DataFrame(poses, columns=list(TRUTH_COLUMNS)), folder / "truth.csv")
@@ -117,6 +117,17 @@ def _write_sensors(dataset: Dataset, ids: tuple[str, str], out: Path) -> None:
         columns = {"time_s": lidar["time_s"], **_columns(BEAM_DIRECTION, lidar["beam_in_body"])}
         measured = {name: lidar[name] for name in ("speed_mps", "range_m")}
         write_csv(pd.DataFrame(columns | measured), out / "doppler_lidar.csv")
+
+
+def _recorded_sigmas(dataset: Dataset, scene_id: str) -> dict[str, object]:
+    """Keys of prior.yaml for the standard deviations of star tracker and Doppler lidar, from a scene's recipe."""
+    recipe = dataset.info.recipes[dataset.table("scenes", ["recipe"], scene_id)["recipe"][0].as_py()]
+    settings = recipe.config.get(recipe.kind)
+    instruments = settings.get("instruments") if isinstance(settings, dict) else None
+    if not isinstance(instruments, dict):
+        return {}
+    keys = ("star_tracker_sigma_arcsec", "doppler_speed_sigma_mps", "doppler_range_sigma_m")
+    return {key: instruments[key] for key in keys if key in instruments}
 
 
 def _write_catalogue(path: Path, catalogue: Catalogue) -> None:
