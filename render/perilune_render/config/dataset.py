@@ -104,7 +104,7 @@ class InstrumentsConfig(Section):
     star_tracker_sigma_arcsec: tuple[Deviation, Deviation, Deviation] = (10.0, 10.0, 60.0)
     """Standard deviations of an attitude about X_B, Y_B and Z_B, seconds of arc. The tracker looks along Z_B, and is
     least precise about this axis."""
-    star_tracker_outages_s: tuple[Span, ...] = ()
+    star_tracker_outages_s: tuple[Annotated[Span, Within(0, 1e6)], ...] = ()
     """Times without attitudes, from `low` to `high` seconds after the first frame."""
     doppler_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Measurements of each beam of a Doppler lidar per second; 0 for no Doppler lidar."""

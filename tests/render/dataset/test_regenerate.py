@@ -87,7 +87,7 @@ def test_after_merge_subset_and_split_the_bytes_are_the_same(quick, tmp_path):
 def test_a_plan_is_the_dataset_before_it_is_rendered(quick, plan, tmp_path):
     planned, rendered = open_dataset(plan), open_dataset(quick / "detect")
     assert validate(planned) == [] and planned.info.images == "planned"
-    found = {(each.place, each.column) for each in differences(planned, rendered)}
+    found = {(each.table, each.column) for each in differences(planned, rendered)}
     hashes = {("frames", f"{kind}_{name}") for kind in ("png", "exr") for name in ("sha256", "bytes")}
     # Counted on the rendered frame.
     hashes |= {("frames", "real_ground_share"), ("frames", "n_craters_above_max_radius")}

@@ -79,6 +79,7 @@ def bytes_of(folder):
         tables = {
             name: stored(name, dataset.table(name))
             for name in ("scenes", "craters", "boulders", "trajectories", "frames", *OPTIONAL_TABLES)
+            if name in ("inertial", "ranges") or len(dataset.table(name))
         }
         tables = {**tables, "scenes": tables["scenes"].drop_columns(["recipe"]), "labels": dataset.table("labels")}
         groups = {}
