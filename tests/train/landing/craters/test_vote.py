@@ -1,14 +1,30 @@
 """Search by votes, and the support of a pose."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.train.landing.craters.crater_world import CAMERA, nearby, pose, sighted, world
 
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
+from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.landing.craters.catalogue import CatalogueErrors, with_errors
 from perilune_train.landing.craters.fix import PosePrior, refine
-from perilune_train.landing.craters.locate import locate
+from perilune_train.landing.craters.locate import is_clear, locate, lost_in_space
+from perilune_train.landing.craters.projection import Pose
+from perilune_train.landing.craters.search import Area
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.craters.vote import QUICK, THOROUGH, SearchRange, candidates, support
+from perilune_train.landing.craters.vote import (
+    FINE,
+    LOST,
+    QUICK,
+    WHOLE,
+    Candidate,
+    SearchRange,
+    candidates,
+    refined,
+    support,
+)
 
 WORLD = world()
 CATALOGUE = with_errors(WORLD, CatalogueErrors(), np.random.default_rng(9))
@@ -30,15 +46,65 @@ def test_a_pose_is_found_with_and_without_the_largest_craters(catalogue, altitud
         assert np.linalg.norm(located.fix.pose.position_m - true.position_m) * CAMERA.fx_px / altitude_m < 5
 
 
-@pytest.mark.parametrize("effort", [QUICK, THOROUGH], ids=["quick", "thorough"])
+@pytest.mark.parametrize("effort", [QUICK, FINE, WHOLE], ids=["quick", "fine", "whole"])
 def test_candidates_contain_shift_altitude_and_heading(effort):
     rng = np.random.default_rng(2)
     true = pose(rng, 900.0, tilt_deg=0.0, heading_rad=0.3)
     seen = sighted(WORLD, true, rng, most=300)
     expected = true.changed(np.concatenate([[30.0, -50.0, 80.0], np.radians([0.0, 0.0, 5.0])]))
-    limits = SearchRange(0.0, 60.0, (-0.2, 0.2), np.radians(8))
-    poses = candidates(seen, CATALOGUE, CAMERA, expected, limits, effort)
-    assert len(poses) == 8 and np.linalg.norm(poses[0].position_m - true.position_m) < 50
+    limits = SearchRange(0.0, 0.0, 60.0, (-0.2, 0.2), np.radians(8))
+    found = candidates(seen, CATALOGUE, CAMERA, expected, limits, effort)
+    assert 8 <= len(found) <= effort.n_candidates
+    assert np.linalg.norm(found[0].pose.position_m - true.position_m) < 50
+    assert [each.significance for each in found] == sorted((each.significance for each in found), reverse=True)
+
+
+def test_a_second_vote_finds_the_true_pose_among_candidates():
+    rng = np.random.default_rng(6)
+    true = pose(rng, 900.0)
+    seen = sighted(WORLD, true, rng, most=500)
+    off = true.changed(np.array([12.0, -9.0, 20.0, 0.0, 0.0, 0.03]))
+    wrong = [true.changed(np.array([x, y, 0.0, 0.0, 0.0, 0.0])) for x in (-150, 150) for y in (-150, 150)]
+    again = refined(seen, SMALL, CAMERA, [Candidate(each, 50.0) for each in wrong] + [Candidate(off, 1.0)])
+    assert np.linalg.norm(again[0].pose.position_m - true.position_m) < 25
+    assert again[0].significance > 3 * again[1].significance
+
+
+def test_groups_of_craters_and_repeated_sightings_are_not_significant():
+    """Each pair of a group of sightings and a group of craters votes for one shift, which says little."""
+    rng = np.random.default_rng(7)
+    expected = pose(rng, 900.0, tilt_deg=0.0, heading_rad=0.0)
+    groups_px = np.repeat(rng.uniform(20, 236, (12, 2)), 8, axis=0) + rng.normal(size=(96, 2))
+    seen = Sightings(groups_px, np.full(96, 4.0), np.full(96, 0.9))
+    centres_m = np.repeat(rng.uniform(-600, 600, (60, 2)), 8, axis=0) + 3 * rng.normal(size=(480, 2))
+    part = WORLD.part(np.arange(480))
+    grouped = replace(
+        part, centre_m=np.column_stack([centres_m, np.zeros(480)]), radius_m=np.full(480, 4.0 * 900 / CAMERA.fx_px)
+    )
+    limits = SearchRange(0.0, 200.0, 20.0, (-0.1, 0.1), np.radians(8))
+    found = candidates(seen, grouped, CAMERA, expected, limits, WHOLE)
+    assert found[0].significance < 20
+
+
+def test_a_camera_that_is_lost_in_space_without_the_largest_craters():
+    rng = np.random.default_rng(1)
+    true = pose(rng, 1000.0, reach_m=200.0)
+    seen = sighted(WORLD, true, rng, most=300)
+    turn = matrix_from_rotation_vector(np.array([0.0, 0.0, rng.uniform(-3, 3)]))
+    prior = PosePrior(Pose(np.array([0.0, 0.0, 1050.0]), turn @ MOUNTING), np.eye(6))
+    area = Area(np.zeros(2), 300.0, (950.0, 1150.0), np.pi)
+    located = lost_in_space(seen, SMALL, CAMERA, prior, area)
+    assert located is not None
+    assert np.linalg.norm(located.fix.pose.position_m - true.position_m) * CAMERA.fx_px / 1000 < 5
+
+
+def test_candidates_of_another_place_are_not_clear():
+    rng = np.random.default_rng(2)
+    true = pose(rng, 1000.0)
+    seen = sighted(world(seed=11), true, rng, most=300)
+    limits = SearchRange(0.0, 300.0, 20.0, (-0.1, 0.1), np.radians(60))
+    voted = refined(seen, SMALL, CAMERA, candidates(seen, SMALL, CAMERA, true, limits, LOST))
+    assert voted and not is_clear(voted)
 
 
 def test_support_is_large_at_the_true_pose_and_chance_elsewhere():

@@ -11,10 +11,11 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.search import Area, search
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.craters.vote import (
+    FINE,
     LOST,
     LOST_FINELY,
     QUICK,
-    THOROUGH,
+    WHOLE,
     Candidate,
     SearchRange,
     Support,
@@ -28,9 +29,9 @@ _NEAR_PX = 6.0
 _NEAR_SIGMAS, _SEARCH_SIGMAS, _SURE_SIGMAS = 5.0, 10.0, 30.0
 """Smallest support of a fix, in standard deviations of chance: near the expected pose, and by a search. A search stops
 at the first candidate with the last support."""
-_CLEAR_SIGNIFICANCE, _CLEARLY_AHEAD = 18.0, 1.3
+_CLEAR_SIGNIFICANCE, _CLEARLY_AHEAD = 14.0, 1.3
 """Smallest significance of the first refined candidate of a camera that is lost in space, and smallest ratio to the
-second. Over validation scenes, chance reaches 14, and the true pose has 18 to 104."""
+second. Over validation scenes, chance reaches 11, and the true pose has 14 to 120."""
 _AHEAD = 1.3
 """Smallest ratio between the support of the best and the second-best pose of a search."""
 _MAX_TILT_RAD = float(np.radians(5))
@@ -38,10 +39,12 @@ _MAX_TILT_RAD = float(np.radians(5))
 ground, a tilt has nearly the effect of a displacement, and some craters agree."""
 _WEAK_TILT_RAD, _KNOWN_TILT_RAD = float(np.radians(3)), float(np.radians(1))
 """Standard deviations of a rotation: of a weak prior, and of the tilt of a camera that is lost in space."""
+_N_REFINED = 4
+"""Number of refined candidates from which fixes are computed."""
 _N_POLISHED = 3
 """Largest number of fits from a candidate."""
 _SIGMAS = 3.5
-_ATTEMPTS = ((1.0, QUICK), (1.0, THOROUGH), (3.0, QUICK))
+_ATTEMPTS = ((1.0, QUICK), (1.0, FINE), (1.0, WHOLE), (3.0, QUICK))
 """Searches, tried in turn: search radius, as a multiple of the radius that the prior suggests, and effort. The larger
 radius is tried because the prior may be wrong."""
 _NEAREST = 30
@@ -83,9 +86,12 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     log_altitude = np.log(max(1 - margin, 0.2)), np.log(1 + margin)
     heading_rad = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
     for factor, effort in _ATTEMPTS:
-        shift_px = factor * max(_SIGMAS * on_ground_px, 20.0)
-        limits = SearchRange(ground_m, shift_px, log_altitude, heading_rad)
+        shift_m = factor * _SIGMAS * float(sigma[:2].max())
+        shift_px = factor * max(_SIGMAS * float(sigma[3:5].max()) * camera.fx_px, 20.0)
+        limits = SearchRange(ground_m, shift_m, shift_px, log_altitude, heading_rad)
         voted = candidates(sightings, catalogue, camera, prior.pose, limits, effort)
+        if effort is not QUICK:
+            voted = refined(sightings, catalogue, camera, voted)[:_N_REFINED]
         poses = [candidate.pose for candidate in voted]
         fix = _best(sightings, catalogue, camera, poses, min(float(sigma[3:5].max()), _KNOWN_TILT_RAD))
         if fix is not None:
@@ -110,18 +116,18 @@ def lost_in_space(
         middle_m = float(np.sqrt(low * high))
         middle = Pose(np.array([*area.centre_m, ground_m + middle_m]), rotation_camera_from_site)
         log_altitude = np.log(low / middle_m), np.log(high / middle_m)
-        limits = SearchRange(ground_m, area.reach_m / low * camera.fx_px, log_altitude, area.heading_rad)
+        limits = SearchRange(ground_m, area.reach_m, 0.0, log_altitude, area.heading_rad)
         for effort in (LOST, LOST_FINELY):
             voted = refined(
                 sightings, catalogue, camera, candidates(sightings, catalogue, camera, middle, limits, effort)
             )
-            if _is_clear(voted):
+            if is_clear(voted):
                 fix = _best(sightings, catalogue, camera, [voted[0].pose], _KNOWN_TILT_RAD)
                 break
     return Located(fix, searched=True) if fix is not None else None
 
 
-def _is_clear(voted: list[Candidate]) -> bool:
+def is_clear(voted: list[Candidate]) -> bool:
     """Whether the first of several refined candidates is the pose, and not the most significant chance."""
     if not voted or voted[0].significance < _CLEAR_SIGNIFICANCE:
         return False

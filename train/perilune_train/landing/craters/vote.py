@@ -28,14 +28,16 @@ _MAX_SHIFT_PX = 2000.0
 """Larger shifts are not searched. This limits memory and time if the expected altitude is wrong."""
 _SIZE_TOLERANCE = 0.35
 """Largest difference of the logarithms of the radii of a pair that votes."""
+_MAX_WINDOWS = 1.5e9
+"""Approximate largest number of windows of a search: a few seconds."""
 _MIN_VOTERS = 120
 """Smallest number of sightings that vote, if there are as many."""
 _REFINED_SHIFT_PX, _REFINED_LOG_ALTITUDE, _REFINED_HEADING_RAD = 15.0, 0.06, 0.07
 """Range of the second vote around a candidate."""
 _BORDER_PX = 40.0
 """Craters that are farther outside the image do not take part in the second vote."""
-_SURE_SIGNIFICANCE = 40.0
-"""A candidate with this significance in the second vote is the pose: over validation scenes, chance reaches 15."""
+_SURE_SIGNIFICANCE = 36.0
+"""A candidate with this significance in the second vote is the pose: over validation scenes, chance reaches 11."""
 _APART_PX = 6.0
 """Candidates at one altitude and heading are at least this far apart."""
 
@@ -50,11 +52,14 @@ class Effort:
     """Sightings of the rarest sizes vote, as many as have this number of pairs altogether."""
     n_candidates: int
     """Largest number of candidates."""
+    max_votes: float = 4e8
+    """Largest number of votes at all altitudes and headings; fewer sightings vote in a search over a large range."""
 
 
-QUICK, THOROUGH = Effort(2.0, 40_000, 8), Effort(1.0, 200_000, 8)
-"""With a prior: a first search, and a second one if the first finds nothing."""
-LOST, LOST_FINELY = Effort(2.0, 3_000_000, 64), Effort(1.0, 3_000_000, 16)
+QUICK, FINE, WHOLE = Effort(2.0, 40_000, 8), Effort(1.0, 200_000, 16), Effort(2.0, 1_500_000, 32)
+"""With a prior: a first search, and two more if it finds nothing. In the last one nearly all sightings vote, because
+over an elevation model the rarest sizes may be absent from the catalogue."""
+LOST, LOST_FINELY = Effort(2.0, 3_000_000, 64, 2e9), Effort(1.0, 3_000_000, 16, 8e9)
 """Without a prior: a first search of seconds, and a second one of up to half a minute if the first finds nothing."""
 
 
@@ -65,7 +70,8 @@ class Candidate:
     pose: Pose
     """The pose."""
     significance: float
-    """Logarithm of the likelihood ratio between the number of votes and chance."""
+    """Logarithm of the likelihood ratio between the number of votes and chance, less the logarithm of the number of
+    windows searched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +80,10 @@ class SearchRange:
 
     ground_m: float
     """Height of the ground below the expected pose, metres, O_L."""
+    shift_m: float
+    """Horizontal displacement along each axis, metres."""
     shift_px: float
-    """Shift of the image along each axis, pixels."""
+    """Further shift of the image along each axis, pixels, for example by a tilt."""
     log_altitude: tuple[float, float]
     """Smallest and largest logarithm of the altitude divided by the expected altitude."""
     heading_rad: float
@@ -94,27 +102,28 @@ def candidates(
 
     The shift of the image becomes a horizontal displacement of the camera. The tilt of `expected` stays.
     """
-    range_px = min(limits.shift_px, _MAX_SHIFT_PX)
-    coarser = max(float(np.clip(range_px / _BIN_PX / _MAX_BINS, 1.0, 2.0)), effort.coarser)
-    bin_px, step = coarser * _BIN_PX, coarser * _STEP
     low, high = limits.log_altitude
+    altitude_m = float(expected.position_m[2]) - limits.ground_m
+    coarser = effort.coarser * _coarser_for(limits, altitude_m, camera, effort.coarser)
+    step = coarser * _STEP
     log_altitudes = np.linspace(low, high, 1 + int(np.ceil((high - low) / step)))
     n_headings = 1 + 2 * int(np.ceil(limits.heading_rad / step))
     headings = np.linspace(-limits.heading_rad, limits.heading_rad, n_headings)
     size = np.log(sightings.radius_px)
-    altitude_m = float(expected.position_m[2]) - limits.ground_m
-    reach = max(1, int(np.ceil(range_px / bin_px)))
     smallest_px = float(np.exp(size.min() - _SIZE_TOLERANCE)) if len(size) else 1.0
     peaks: list[tuple[float, float, float, float, float]] = []
     for log_altitude in log_altitudes:
         higher = altitude_m * (np.exp(log_altitude) - 1)
+        range_px = _range_px(limits, altitude_m + higher, camera)
+        bin_px = _BIN_PX * max(float(np.clip(range_px / _BIN_PX / _MAX_BINS, 1.0, 2.0)), coarser)
+        reach = max(1, int(np.ceil(range_px / bin_px)))
         pose = Pose(expected.position_m + np.array([0.0, 0.0, higher]), expected.rotation_camera_from_site)
         view = projected(catalogue, camera, pose, range_px, smallest_px)
         order = np.argsort(view.radius_px)
         known_size = np.log(view.radius_px[order])
         first = np.searchsorted(known_size, size - _SIZE_TOLERANCE)
         last = np.searchsorted(known_size, size + _SIZE_TOLERANCE)
-        voters = _rarest(last - first, effort.max_pairs)
+        voters = _rarest(last - first, effort.max_pairs, effort.max_votes / (len(log_altitudes) * len(headings)))
         middle = np.array([camera.cx_px, camera.cy_px])
         shifts = _peaks(
             sightings.centre_px[voters] - middle,
@@ -148,7 +157,7 @@ def refined(sightings: Sightings, catalogue: Catalogue, camera: Camera, coarse: 
     for candidate in coarse:
         pose = candidate.pose
         limits = SearchRange(
-            catalogue.ground_m(pose.position_m, _NEAREST), _REFINED_SHIFT_PX, log_altitude, _REFINED_HEADING_RAD
+            catalogue.ground_m(pose.position_m, _NEAREST), 0.0, _REFINED_SHIFT_PX, log_altitude, _REFINED_HEADING_RAD
         )
         in_image = projected(catalogue, camera, pose, _BORDER_PX, 0.0).index
         again += candidates(sightings, catalogue.part(in_image), camera, pose, limits, _REFINED)
@@ -162,11 +171,32 @@ _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
 
 
-def _rarest(n_pairs: NDArray[np.integer], max_pairs: int) -> NDArray[np.integer]:
-    """The sightings that vote, from the number of craters of similar size of each sighting (M,)."""
+def _range_px(limits: SearchRange, altitude_m: float, camera: Camera) -> float:
+    """Largest shift of the image along each axis at an altitude, pixels."""
+    return min(float(np.hypot(limits.shift_m / altitude_m * camera.fx_px, limits.shift_px)), _MAX_SHIFT_PX)
+
+
+def _coarser_for(limits: SearchRange, altitude_m: float, camera: Camera, coarser: float) -> float:
+    """Factor, at least 1, by which bins and steps grow, so that a search has at most about `_MAX_WINDOWS` windows.
+
+    Altitude, heading and shift along both axes have fewer steps, so the number falls with the fourth power.
+    """
+    low, high = limits.log_altitude
+    step, bin_px = coarser * _STEP, coarser * _BIN_PX
+    reach_px = _range_px(limits, altitude_m * float(np.exp(low)), camera)
+    n_slices = (1 + (high - low) / step) * (1 + 2 * limits.heading_rad / step)
+    return max(n_slices * (1 + 2 * reach_px / bin_px) ** 2 / _MAX_WINDOWS, 1.0) ** 0.25
+
+
+def _rarest(n_pairs: NDArray[np.integer], max_pairs: int, limit: float) -> NDArray[np.integer]:
+    """The sightings that vote, from the number of craters of similar size of each sighting (M,).
+
+    At least `_MIN_VOTERS` vote, unless they have more than `limit` pairs.
+    """
     order = np.argsort(n_pairs, kind="stable")
-    enough = int(np.searchsorted(np.cumsum(n_pairs[order]), max_pairs, side="right"))
-    return order[: max(enough, _MIN_VOTERS)]
+    pairs = np.cumsum(n_pairs[order])
+    enough = max(int(np.searchsorted(pairs, max_pairs, side="right")), _MIN_VOTERS)
+    return order[: min(enough, int(np.searchsorted(pairs, limit, side="right")))]
 
 
 @compiled
@@ -207,6 +237,7 @@ def _peaks(
         expected = max(9.0 * n_votes / side**2, 0.5)
         best, best_row, best_column = -1, 0, 0
         second, second_row, second_column = -1, 0, 0
+        squares = 0.0
         for row in range(side):
             above, below = max(row - 1, 0), min(row + 1, side - 1)
             for column in range(side):
@@ -217,6 +248,7 @@ def _peaks(
                     three[column + 1] += votes[below, column]
             for column in range(side):
                 count = three[column] + three[column + 1] + three[column + 2]
+                squares += count * count
                 if count <= second or votes[row, column] == 0:
                     continue
                 is_apart = max(abs(row - best_row), abs(column - best_column)) > 3
@@ -226,10 +258,23 @@ def _peaks(
                     best, best_row, best_column = count, row, column
                 elif is_apart:
                     second, second_row, second_column = count, row, column
+        # Without the largest peak, which may be the true pose.
+        for row in range(max(best_row - 3, 0), min(best_row + 4, side)):
+            for column in range(max(best_column - 3, 0), min(best_column + 4, side)):
+                count = 0
+                for r in range(max(row - 1, 0), min(row + 2, side)):
+                    for c in range(max(column - 1, 0), min(column + 2, side)):
+                        count += votes[r, c]
+                squares -= count * count
+        # Groups of craters, and sightings of one crater at two scales, make the votes cluster: divide by the ratio
+        # between the variance of the windows and the variance by Poisson's law.
+        clustering = max((squares / side**2 - expected**2) / expected, 1.0)
         for k in range(2):
             count, row, column = (best, best_row, best_column) if k == 0 else (second, second_row, second_column)
-            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law.
-            peaks[2 * h + k, 0] = count * np.log(max(count, 1.0) / expected) - (count - expected)
+            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law. The number of windows
+            # is subtracted, because the largest of more windows is larger by chance.
+            likelihood = count * np.log(max(count, 1.0) / expected) - (count - expected)
+            peaks[2 * h + k, 0] = likelihood / clustering - np.log(side**2 / 9.0)
             peaks[2 * h + k, 1] = headings[h]
             peaks[2 * h + k, 2] = (column - reach) * bin_px
             peaks[2 * h + k, 3] = (row - reach) * bin_px
