@@ -64,7 +64,8 @@ def _allowed(key: Key) -> str:
 def _inner_limits(kind: Any) -> list[Any]:
     """Return the limits of the first number within a union or a tuple."""
     for inner in typing.get_args(kind):
-        limits = [limit for field in getattr(inner, "__metadata__", ()) for limit in field.metadata]
+        stated = getattr(inner, "__metadata__", ())
+        limits = [limit for each in stated for limit in getattr(each, "metadata", [each])]
         if limits := limits or _inner_limits(inner):
             return limits
     return []
