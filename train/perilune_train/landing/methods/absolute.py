@@ -16,7 +16,7 @@ from perilune_train.landing.craters.catalogue import (
     with_errors,
 )
 from perilune_train.landing.methods.fixes import WRONG_PX, fix_summary, fixes_lost_in_space, fixes_near_a_prior
-from perilune_train.landing.methods.flights import flight_summary, flights
+from perilune_train.landing.methods.flights import flight_summary, flights, flights_with_star_tracker
 from perilune_train.landing.methods.seen import SeenDescent
 
 SEED = 0
@@ -60,10 +60,15 @@ def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: C
         tables[f"fix{name}"] = fixes_near_a_prior(descents, source, SEED)
         tables[f"lost in space{name}"] = fixes_lost_in_space(descents, source, SEED)
     inertial = dataset.table("inertial", ["grade"], *descents[0].ids)
-    if "tactical" in inertial["grade"].unique().to_pylist():
+    grades = inertial["grade"].unique().to_pylist()
+    if "tactical" in grades:
         for name, source in sources.items():
             tables[f"filter{name}"] = flights(dataset, descents, source, "tactical", _START_DEG)
         tables["filter, star tracker"] = flights(dataset, descents, catalogues.rough, "tactical", _STAR_TRACKER_DEG)
+        if "navigation" in grades:
+            tables["filter, star tracker in flight"] = flights_with_star_tracker(
+                dataset, descents, catalogues.rough, _START_DEG
+            )
         tables["smoother"] = flights(dataset, descents, catalogues.rough, "tactical", _START_DEG, smooth=True)
     return {name: table for name, table in tables.items() if len(table)}
 

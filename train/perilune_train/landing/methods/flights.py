@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -10,10 +10,11 @@ import pandas as pd
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.frames import Array
-from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_shared.geometry.inertial_errors import drawn_errors
+from perilune_shared.geometry.inertial_grades import GRADES, InertialErrors, InertialGrade
 from perilune_train.landing.craters.catalogue import Catalogue
-from perilune_train.landing.filter.flight import Estimate, Instruments, fly
+from perilune_train.landing.filter.flight import Estimate, Instruments, StarTracker, fly
 from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
 from perilune_train.landing.filter.propagate import InertialNoise, start_sigmas
 from perilune_train.landing.filter.state import ATTITUDE, POSITION, CameraErrors, State
@@ -45,10 +46,54 @@ def flights(
         )
         for number, descent in enumerate(descents):
             instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
-            start = Start(grade, sigmas, sigmas[:9] * np.random.default_rng(number).normal(size=9))
+            start = Start(GRADES[grade], sigmas, sigmas[:9] * np.random.default_rng(number).normal(size=9))
             catalogue = catalogues[descent.ids[0]]
             begun = time.process_time()
             flown = flight(descent, instruments, rotation_camera_from_body, catalogue, start, smooth)
+            tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
+            progress.advance(task)
+    return pd.concat(tables, ignore_index=True)
+
+
+STAR_TRACKER_UNIT = replace(GRADES["tactical"], gyro_bias_deg_per_h=0.5, gyro_bias_walk_deg_per_h=0.5)
+"""Inertial unit of a lander with a star tracker: tactical, with the gyroscope's bias calibrated before the descent."""
+STAR_TRACKER_ARCSEC = (10.0, 10.0, 60.0)
+"""Standard deviations of the star tracker about the body's axes, seconds of arc."""
+
+
+def flights_with_star_tracker(
+    dataset: Dataset, descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], attitude_deg: float
+) -> pd.DataFrame:
+    """Errors of the filter with a star tracker in flight, at every frame of all descents.
+
+    The star tracker measures the attitude at the time of each frame. Attitudes and inertial errors of
+    `STAR_TRACKER_UNIT` are drawn here, since the dataset need not have them; the small errors of grade `navigation`
+    are neglected. The index of the descent is the random seed.
+    """
+    tables = []
+    rotation_camera_from_body, sigmas_rad = mounting_of(dataset), np.radians(np.array(STAR_TRACKER_ARCSEC) / 3600)
+    sigmas = start_sigmas(START_M, START_MPS, attitude_deg, STAR_TRACKER_UNIT)
+    with progress_bar() as progress:
+        task = progress.add_task("filter, star tracker in flight", total=len(descents), unit="descents", note="")
+        for number, descent in enumerate(descents):
+            reference, rng = (
+                Instruments.of_trajectory(dataset, descent.ids, "navigation"),
+                np.random.default_rng(number),
+            )
+            start = Start(STAR_TRACKER_UNIT, sigmas, sigmas[:9] * rng.normal(size=9))
+            gyro, accelerometer = drawn_errors(STAR_TRACKER_UNIT, reference.inertial.interval_s, rng)
+            rate = reference.inertial.angular_rate_radps + gyro
+            force = reference.inertial.specific_force_mps2 + accelerometer
+            inertial = replace(reference.inertial, angular_rate_radps=rate, specific_force_mps2=force)
+            turns = sigmas_rad * rng.normal(size=(len(descent.true), 3))
+            attitudes = [
+                matrix_from_rotation_vector(-turn) @ rotation_camera_from_body.T @ true.rotation_camera_from_site
+                for turn, true in zip(turns, descent.true, strict=True)
+            ]
+            stars = StarTracker(descent.time_s, np.array(attitudes), sigmas_rad)
+            instruments = replace(reference, inertial=inertial, star_tracker=stars)
+            begun = time.process_time()
+            flown = flight(descent, instruments, rotation_camera_from_body, catalogues[descent.ids[0]], start)
             tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
             progress.advance(task)
     return pd.concat(tables, ignore_index=True)
@@ -72,8 +117,8 @@ def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
 class Start:
     """Assumed errors of the filter at the first frame, and the true error."""
 
-    grade: InertialGrade
-    """Grade of the inertial unit."""
+    unit: InertialErrors
+    """Errors of the inertial unit."""
     sigmas: Array
     """Standard deviations (15,) with which the filter starts, see `start_sigmas`."""
     error: Array
@@ -115,7 +160,7 @@ def lander_of(
     camera = CameraErrors(descent.sun_elevation_deg)
     state = State.starting(pose.position_m, velocity_mps, attitude, start.sigmas, RELIEF_M, camera)
     surroundings = Surroundings(descent.camera, rotation_camera_from_body, catalogue, RANGE_SIGMA_M, RELIEF_M)
-    return Lander(state, InertialNoise.of(GRADES[start.grade]), surroundings, keep_poses=smooth)
+    return Lander(state, InertialNoise.of(start.unit), surroundings, keep_poses=smooth)
 
 
 def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFrame:

@@ -12,9 +12,9 @@ _KNOWS = {
     "warp": "two frames, the nominal motion",
     "stack": "two frames",
     "klt": "two frames, the altitude at the start",
-    "klt_gyroscope": "the same and a tactical gyroscope",
+    "klt_gyroscope": "two frames, the altitude at the start, and a tactical gyroscope",
     "alignment": "two frames, the altitude at the start",
-    "alignment_gyroscope": "the same and a tactical gyroscope",
+    "alignment_gyroscope": "two frames, the altitude at the start, and a tactical gyroscope",
     "nominal": "the planned curve; no frame",
     "fix, exact catalogue": "one frame, catalogue without errors, prior of 100 m and 1 degree",
     "fix": "one frame, catalogue with errors, prior of 100 m and 1 degree",
@@ -22,10 +22,12 @@ _KNOWS = {
     "lost in space": "one frame at 800 m or above, catalogue with errors, altitude to 10 %, level camera",
     "filter": "all frames so far, catalogue with errors, tactical unit, ranges, start of 60 m, 1 m/s, 0.5 degrees",
     "smoother": "as `filter`, and all later frames; for reference, not on board",
-    "fix, map": "as `fix`, catalogue by our own detector from images of an orbiter",
-    "lost in space, map": "as `lost in space`, that catalogue",
-    "filter, map": "as `filter`, that catalogue",
+    "fix, map": "as `fix`, with a catalogue that the detector made from images taken from orbit",
+    "lost in space, map": "as `lost in space`, with the catalogue of `fix, map`",
+    "filter, map": "as `filter`, with the catalogue of `fix, map`",
     "filter, star tracker": "as `filter`, with a start of 0.02 degrees",
+    "filter, star tracker in flight": "as `filter`, with an attitude at each frame (10, 10 and 60 seconds of arc), and a "
+    "gyroscope with a bias of 0.5 degrees per hour",
     "filter, exact catalogue": "as `filter`, with a catalogue without errors",
 }
 _RELATIVE = {

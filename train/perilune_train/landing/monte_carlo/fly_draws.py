@@ -17,7 +17,7 @@ from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
-from perilune_shared.geometry.inertial_grades import InertialGrade
+from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_shared.threads import usable_cores
@@ -149,7 +149,7 @@ def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFram
                 draw_of_descent.descent,
                 job.rotation_camera_from_body,
                 catalogue,
-                Start(GRADE, sigmas, draw_of_descent.start_error),
+                Start(GRADES[GRADE], sigmas, draw_of_descent.start_error),
             )
         )
         drawn_descents.append(draw_of_descent)
