@@ -76,10 +76,8 @@ def flights_with_star_tracker(
     with progress_bar() as progress:
         task = progress.add_task("filter, star tracker in flight", total=len(descents), unit="descents", note="")
         for number, descent in enumerate(descents):
-            reference, rng = (
-                Instruments.of_trajectory(dataset, descent.ids, "navigation"),
-                np.random.default_rng(number),
-            )
+            reference = Instruments.of_trajectory(dataset, descent.ids, "navigation")
+            rng = np.random.default_rng(number)
             start = Start(STAR_TRACKER_UNIT, sigmas, sigmas[:9] * rng.normal(size=9))
             gyro, accelerometer = drawn_errors(STAR_TRACKER_UNIT, reference.inertial.interval_s, rng)
             rate = reference.inertial.angular_rate_radps + gyro
