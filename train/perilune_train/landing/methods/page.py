@@ -26,7 +26,7 @@ _KNOWS = {
     "lost in space, map": "as `lost in space`, with the catalogue of `fix, map`",
     "filter, map": "as `filter`, with the catalogue of `fix, map`",
     "filter, star tracker": "as `filter`, with a start of 0.02 degrees",
-    "filter, star tracker in flight": "as `filter`, with a measured attitude at each frame (10, 10 and 60 seconds of arc)"
+    "filter, star tracker in flight": "as `filter`, with an attitude at each frame (10, 10 and 60 arc seconds)"
     " and a gyroscope with a bias of 0.5 degrees per hour",
     "filter, exact catalogue": "as `filter`, with a catalogue without errors",
 }
