@@ -94,7 +94,7 @@ def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, f
     """
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()
-        smallest_px, largest_px = (np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max"))
-        return smallest_px, largest_px
+        extremes_px = [np.nan if limits[key] is None else float(limits[key]) for key in ("min", "max")]
+        return extremes_px[0], extremes_px[1]
     smallest_px, largest_px = settings.radius_px
     return smallest_px, label_bound_px(dataset.info) if largest_px is None else largest_px
