@@ -1,4 +1,4 @@
-"""The filter in flight: one call for each measurement, in order of time.
+"""The filter of one flight, with one method for each kind of measurement, called in time order.
 
 inertial, coast   propagate the state
 range             update the state with the distance to the ground below
@@ -6,11 +6,11 @@ beam              update the state with the range and the speed along a beam of 
 attitude          update the state with the attitude from a star tracker
 sightings         match craters (locate.py), then one of three:
                   - the fix fits the state: update with its craters (`craters_update`)
-                  - the fix contradicts the state, and the previous fix did so too, with an equal offset: replace
-                    position and attitude (`_restart`)
+                  - the fix and the previous fix contradict the state with an equal offset: replace position and
+                    attitude (`_restart`)
                   - otherwise ignore the frame
 
-Between frames the state is propagated for many measurements at once (stretch.py).
+The first four methods change only a part of the state; stretch.py updates the rest at the next frame.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ class Surroundings:
 
 
 def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
-    """Update flights by one range at the current time; returns whether it was accepted (F,).
+    """Update flights by one range at the current time; returns whether each flight accepted it (F,).
 
     A range that is not a positive, finite length is refused.
     """
@@ -107,17 +107,17 @@ class LidarErrors:
     """Time between two measurements of one beam, seconds."""
 
     def range_deviation_m(self, relief_m: float) -> float:
-        """Standard deviation of a range as the filter uses it, metres.
+        """Standard deviation, metres, that the filter assumes for a range along a slanted beam.
 
-        The ground at a slanted beam's end differs from the ground below, and the difference repeats from one range to
-        the next. Without a state for each beam, each range gets its share of the information of one range per
-        correlation time.
+        The ground at the end of a slanted beam differs in height from the ground below the lander, and consecutive
+        ranges share this difference. The filter has no state for it. Instead it enlarges the deviation of the relief,
+        so that all ranges of a beam within one correlation time together count as one.
         """
         return float(np.hypot(self.range_sigma_m, relief_m * np.sqrt(max(1.0, GROUND_S / self.step_s))))
 
 
 def beam_update(stretch: Stretch, beam: Beam, errors: LidarErrors, surroundings: Sequence[Surroundings]) -> None:
-    """Update flights by the range and the speed along a beam; missing ones are left out."""
+    """Update flights by the range and the speed along a beam; missing values are ignored."""
     sigma_m = errors.range_deviation_m(surroundings[0].relief_m)
     _range_along(stretch, beam.range_m, surroundings, sigma_m, beam.direction_in_body)
     if np.isfinite(beam.speed_mps):
@@ -129,7 +129,7 @@ class _Contradiction:
     """A fix that contradicts the state."""
 
     time_s: float
-    """Time of its frame."""
+    """Time of the frame, seconds since the first frame."""
     offset_m: Array
     """Position of the fix minus the position in the state (3,), metres, O_L."""
     covariance: Array
@@ -161,7 +161,7 @@ class Lander:
     noise: InertialNoise
     """Noise of the inertial unit."""
     _since: Stretch | None
-    """Measurements since `_state`."""
+    """Effect of the measurements since `_state`; None if there are no such measurements."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -240,8 +240,8 @@ class Lander:
     def _replaces(self, fix: Fix) -> bool:
         """Whether a fix that contradicts the state replaces it: only if the previous fix had an equal offset.
 
-        Unless the state is lost, a fix whose attitude contradicts it is wrong, because the attitude from a gyroscope
-        does not jump.
+        While the lander is not lost, a fix whose attitude contradicts the state is wrong, because the attitude from a
+        gyroscope does not jump.
         """
         expected, state = self._expected(), self.state
         turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)

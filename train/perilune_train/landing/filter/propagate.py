@@ -17,7 +17,7 @@ from perilune_train.landing.filter.state import (
 )
 
 _INERTIAL = 15
-"""Number of elements of the error state that inertial measurements change; these are the first ones."""
+"""Number of elements at the start of the error state that inertial measurements change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +66,13 @@ def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, un
 
 
 COAST_MPS2, COAST_DEGPS = 2.0, 3.0
-"""Default standard deviations of acceleration and angular rate while inertial measurements are missing."""
+"""Default standard deviations of the acceleration (metres per second^2) and the angular rate (degrees per second) while
+inertial measurements are missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class InertialNoise:
-    """Variances that an inertial unit adds in one second, per axis, and the motion while it measures nothing."""
+    """Variances that an inertial unit adds per second and axis, and noise while measurements are missing."""
 
     turn: float
     """Variance of the attitude, square radians."""
@@ -82,9 +83,9 @@ class InertialNoise:
     force_bias: float
     """Variance of the accelerometer's bias, square metres per second^4."""
     coast_mps2: float = COAST_MPS2
-    """Standard deviation of the acceleration while measurements are missing."""
+    """Standard deviation of the acceleration while measurements are missing, metres per second^2."""
     coast_radps: float = float(np.radians(COAST_DEGPS))
-    """Standard deviation of the angular rate while measurements are missing."""
+    """Standard deviation of the angular rate while measurements are missing, radians per second."""
 
     @classmethod
     def of(cls, errors: InertialErrors) -> "InertialNoise":

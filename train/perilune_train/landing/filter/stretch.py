@@ -2,17 +2,17 @@
 
 These measurements change and measure only 16 parts of the error state: the first 15 and the height of the ground (the
 core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
-errors at the start of the stretch. The other parts are therefore updated once, at its end (compressed filter, Guivant
-& Nebot 2001, doi 10.1109/70.938382):
+errors at the start of the stretch. The other parts are therefore updated once, at the end of the stretch (compressed
+filter, Guivant & Nebot 2001, doi 10.1109/70.938382):
 
 1. Every measurement changes the core, its covariance and its derivative with respect to the core at the start.
 2. `range`, `line_speed` and `attitude` also keep the innovation, and its derivative with respect to the core at the
    start.
 3. `states` applies all kept innovations to the other parts at once.
 
-The filter that updates its whole covariance at every measurement gives an equal result; here a measurement costs as
-much as if there were no craters. Only the attitudes of
-earlier frames differ, by second-order terms: corrections are summed, not applied one after the other.
+A filter that updates its whole covariance at every measurement gives an equal result. Here, a measurement costs only as
+much as without craters. The attitudes of earlier frames differ by second-order terms, because their corrections are
+summed and not applied one after the other.
 
 All flights of a stretch have measurements at the same times, and every operation acts on all of them at once.
 """
@@ -56,9 +56,11 @@ class Stretch:
     """F flights from one frame to the next."""
 
     def __init__(self, states: Sequence[State], noise: InertialNoise, relief_m: float):
-        """Start at a frame's states.
+        """Start at the states of a frame.
 
-        `relief_m` is the standard deviation of the ground's height, a Gauss-Markov process, metres."""
+        `relief_m` is the standard deviation, metres, of the ground's height, which is modelled as a Gauss-Markov
+        process.
+        """
         self._begin, self._noise, self._relief_m = list(states), noise, relief_m
         self.time_s = states[0].time_s
         self._moving = Moving(
@@ -132,7 +134,8 @@ class Stretch:
     def _moved(self, time_s: float, change: Array, added: Array, kept: float) -> None:
         """Apply the transition matrix `change` and the process noise `added` of the first 15 errors.
 
-        `kept` is the share of the ground's height error that remains."""
+        `kept` is the share of the ground's height error that remains.
+        """
         whole, noise = np.zeros_like(self._covariance), np.zeros_like(self._covariance)
         whole[:, :_INERTIAL, :_INERTIAL], whole[:, _HEIGHT, _HEIGHT] = change, kept
         noise[:, :_INERTIAL, :_INERTIAL], noise[:, _HEIGHT, _HEIGHT] = added, self._relief_m**2 * (1 - kept**2)
@@ -170,13 +173,14 @@ class Stretch:
     def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
         """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
 
-        `sigmas_rad` (3,) are the standard deviations about the body's axes. An attitude that is not finite is missing.
+        `sigmas_rad` (3,) are the standard deviations about the body's axes, radians. An attitude that is not finite is
+        ignored.
         """
         if not np.isfinite(rotation_site_from_body).all():
             return np.zeros(len(self._covariance), bool)
         spread = self._covariance[:, ATTITUDE, ATTITUDE] + np.diag(sigmas_rad**2)
         turn = self._turn_to(rotation_site_from_body)
-        # Rotation vectors are wrong near half a turn: refuse turns above 90 degrees, which have a smaller trace.
+        # Rotation vectors are unreliable near half a turn. Refuse turns above 90 degrees: their trace is below 1.
         is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
         accepted = is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
         for axis, sigma_rad in enumerate(sigmas_rad):
@@ -195,7 +199,7 @@ class Stretch:
     def _update(
         self, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
     ) -> NDArray[np.bool_]:
-        """Update by one number if it passes the gate; returns whether it does (F,)."""
+        """Update the flights in which one number passes the gate; returns whether it passes (F,)."""
         spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
         accepted = (innovation**2 / spread <= gate(1)) & is_possible
         self._apply(innovation, by_error, sigma, accepted)
@@ -205,8 +209,8 @@ class Stretch:
     def _apply(self, innovation: Array, by_error: Array, sigma: float, accepted: NDArray[np.bool_]) -> None:
         """Update the flights that accept one number.
 
-        `innovation` (F,) is the measured minus the expected number, `by_error` (F, 16) its derivative by the core, and
-        `sigma` its standard deviation.
+        `innovation` (F,) is the measured minus the expected number, `by_error` (F, 16) its derivative with respect to
+        the core, and `sigma` its standard deviation.
         """
         crossed = (self._covariance @ by_error[:, :, None])[:, :, 0]
         spread = (by_error * crossed).sum(axis=1) + sigma**2
