@@ -120,7 +120,7 @@ def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Ite
     """Run a filter over a descent; yields one estimate for each frame.
 
     `frame_time_s` (n,) must increase. `seen` yields the sightings of one frame at a time. Inertial measurements that
-    are not finite count as missing. Measurements and frames older than the lander's state are ignored.
+    are not finite count as missing. Measurements older than the lander's state are ignored.
     """
     for (estimate,) in fly_together(
         [lander], instruments, frame_time_s, ((frame_sightings,) for frame_sightings in seen)

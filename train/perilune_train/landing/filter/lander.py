@@ -190,7 +190,7 @@ class Lander:
         self._stretch.inertial(measured)
 
     def coast(self, until_s: float) -> None:
-        """Propagate without inertial measurements, at constant velocity and attitude and with growing uncertainty."""
+        """Propagate without inertial measurements, at constant velocity and attitude."""
         self._stretch.coast(until_s)
 
     def range(self, range_m: float) -> bool:
@@ -240,8 +240,8 @@ class Lander:
     def _replaces(self, fix: Fix) -> bool:
         """Whether a fix that contradicts the state replaces it: only if the previous fix had an equal offset.
 
-        While the lander is not lost, a fix whose attitude contradicts the state is wrong, because the attitude from a
-        gyroscope does not jump.
+        A fix whose attitude contradicts the state is wrong, because the attitude from a gyroscope does not jump. This
+        does not hold if no frame was matched for `_LOST_S`.
         """
         expected, state = self._expected(), self.state
         turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)
@@ -260,7 +260,7 @@ class Lander:
         self.status = "lost" if self._late or self._contradiction is not None else "coasting"
 
     def _restart(self, located: Located) -> None:
-        """Take position and attitude from a fix, and enlarge the velocity's uncertainty by `_UNKNOWN_VELOCITY_MPS`."""
+        """Take position and attitude from a fix, and enlarge the uncertainty of the velocity."""
         fix, state = located.fix, self.state.with_craters(np.zeros(0, int), np.zeros(0))
         expected, by_error = camera_pose(state, self._around.rotation_camera_from_body)
         covariance = state.covariance.copy()

@@ -61,7 +61,7 @@ def camera_pose(state: State, rotation_camera_from_body: Array) -> tuple[Pose, A
 
 
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Translation and rotation (6,) from the expected pose, and their derivative (6, 25) by the error state."""
+    """Translation and rotation (6,) from the expected pose, and the derivative (6, 25) of its error."""
     expected, by_error = camera_pose(state, rotation_camera_from_body)
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.rotation_camera_from_site.T)
     return np.concatenate([pose.position_m - expected.position_m, turn]), by_error
@@ -118,7 +118,7 @@ def craters_update(
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
-    """Covariances of N sightings without noise: with the error state (2 N, M) and with each other (2 N, 2 N).
+    """Covariances of N noise-free sightings: with the error state (2 N, M), with each other (2 N, 2 N).
 
     `by_error` (N, 2, 15) and `by_offset` (N, 2, 2) are the derivatives of the sightings with respect to the errors
     `_ALL_SEE` and to the offsets of their craters. `crater` (N,) gives the index in the state of each sighting's

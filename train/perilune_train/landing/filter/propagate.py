@@ -1,4 +1,4 @@
-"""Propagation of the state by inertial measurements (strapdown integration, e.g. Sola 2017, arXiv 1711.02508)."""
+"""Propagate the state by inertial measurements (strapdown integration; Sola 2017, arXiv 1711.02508)."""
 
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ _INERTIAL = 15
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """N inertial measurements in time order, each a mean over an interval, for one flight or for F flights."""
+    """N inertial measurements in time order, means over intervals, for one flight or for F flights."""
 
     time_s: Array
     """Ends of the intervals (N,), seconds since the first frame."""
@@ -59,7 +59,7 @@ class Increments:
 
 
 def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, unit: InertialErrors) -> Array:
-    """Initial standard deviations (15,) of the first 15 elements of the error state, from the deviations per axis."""
+    """Initial standard deviations (15,) of the first 15 elements of the error state."""
     gyro_bias_radps = np.radians(unit.gyro_bias_deg_per_h) / HOUR_S
     force_bias_mps2 = unit.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
     return np.repeat([position_m, velocity_mps, np.radians(attitude_deg), gyro_bias_radps, force_bias_mps2], 3)
@@ -117,7 +117,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motions of F flights over one time span, and their effect on the first 15 elements of the error state."""
+    """Motions of F flights over a time span, and their effect on the first 15 elements of the error state."""
 
     end: Moving
     """The state at the end of the span."""
@@ -156,7 +156,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
 
 
 def _changes(middle: Array, half: Array, force: Array, step_s: Array) -> Array:
-    """Derivatives (N, F, 15, 15) of the errors after each step with respect to the errors before that step.
+    """Derivatives (N, F, 15, 15) of the errors after a step with respect to the errors before the step.
 
     An attitude error rotates the measured force; bias errors are integrated over the step. `middle` (N, F, 3, 3) holds
     the attitudes at the middle of the steps, and `half` (N, F, 3, 3) the rotations from the start to the middle of each

@@ -231,7 +231,7 @@ def cross_matrices(vectors: Array) -> Array:
 
 
 def rotation_matrices(turns_rad: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians: `matrix_from_rotation_vector` for many."""
+    """Rotation matrices (..., 3, 3) of many rotation vectors (..., 3), radians."""
     angle = np.sqrt((turns_rad**2).sum(axis=-1))[..., None]
     cross = cross_matrices(turns_rad / np.where(angle > 0, angle, 1.0))
     angle = angle[..., None]
@@ -239,11 +239,11 @@ def rotation_matrices(turns_rad: Array) -> Array:
 
 
 def common_pattern(ray: Array) -> Array:
-    """Derivatives (n, 2, 5) of the image error that all sightings share, at rays (n, 2) on the plane at depth 1.
+    """Derivatives (n, 2, 5) of the shared image error at rays (n, 2) on the plane at depth 1.
 
-    The error is a shift, a scale and two terms that grow with the square of the distance from the image centre. Errors
-    of position, altitude and tilt displace craters in this pattern too, so one frame cannot distinguish them from the
-    image error.
+    All sightings share this error: a shift, a scale and two terms that grow with the square of the distance from the
+    image centre. Errors of position, altitude and tilt displace craters in the same pattern, so one frame cannot
+    distinguish them from the image error.
     """
     x, y = ray.T
     zero, ones = np.zeros_like(x), np.ones_like(x)

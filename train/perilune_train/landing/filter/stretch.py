@@ -1,4 +1,4 @@
-"""Update flights between two frames by inertial measurements, ranges, speeds along a beam, and attitudes.
+"""Update flights between two frames by inertial measurements, ranges, beam speeds and attitudes.
 
 These measurements change and measure only 16 parts of the error state: the first 15 and the height of the ground (the
 core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
@@ -93,7 +93,7 @@ class Stretch:
         return self._moving.rotation_site_from_body
 
     def inertial(self, measured: Increments) -> None:
-        """Propagate to the end of inertial measurements; measurements that are older or not finite are ignored."""
+        """Propagate by inertial measurements; ignore measurements that are older or not finite."""
         measured = measured.measured()
         measured = measured.part(slice(int(np.searchsorted(measured.time_s, self.time_s, side="right")), None))
         if not len(measured):
@@ -122,7 +122,10 @@ class Stretch:
         self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
 
     def coast(self, until_s: float) -> None:
-        """Propagate without inertial measurements, at constant velocity and attitude; add the uncertainty of both."""
+        """Propagate without inertial measurements, at constant velocity and attitude.
+
+        The uncertainty of both grows.
+        """
         gap_s = until_s - self.time_s
         self._moving = replace(self._moving, position_m=self.position_m + self._moving.velocity_mps * gap_s)
         change = np.eye(_INERTIAL)

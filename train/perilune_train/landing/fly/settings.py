@@ -152,15 +152,15 @@ class FlightPrior(Section):
 
     @property
     def lidar_errors(self) -> LidarErrors:
-        """Standard deviations of the Doppler lidar, with one measurement of each beam per second."""
+        """Standard deviations of the Doppler lidar, for one measurement of each beam per second."""
         return LidarErrors(self.doppler_speed_sigma_mps, self.doppler_range_sigma_m, 1.0)
 
 
 def read_camera(path: Path) -> CameraRecord:
-    """Read camera.yaml: the fields of `camera` in dataset.json, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
+    """Read camera.yaml, or a calibration file of OpenCV, ROS, Kalibr or EuRoC.
 
-    Distortion and mounting may be absent. Raises UserError on a missing file, a wrong value, or a camera that is not at
-    the body's origin.
+    camera.yaml has the fields of `camera` in dataset.json. Distortion and mounting may be absent. Raises UserError on a
+    missing file, a wrong value, or a camera that is not at the body's origin.
     """
     content = read_camera_file(path)
     if isinstance(content, Calibration):

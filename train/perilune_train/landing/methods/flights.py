@@ -1,4 +1,4 @@
-"""Run the filter over descents; compute its errors at every frame and the standard deviations that it states."""
+"""Run the filter over descents, and tabulate true and stated errors at every frame."""
 
 import time
 from collections.abc import Mapping
@@ -64,13 +64,16 @@ def mounting_of(dataset: Dataset) -> Array:
 
 
 def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
-    """Standard deviations at the start: `START_M`, `START_MPS`, the given attitude, and the biases of the grade."""
+    """Standard deviations (15,) at the start.
+
+    They are `START_M`, `START_MPS`, `attitude_deg`, and the biases of the grade on each axis.
+    """
     return start_sigmas(START_M, START_MPS, attitude_deg, GRADES[grade])
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Assumed errors of the filter at the first frame, and the true error."""
+    """Standard deviations that the filter assumes at the first frame, and the true error."""
 
     grade: InertialGrade
     """Grade of the inertial unit."""
@@ -88,7 +91,10 @@ def flight(
     start: Start,
     smooth: bool = False,
 ) -> pd.DataFrame:
-    """Errors of the filter at every frame of a descent; with `smooth`, of the smoother, which uses all frames."""
+    """Errors of the filter at every frame of a descent.
+
+    With `smooth` they are the errors of the smoother, which estimates every pose from the measurements of all frames.
+    """
     lander = lander_of(descent, rotation_camera_from_body, catalogue, start, smooth)
     estimates = list(fly(lander, instruments, descent.time_s, descent.sightings))
     rows = [row_of(descent, estimate, rotation_camera_from_body) for estimate in estimates]
