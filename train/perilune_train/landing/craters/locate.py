@@ -45,8 +45,8 @@ _N_POLISHED = 3
 """Largest number of fits from a candidate."""
 _SIGMAS = 3.5
 _ATTEMPTS = ((1.0, QUICK), (1.0, FINE), (1.0, WHOLE), (3.0, QUICK))
-"""Searches, tried in turn: search radius, as a multiple of the radius that the prior suggests, and effort. The larger
-radius is tried because the prior may be wrong."""
+"""Searches in the order in which they are tried: search radius as a multiple of the radius from the prior's standard
+deviations, and effort. The last search has a larger radius, because the prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
 _MIN_MARGIN = 0.06
@@ -75,7 +75,7 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     altitude_m = max(float(prior.pose.position_m[2] - ground_m), 1.0)
     sigma = np.sqrt(np.diag(prior.covariance))
     on_ground_px = float(np.hypot(sigma[:2].max() / altitude_m, sigma[3:5].max())) * camera.fx_px
-    # Altitude and heading move the edges of the frame.
+    # Errors of altitude and heading move the edges of the image, but not its centre.
     edge_px = float(np.hypot(sigma[2] / altitude_m, sigma[5])) * camera.width_px / 2
     start_px = float(np.hypot(on_ground_px, edge_px))
     if start_px < _NEAR_PX:

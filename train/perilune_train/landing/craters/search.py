@@ -24,9 +24,9 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _N_PAIRED = 18
-"""Number of sightings that form pairs, the largest ones, since large craters are rare."""
+"""Number of sightings that form pairs. The largest sightings are used, because large craters are rare."""
 _N_FIRST, N_TESTED = 24, 60
-"""Numbers of sightings, largest first, that test every placement and that test the best placements."""
+"""Number of sightings on which all placements are tested, and on which the best are tested; the largest sightings."""
 _MIN_SEPARATION = 0.1
 """Smallest separation of a pair, divided by the width of the image."""
 _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
@@ -84,7 +84,7 @@ def search(
     placements = _placements(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
     if not len(placements.altitude_m):
         return []
-    # All placements are tested on some sightings, the best on more.
+    # To save time, test all placements on few sightings, and only the best placements on more.
     agreed = _agreed(placements, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
     placements = placements.part(np.argsort(-agreed, kind="stable")[:_MAX_TESTED])
     agreed = _agreed(placements, offset[:N_TESTED], size[:N_TESTED], local, camera)
@@ -190,7 +190,7 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _MIN_SEPARATION * width * low, most)
     if not len(catalogue_pairs.index):
         return none
-    # Scale the sightings to the middle altitude: their separations are then wrong by at most half of the range.
+    # Scale the sightings to the middle altitude. The error of a separation is then at most half of the altitude range.
     middle = replace(sighting_pairs, separation=sighting_pairs.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
     tree = KDTree(catalogue_pairs.places(log_range, area.heading_rad))

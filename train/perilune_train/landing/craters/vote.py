@@ -277,8 +277,8 @@ def _peaks(
         clustering = max((squares / side**2 - expected**2) / expected, 1.0)
         for k in range(2):
             count, row, column = (best, best_row, best_column) if k == 0 else (second, second_row, second_column)
-            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law. The number of windows
-            # is subtracted, because the largest of more windows is larger by chance.
+            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law. The logarithm of the
+            # number of windows is subtracted, because by chance the maximum over more windows is larger.
             likelihood = count * np.log(max(count, 1.0) / expected) - (count - expected)
             peaks[2 * h + k, 0] = likelihood / clustering - np.log(side**2 / 9.0)
             peaks[2 * h + k, 1] = headings[h]

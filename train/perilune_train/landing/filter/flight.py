@@ -147,7 +147,6 @@ def fly_together(
     times = np.concatenate(list(of_kind.values()))
     kind = np.concatenate([np.full(len(time_s), key) for key, time_s in of_kind.items()])
     number = np.concatenate([np.arange(len(time_s)) for time_s in of_kind.values()])
-    # At equal times, the frame comes last.
     order = np.lexsort([kind, times])
     sightings, surroundings = iter(seen), [lander.surroundings for lander in landers]
     measured, n_done = instruments.inertial.measured(), 0

@@ -10,7 +10,7 @@ sightings         match craters (locate.py), then one of three:
                     attitude (`_restart`)
                   - otherwise ignore the frame
 
-The first four methods change only a part of the state; stretch.py updates the rest at the next frame.
+All methods but `sightings` update a part of the state first; stretch.py updates the rest at the next frame.
 """
 
 from collections.abc import Sequence
@@ -143,7 +143,7 @@ class _Contradiction:
 
 
 class Lander:
-    """State and status of a lander; every method takes one measurement.
+    """State and status of a lander; each method processes one kind of measurement.
 
     With `keep_poses` the state keeps the pose of every frame, and later measurements correct these poses. This makes
     the filter a smoother.

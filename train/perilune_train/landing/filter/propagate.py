@@ -131,7 +131,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
     """Integrate consecutive inertial measurements, each over its interval."""
     position, velocity, rotation_site_from_body = start.position_m, start.velocity_mps, start.rotation_site_from_body
     n, step_s = len(measured), measured.interval_s
-    # Time is the first axis.
+    # Time is the first axis, because the loop below takes one step at a time.
     rate = np.moveaxis(measured.angular_rate_radps - start.gyro_bias_radps[:, None], 1, 0)
     force = np.moveaxis(measured.specific_force_mps2 - start.force_bias_mps2[:, None], 1, 0)
     half = rotation_matrices(rate * (step_s / 2)[:, None, None])
@@ -143,7 +143,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
         position = position + velocity * step_s[k] + acceleration * (step_s[k] ** 2 / 2)
         velocity = velocity + acceleration * step_s[k]
     changes = _changes(middle, half, force, step_s)
-    # Multiply from the last measurement to the first.
+    # The noise of a step is propagated by all later steps, so multiply from the last step to the first.
     onward = np.empty((len(position), _INERTIAL, n, _INERTIAL))
     change = np.eye(_INERTIAL)
     for k in reversed(range(n)):

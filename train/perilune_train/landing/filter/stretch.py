@@ -189,7 +189,7 @@ class Stretch:
         for axis, sigma_rad in enumerate(sigmas_rad):
             by_error = np.zeros((len(turn), len(CORE)))
             by_error[:, ATTITUDE.start + axis] = 1
-            # The first axes have changed the attitude.
+            # The updates about earlier axes have changed the attitude.
             turn = self._turn_to(rotation_site_from_body)
             self._apply(turn[:, axis], by_error, float(sigma_rad), accepted)
         self.n_refused += ~accepted
@@ -217,7 +217,7 @@ class Stretch:
         """
         crossed = (self._covariance @ by_error[:, :, None])[:, :, 0]
         spread = (by_error * crossed).sum(axis=1) + sigma**2
-        # Divide by the innovation's standard deviation; 0 where the number is refused.
+        # Divide by the innovation's standard deviation; a scale of 0 leaves out flights that refuse the number.
         scale = accepted / np.sqrt(spread)
         innovation, crossed, by_error = innovation * scale, crossed * scale[:, None], by_error * scale[:, None]
         by_start = (by_error[:, None] @ self._change)[:, 0]

@@ -20,7 +20,7 @@ from perilune_train.landing.filter.state import ATTITUDE, POSITION, CameraErrors
 from perilune_train.landing.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
-"""Standard deviations at the start, per axis, of position (metres) and velocity (metres per second)."""
+"""Standard deviations at the start on each axis: position (metres) and velocity (metres per second)."""
 BAND = (1.24, 14.45)
 """Interval that contains the sum of six squared standard normal numbers with probability 95 %."""
 
