@@ -55,7 +55,7 @@ _MIN_MARGIN = 0.06
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A fix and how it was found."""
+    """A fix, and whether it needed a search."""
 
     fix: Fix
     """The fix."""

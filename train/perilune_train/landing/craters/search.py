@@ -56,7 +56,7 @@ class Area:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose, and how many sightings agree with it."""
+    """A possible pose of the camera."""
 
     pose: Pose
     """The pose."""

@@ -34,20 +34,20 @@ from perilune_train.landing.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
 """tracking: the last frame was matched to the catalogue. coasting: the last frame was not matched. lost: no frame was
-matched for 15 s, or a fix contradicts the state."""
+matched for 15 s, or a fix since the last matched frame contradicts the state."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 """Default standard deviations, metres, of a range and of the ground's height relative to the nearest craters."""
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
-"""Standard deviation per axis, metres per second, added to the velocity when a fix that contradicts the state replaces
-it."""
+"""Standard deviation on each axis, metres per second, that is added to the velocity when a fix replaces a state that it
+contradicts."""
 _NEAREST = 10
-"""Number of nearest craters whose median height is taken as the height of the ground below."""
+"""The median height of this number of nearest craters is taken as the height of the ground below."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What the lander knows about its camera and the ground."""
+    """Camera, catalogue and ground of a flight."""
 
     camera: Camera
     """Intrinsics."""
@@ -165,7 +165,7 @@ class Lander:
 
     @property
     def surroundings(self) -> Surroundings:
-        """What the lander knows about its camera and the ground."""
+        """Camera, catalogue and ground of the flight."""
         return self._around
 
     @property

@@ -108,7 +108,7 @@ def craters_update(
     innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
     # Height errors of the catalogue shift craters in the image radially. They are added as noise: as parts of the state
-    # they would make it half as large again, and the errors and normalised errors would stay equal.
+    # they made it half as large again and gave equal errors and normalised errors.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
     noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)

@@ -35,7 +35,7 @@ class CatalogueUse:
     site_deg: tuple[float, float] | None = None
     """Latitude and longitude of the site, degrees; needed for a catalogue by latitude and longitude."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Column names of a catalogue by latitude and longitude; if empty, they are recognised automatically."""
+    """Column names of a catalogue by latitude and longitude; if empty, they are recognised."""
 
 
 def read_catalogue(path: Path, use: CatalogueUse) -> Catalogue:

@@ -1,4 +1,4 @@
-"""Run the filter over descents, and tabulate true and stated errors at every frame."""
+"""Run the filter over descents, and tabulate its errors and stated standard deviations."""
 
 import time
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Descents with the craters that a detector finds in every frame."""
+"""Run a detector over the frames of descents."""
 
 import time
 from dataclasses import dataclass
