@@ -1,1 +1,1 @@
-"""The pose of a lander over known craters: catalogue, pose fixes, navigation filter, flights, crater maps."""
+"""Estimate the pose of a lander over known craters: catalogues, fixes, navigation filter, crater maps."""

@@ -1,1 +1,1 @@
-"""Absolute navigation by craters: a catalogue, its match with detections, and the camera pose from that match."""
+"""Absolute navigation by craters: catalogue, matching of detections, and camera pose."""

@@ -1,4 +1,4 @@
-"""Crater catalogues: what a mission knows of the craters at its landing site."""
+"""Crater catalogues of a landing site, without errors or with the errors of orbiter images."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -78,7 +78,10 @@ def exact_catalogue(dataset: Dataset, scene_id: str, least_diameter_m: float) ->
 
 
 def with_errors(exact: Catalogue, errors: CatalogueErrors, rng: np.random.Generator) -> Catalogue:
-    """The catalogue with random errors. False craters have sizes of real craters and random positions among them."""
+    """The catalogue with random errors, some craters missing and some false craters.
+
+    False craters have the sizes of real craters, and random positions within the area of the catalogue.
+    """
     kept = exact.part(rng.random(len(exact)) >= errors.missing_share)
     n_false = round(len(kept) * errors.false_share / (1 - errors.false_share))
     model = kept.part(rng.integers(len(kept), size=n_false))

@@ -33,8 +33,9 @@ _N_HARD = 3
 """Number of one-to-one rounds at the end."""
 _GATE_SIGMAS = 3.5
 _FARTHEST_PX, _SMALLER = 64.0, 0.8
-"""All rounds leave out craters farther outside the image than this, or smaller than this share of the smallest radius
-to match. The start is correct to a few pixels, and the rounds consider craters up to 18 px outside the image."""
+"""All rounds leave out craters that are farther outside the image than this, pixels, or smaller than this share of the
+smallest radius to match. No match is lost: the start is correct to a few pixels, and the rounds consider craters up to
+18 px outside the image."""
 _TUKEY = 4.685
 COMMON_PX = 0.08
 """Standard deviation, pixels, of the error that all centres in a frame share."""
@@ -69,7 +70,7 @@ class Fix:
     weight: Array
     """Weights of the matches (K,), from 0 for outliers to 1."""
     rms_px: float
-    """Root mean square distance between matched centres, per axis."""
+    """Root mean square distance between matched centres, per axis, pixels."""
 
 
 def refine(
@@ -80,10 +81,10 @@ def refine(
     start: Pose,
     start_px: float = _SOFT_PX[0],
 ) -> Fix | None:
-    """Estimate the best-fitting pose from a start near the true pose; None if fewer than six sightings match.
+    """Estimate the best-fitting pose near a start; None if fewer than six sightings match.
 
-    `start_px` is the standard deviation of the start's error in the image, pixels. The result is the best pose near the
-    start, and it may be wrong: `vote.support` tells how far it exceeds chance.
+    `start_px` is the standard deviation of the start's error in the image, pixels. If the start is far from the true
+    pose, the result is wrong: use `vote.support` to compare the number of agreeing sightings with chance.
     """
     if not len(sightings):
         return None
@@ -110,7 +111,7 @@ def refine(
         )
         pose = _stepped(pose, prior, precision, normal, gradient)
     for number in range(_N_HARD):
-        # The first step still has the error of the last soft round.
+        # In the first of these rounds, the pose still has the error of the last soft round.
         gate_px = 0.5 if number == 0 else 0.0
         expected = projected(catalogue, camera, pose, 3 * gate_px, least_px)
         placed_px = camera.fx_px / expected.depth_m * catalogue.position_sigma_m
@@ -136,7 +137,7 @@ def refine(
 
 
 def _first_round(start_px: float) -> int:
-    """The first soft round for a start with this error: the last one that assumes at least 1.5 times the error."""
+    """Index of the first soft round: the last round that assumes at least 1.5 times the start's error."""
     return max(sum(soft_px >= 1.5 * start_px for soft_px in _SOFT_PX) - 1, 0)
 
 
@@ -154,11 +155,12 @@ def _soft_equations(
     limits: tuple[float, float, float],
     jacobian: Array,
 ) -> tuple[Array, Array]:
-    """Normal matrix (6, 6) and right side (6,) over all pairs, weighted by the probability that a pair is correct.
+    """Normal matrix (6, 6) and right side (6,) over all pairs of a soft round.
 
-    `first` and `crater` list the pairs as `within_reach` does. `limits` holds the deviation of a size, the density of
-    false sightings relative to one crater (per pixel squared and per unit of size), and the largest distance in
-    standard deviations. `jacobian` (N, 3, 6) holds the derivatives of each crater with respect to the step.
+    A pair is weighted by the probability that it is correct. `first` and `crater` list the pairs as
+    `within_reach` does. `limits` holds the standard deviation of a size, the density of false sightings relative to one
+    crater (per pixel squared and per unit of size), and the largest distance in standard deviations. `jacobian` (N, 3,
+    6) holds the derivatives of each crater with respect to the pose step.
     """
     size_sigma, clutter, farthest = limits
     normal, right = np.zeros((6, 6)), np.zeros(6)
@@ -202,7 +204,7 @@ def _soft_equations(
 def _normal_equations(
     error: Array, centre_sigma: Array, size_sigma: float, gate_px: float, jacobian: Array
 ) -> tuple[Array, Array, Array]:
-    """Weights (K,) of K matches, normal matrix (6, 6) and right side (6,) of a Gauss-Newton step of the pose.
+    """Weights (K,) of K matches; normal matrix (6, 6) and right side (6,) of a Gauss-Newton step.
 
     `error` (K, 3) holds the differences in centre and size. `centre_sigma` (K,) and `size_sigma` are the standard
     deviations of these differences. `gate_px` is the uncertainty of the pose, and `jacobian` (K, 3, 6) holds the

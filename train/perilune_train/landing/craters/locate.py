@@ -1,4 +1,4 @@
-"""Estimate a pose from one frame: near an expected pose, within an area, or anywhere over the catalogue."""
+"""Estimate a pose from one frame: near an expected pose, in an area, or anywhere over the catalogue."""
 
 from dataclasses import dataclass
 
@@ -27,11 +27,11 @@ from perilune_train.landing.craters.vote import (
 _NEAR_PX = 6.0
 """Largest standard deviation of the expected pose, in pixels on the ground, for which no search is needed."""
 _NEAR_SIGMAS, _SEARCH_SIGMAS, _SURE_SIGMAS = 5.0, 10.0, 30.0
-"""Smallest support of a fix, in standard deviations of chance: near the expected pose, and by a search. A search stops
-at the first candidate with the last support."""
+"""Smallest support, in standard deviations of chance: of a fix near the expected pose, of a fix by a search, and of a
+fix at which a search stops without trying further candidates."""
 _CLEAR_SIGNIFICANCE, _CLEARLY_AHEAD = 14.0, 1.3
-"""Smallest significance of the first refined candidate of a camera that is lost in space, and smallest ratio to the
-second. Over validation scenes, chance reaches 11, and the true pose has 14 to 120."""
+"""Smallest significance of the best refined candidate of a camera that is lost in space, and smallest ratio to the
+significance of the next different pose. On validation scenes, wrong poses reach 11, and the true pose has 14 to 120."""
 _AHEAD = 1.3
 """Smallest ratio between the support of the best and the second-best pose of a search."""
 _MAX_TILT_RAD = float(np.radians(5))
@@ -45,8 +45,8 @@ _N_POLISHED = 3
 """Largest number of fits from a candidate."""
 _SIGMAS = 3.5
 _ATTEMPTS = ((1.0, QUICK), (1.0, FINE), (1.0, WHOLE), (3.0, QUICK))
-"""Searches, tried in turn: search radius, as a multiple of the radius that the prior suggests, and effort. The larger
-radius is tried because the prior may be wrong."""
+"""Searches in the order in which they are tried: search radius as a multiple of the radius from the prior's standard
+deviations, and effort. The last search has a larger radius, because the prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
 _MIN_MARGIN = 0.06
@@ -55,7 +55,7 @@ _MIN_MARGIN = 0.06
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A fix and how it was found."""
+    """A fix, and whether it needed a search."""
 
     fix: Fix
     """The fix."""
@@ -75,7 +75,7 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     altitude_m = max(float(prior.pose.position_m[2] - ground_m), 1.0)
     sigma = np.sqrt(np.diag(prior.covariance))
     on_ground_px = float(np.hypot(sigma[:2].max() / altitude_m, sigma[3:5].max())) * camera.fx_px
-    # Altitude and heading move the edges of the frame.
+    # Errors of altitude and heading move the edges of the image, but not its centre.
     edge_px = float(np.hypot(sigma[2] / altitude_m, sigma[5])) * camera.width_px / 2
     start_px = float(np.hypot(on_ground_px, edge_px))
     if start_px < _NEAR_PX:
@@ -104,8 +104,8 @@ def lost_in_space(
 ) -> Located | None:
     """Search an area for the pose of a frame whose tilt is known to about 1 degree; None if uncertain.
 
-    Pairs of the largest craters come first, because they are fast. If they lead to no fix, all craters vote, first with
-    coarse bins and then with fine ones.
+    Pairs of the largest craters are tried first, because this is fast. If they lead to no fix, the sightings vote (see
+    vote.py), first with coarse bins and then with fine bins.
     """
     rotation_camera_from_site = prior.pose.rotation_camera_from_site
     hypotheses = search(sightings, catalogue, camera, rotation_camera_from_site, area)
@@ -128,7 +128,7 @@ def lost_in_space(
 
 
 def is_clear(voted: list[Candidate]) -> bool:
-    """Whether the first of several refined candidates is the pose, and not the most significant chance."""
+    """Whether the first refined candidate is significant enough to be the true pose."""
     if not voted or voted[0].significance < _CLEAR_SIGNIFICANCE:
         return False
     others = (later.significance for later in voted[1:] if not _same(later.pose, voted[0].pose))
@@ -163,9 +163,9 @@ def _polished(
 ) -> tuple[Support, Fix | None]:
     """The fix from a candidate of a search, and its support.
 
-    A candidate is off by several pixels at the edges of the frame, and a fit from there may match a part of the frame
-    only, with a wrong tilt. So the first fit keeps the tilt near the candidate's, with standard deviation `tilt_rad`,
-    and the fit is repeated from its result while the support grows.
+    A candidate is off by several pixels at the edges of the frame. A free fit from there may match only a part of the
+    frame, with a wrong tilt. Therefore the first fit has a prior on the tilt, with standard deviation `tilt_rad`. Free
+    fits follow, each from the previous result, while the support grows.
     """
     first = refine(sightings, catalogue, camera, _around(pose, tilt_rad), pose)
     best, agreed = None, Support(0, 0.0, 1.0)
@@ -190,11 +190,13 @@ def _tilt(first: Pose, second: Pose) -> float:
 
 
 def _same(first: Pose, second: Pose) -> bool:
-    """Whether two fixes are one pose: closer than an error of a fix."""
+    """Whether the distance of two poses is below a tenth of the height."""
     return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 
 def _around(pose: Pose, tilt_rad: float = _WEAK_TILT_RAD) -> PosePrior:
-    """A prior around a pose; by default a weak one. The fix then depends on the sightings alone, and no sighting is
-    counted twice."""
+    """A prior around a pose.
+
+    By default it is weak: the fix then depends on the sightings alone, and no sighting is counted twice.
+    """
     return PosePrior(pose, np.diag(np.square([300.0] * 3 + [tilt_rad, tilt_rad, _WEAK_TILT_RAD])))

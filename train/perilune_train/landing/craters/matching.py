@@ -55,7 +55,7 @@ def _best(
     crater: NDArray[np.int64],
     limits: tuple[float, float],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Match the pairs that `within_reach` lists, as `matched` does; `limits` are the size variance and the gate."""
+    """`matched` for pairs listed by `within_reach`; `limits` are `size_variance` and `gate`."""
     size_variance, gate = limits
     kept, kept_crater, cost, count = np.zeros_like(first), np.empty_like(crater), np.empty(len(crater)), 0
     for i in range(len(seen.size)):
@@ -80,11 +80,12 @@ def _best(
 
 @compiled
 def assigned(first: NDArray[np.int64], crater: NDArray[np.int64], cost: Array, n_craters: int) -> NDArray[np.int64]:
-    """The crater of each sighting (M,), or -1, in the assignment with the most pairs and, among these, the least cost.
+    """The crater of each sighting (M,), or -1, in the best one-to-one assignment.
 
-    `first` and `crater` list the pairs as `within_reach` does. The sightings are added one at a time, each along the
-    shortest path of exchanges among the listed pairs (Crouse 2016, doi 10.1109/TAES.2016.140952). A sighting may stay
-    unmatched at the cost `_ALONE`.
+    The best assignment has the most pairs and, among equal numbers of pairs, the least total cost. `first`
+    and `crater` list the pairs as `within_reach` does. The sightings are added one at a time, each along the shortest
+    path of exchanges among the listed pairs (Crouse 2016, doi 10.1109/TAES.2016.140952). A sighting may stay unmatched
+    at the cost `_ALONE`.
     """
     n = len(first) - 1
     partner, taken = np.full(n, -1), np.full(n_craters, -1)

@@ -57,10 +57,10 @@ def _cell(coordinate: float, corner: float, side: float, n: int) -> int:
 
 @compiled
 def within_reach(positions: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each of M positions (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
+    """For each of M positions (M, 2), the points (N, 2) within `reach` (M,) along each axis.
 
-    Returns the index of the first pair of each position, followed by the number of pairs (M + 1,), and the point of
-    each pair.
+    Returns two arrays. The first (M + 1,) holds the index of the first pair of each position, and as its last element
+    the number of pairs. The second holds the point of each pair.
     """
     grid = grid_of(others)
     first, other, count = np.zeros(len(positions) + 1, np.int64), np.empty(8 * len(positions) + 1, np.int64), 0

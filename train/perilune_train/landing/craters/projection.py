@@ -1,4 +1,4 @@
-"""Craters of a catalogue as a camera at a pose sees them."""
+"""Project the craters of a catalogue into the image of a camera with a known pose."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Pose:
     """Attitude (3, 3)."""
 
     def changed(self, step: Array) -> "Pose":
-        """The pose after a step (6,): shift in O_L, metres, then a rotation multiplied from the left, radians, O_C."""
+        """The pose after a step (6,): shift (metres, O_L), then rotation from the left (radians, O_C)."""
         turn = matrix_from_rotation_vector(step[3:])
         return Pose(self.position_m + step[:3], turn @ self.rotation_camera_from_site)
 
@@ -34,9 +34,9 @@ class Projected:
     index: NDArray[np.integer]
     """Rows (N,) of the catalogue."""
     centre_px: Array
-    """Centres of the ellipses (N, 2), which are not the images of the circles' centres."""
+    """Centres of the ellipses (N, 2), pixels; they differ from the images of the circles' centres."""
     radius_px: Array
-    """Radii (N,): half the geometric mean of width and height of the box."""
+    """Radii (N,), pixels: half the geometric mean of width and height of the bounding box."""
     point_m: Array
     """Centres of the circles (N, 3), O_C."""
     pose: Pose
@@ -50,10 +50,10 @@ class Projected:
         return self.point_m[:, 2]
 
     def jacobian(self, chosen: NDArray[np.integer] | None = None) -> Array:
-        """Derivatives (K, 3, 6) of centre and log radius with respect to a pose step; of all craters or `chosen`.
+        """Derivatives (K, 3, 6) of centre and logarithm of the radius with respect to a pose step.
 
-        They neglect the change of the offset between the ellipse's centre and the image of the circle's centre, which
-        changes far more slowly.
+        K is the number of `chosen` craters, or of all craters. The offset between the centre of the ellipse and the
+        image of the circle's centre is taken as constant, because it changes far more slowly than the centre.
         """
         points = self.point_m if chosen is None else self.point_m[chosen]
         return _derivatives(points, self.pose.rotation_camera_from_site, self.camera.fx_px, self.camera.fy_px)
@@ -84,7 +84,7 @@ def _derivatives(point_m: Array, rotation_camera_from_site: Array, fx_px: float,
 def projected(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float = 0.0, least_radius_px: float = 1.0
 ) -> Projected:
-    """Project craters of at least `least_radius_px`, with a centre in the image or at most `margin_px` outside it."""
+    """Project the craters that `in_view` selects, except circles whose image is not an ellipse."""
     index, points = _in_view(catalogue, camera, pose, margin_px, least_radius_px)
     rotation_camera_from_site = pose.rotation_camera_from_site
     if any(camera.distortion):
@@ -104,8 +104,11 @@ def projected(
 def in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> NDArray[np.integer]:
-    """Rows of the craters whose centre is in the image or at most `margin_px` outside it, and whose radius, times
-    focal length over depth, is at least `least_radius_px`."""
+    """Rows of the craters in view.
+
+    The centre of a crater in view is in the image or at most `margin_px` outside it. The radius, times focal length
+    over depth, is at least `least_radius_px`.
+    """
     return _in_view(catalogue, camera, pose, margin_px, least_radius_px)[0]
 
 
@@ -138,7 +141,10 @@ def _visible(
     lens: _Lens,
     limits: tuple[float, float],
 ) -> tuple[NDArray[np.int64], Array]:
-    """`_in_view` for circles with centres (N, 3), O_L, and radii (N,); `limits` are the margin and the least radius."""
+    """`_in_view` for circles with centres (N, 3), O_L, and radii (N,).
+
+    `limits` are `margin_px` and `least_radius_px`.
+    """
     fx_px, fy_px, cx_px, cy_px, width_px, height_px = lens
     margin_px, least_px = limits
     # No branches: the processor cannot predict which craters pass. Size comes first, because it alone excludes most

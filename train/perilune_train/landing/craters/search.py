@@ -1,4 +1,4 @@
-"""Find the position of a camera from pairs of craters, with a rough prior position or none.
+"""Find the position of a camera from pairs of craters, with or without a rough prior position.
 
 Two craters determine position, heading and altitude of a level camera. Steps:
 
@@ -24,19 +24,20 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _N_PAIRED = 18
-"""Number of sightings that form pairs, the largest ones, since large craters are rare."""
+"""Number of sightings that form pairs. The largest sightings are used, because large craters are rare."""
 _N_FIRST, N_TESTED = 24, 60
-"""Numbers of sightings, largest first, that test every placement and that test the best placements."""
+"""Number of sightings on which all placements are tested, and on which the best are tested; the largest sightings."""
 _MIN_SEPARATION = 0.1
 """Smallest separation of a pair, divided by the width of the image."""
 _SIZE_SIGMA, _SIGMAS, _FARTHEST = 0.12, 3.5, 4.5
-"""Standard deviation of the logarithm of a size; number of standard deviations at an area's limits of
-altitude and heading; largest distance, in standard deviations, between a pair of sightings and a pair of craters."""
+"""Standard deviation of the logarithm of a size; number of standard deviations that correspond to the limits of an
+area's altitude and heading; largest distance, in standard deviations, between a pair of sightings and a pair of
+craters."""
 _TEST_PX, _TEST_SIZE = 4.0, 0.35
 """Largest distance, and largest difference of the logarithms of the sizes, at which a sighting agrees with a crater."""
 _MAX_PAIRED, _MAX_HITS, _MAX_TESTED, _MAX_RETURNED = 800, 150, 1000, 5
-"""Limits on the time: craters that form pairs, the largest first; placements for a pair of sightings; placements that
-are tested on more sightings; hypotheses that are returned."""
+"""Largest numbers of: craters that form pairs, the largest first; placements for a pair of sightings; placements that
+are tested on more sightings; returned hypotheses. They limit the time of a search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,7 @@ class Area:
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose, and how many sightings agree with it."""
+    """A possible pose of the camera."""
 
     pose: Pose
     """The pose."""
@@ -66,10 +67,10 @@ class Hypothesis:
 def search(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, rotation_camera_from_site: Array, area: Area
 ) -> list[Hypothesis]:
-    """The best hypotheses, best first; may be empty.
+    """The best hypotheses, best first; empty if no placement fits.
 
-    Each is at least 10 px on the ground away from all better ones. `rotation_camera_from_site` is the assumed attitude:
-    its tilt must be correct to about a degree.
+    Each hypothesis is at least 10 px on the ground away from all better hypotheses. `rotation_camera_from_site` is the
+    assumed attitude; its tilt must be correct to about a degree.
     """
     rays = camera.rays(sightings.centre_px) @ rotation_camera_from_site
     offset, size = rays[:, :2] / -rays[:, 2:], sightings.radius_px / camera.fx_px
@@ -83,7 +84,7 @@ def search(
     placements = _placements(offset[:_N_PAIRED], size[:_N_PAIRED], paired, camera, area)
     if not len(placements.altitude_m):
         return []
-    # All placements are tested on some sightings, the best on more.
+    # To save time, test all placements on few sightings, and only the best placements on more.
     agreed = _agreed(placements, offset[:_N_FIRST], size[:_N_FIRST], local, camera)
     placements = placements.part(np.argsort(-agreed, kind="stable")[:_MAX_TESTED])
     agreed = _agreed(placements, offset[:N_TESTED], size[:N_TESTED], local, camera)
@@ -144,9 +145,10 @@ class _Pairs:
         return _Pairs(self.index[chosen], self.separation[chosen], self.sizes[chosen], self.direction[chosen])
 
     def places(self, log_range: float, heading_rad: float) -> Array:
-        """Points (n, 5), one for each pair; their distances are differences of pairs in standard deviations.
+        """Points (n, 5), one for each pair; distances between points are in standard deviations.
 
-        Differences of `log_range` in separation and `heading_rad` in direction count `_SIGMAS` standard deviations.
+        `_SIGMAS` standard deviations correspond to a difference of `log_range` in the logarithm of the separation, and
+        to a difference of `heading_rad` in direction.
         """
         on_circle = np.column_stack([np.cos(self.direction), np.sin(self.direction)])
         across = 2 * np.sin(min(heading_rad, np.pi) / 2)
@@ -156,7 +158,7 @@ class _Pairs:
 
 @dataclass(frozen=True, slots=True)
 class _Placements:
-    """Possible places of a level camera."""
+    """Possible positions and headings of a level camera."""
 
     altitude_m: Array
     """Altitudes above the ground (n,), metres."""
@@ -188,7 +190,7 @@ def _placements(offset: Array, size: Array, local: Catalogue, camera: Camera, ar
     catalogue_pairs = _Pairs.of(local.centre_m[:, :2], local.radius_m, _MIN_SEPARATION * width * low, most)
     if not len(catalogue_pairs.index):
         return none
-    # Scale the sightings to the middle altitude: their separations are then wrong by at most half of the range.
+    # Scale the sightings to the middle altitude. The error of a separation is then at most half of the altitude range.
     middle = replace(sighting_pairs, separation=sighting_pairs.separation + np.log(low * high) / 2)
     log_range = np.log(high / low) / 2
     tree = KDTree(catalogue_pairs.places(log_range, area.heading_rad))

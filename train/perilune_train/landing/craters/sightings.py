@@ -11,8 +11,8 @@ _FLOOR_PX, _NOISE_SHARE, STATIC_SHARE = 0.15, 0.045, 0.075
 differ from frame to frame have a floor and a share of the radius. Errors that repeat in every frame of a crater have a
 share of the radius."""
 _PER_SCORE, _USUAL_SCORE = 1.5, 0.8
-"""The logarithm of the error that differs from frame to frame grows by this much per unit of decreasing score, and has
-the value stated above at this score."""
+"""The standard deviation that differs from frame to frame has the value above at `_USUAL_SCORE`. The logarithm of this
+deviation grows by `_PER_SCORE` per unit of decreasing score."""
 MAX_SIGHTINGS = 500
 """Largest number of craters of a frame that are matched, which limits the time of a step."""
 _SIZE_SHARE = 0.15

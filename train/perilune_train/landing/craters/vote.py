@@ -1,9 +1,9 @@
-"""Search for a pose near an expected one, by votes of all pairs of a sighting and a crater of similar size.
+"""Search for a pose near an expected pose, by votes of pairs of a sighting and a crater.
 
 An error of the expected pose shifts, scales and turns the image of the catalogue. For each altitude and heading of a
-grid, every pair votes for the shift that maps its crater onto its sighting. The correct pairs vote for one shift, and
-all other pairs spread over the whole range. No single crater has to be both detected and in the catalogue, so the
-search also works where the largest sightings have no counterpart in the catalogue.
+grid, every pair of similar size votes for the shift that maps its crater onto its sighting. The correct pairs vote for
+one shift, and all other pairs spread over the whole range. The search does not depend on any single crater, so it also
+works where the largest sightings have no counterpart in the catalogue.
 """
 
 from dataclasses import dataclass
@@ -19,25 +19,26 @@ from perilune_train.landing.craters.projection import Pose, projected
 from perilune_train.landing.craters.sightings import Sightings
 
 _BIN_PX, _STEP = 1.5, 0.03
-"""Size of a bin, pixels, and step of the logarithm of the altitude and of the heading, radians. Half a step moves the
-corner of a frame of 256 px by 2.7 px; votes are summed over three bins, 4.5 px."""
+"""Size of a bin, pixels; step of the heading, radians, and of the logarithm of the altitude. Half a step moves the
+corner of a frame of 256 px by 2.7 px. Votes are summed over windows of three by three bins, 4.5 px wide."""
 _MAX_BINS = 400
-"""Searches over larger shifts use at most this number of bins on each side of zero, unless a bin would be more than
-twice as large."""
+"""Largest number of bins on each side of zero. Bins grow up to twice their size to respect it; searches over even
+larger shifts exceed it."""
 _MAX_SHIFT_PX = 2000.0
 """Larger shifts are not searched. This limits memory and time if the expected altitude is wrong."""
 _SIZE_TOLERANCE = 0.35
 """Largest difference of the logarithms of the radii of a pair that votes."""
 _MAX_WINDOWS = 1.5e9
-"""Approximate largest number of windows of a search: a few seconds."""
+"""Approximate largest number of windows in a search, over all altitudes and headings; it takes a few seconds."""
 _MIN_VOTERS = 120
-"""Smallest number of sightings that vote, if there are as many."""
+"""Smallest number of sightings that vote. If there are fewer, all vote."""
 _REFINED_SHIFT_PX, _REFINED_LOG_ALTITUDE, _REFINED_HEADING_RAD = 15.0, 0.06, 0.07
 """Range of the second vote around a candidate."""
 _BORDER_PX = 40.0
 """Craters that are farther outside the image do not take part in the second vote."""
 _SURE_SIGNIFICANCE = 36.0
-"""A candidate with this significance in the second vote is the pose: over validation scenes, chance reaches 11."""
+"""A candidate with at least this significance in the second vote is taken as the true pose. On validation scenes, wrong
+poses reach 11."""
 _APART_PX = 6.0
 """Candidates at one altitude and heading are at least this far apart."""
 
@@ -47,20 +48,21 @@ class Effort:
     """How thorough a search is."""
 
     coarser: float
-    """Factor of the bins and steps."""
+    """Factor that enlarges bins and steps."""
     max_pairs: int
-    """Sightings of the rarest sizes vote, as many as have this number of pairs altogether."""
+    """Largest number of pairs of all voting sightings together; sightings of the rarest sizes vote first."""
     n_candidates: int
     """Largest number of candidates."""
     max_votes: float = 4e8
-    """Largest number of votes at all altitudes and headings; fewer sightings vote in a search over a large range."""
+    """Largest number of votes over all altitudes and headings. In a search over a large range, fewer sightings vote."""
 
 
 QUICK, FINE, WHOLE = Effort(2.0, 40_000, 8), Effort(1.0, 200_000, 16), Effort(2.0, 1_500_000, 32)
-"""With a prior: a first search, and two more if it finds nothing. In the last one nearly all sightings vote, because
-over an elevation model the rarest sizes may be absent from the catalogue."""
+"""Efforts of searches with a prior: the first search, and two more if it finds nothing. In the last search nearly all
+sightings vote, because over an elevation model the catalogue may lack craters of the rarest sizes."""
 LOST, LOST_FINELY = Effort(2.0, 3_000_000, 64, 2e9), Effort(1.0, 3_000_000, 16, 8e9)
-"""Without a prior: a first search of seconds, and a second one of up to half a minute if the first finds nothing."""
+"""Efforts of searches without a prior: the first search takes seconds. If it finds nothing, the second search takes up
+to half a minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class SearchRange:
-    """Height of the ground, and largest differences between the expected pose and the true pose."""
+    """Limits of a search: height of the ground, and largest errors of the expected pose."""
 
     ground_m: float
     """Height of the ground below the expected pose, metres, O_L."""
@@ -87,7 +89,7 @@ class SearchRange:
     log_altitude: tuple[float, float]
     """Smallest and largest logarithm of the altitude divided by the expected altitude."""
     heading_rad: float
-    """Heading, radians; pi if it is unknown."""
+    """Difference in heading, radians; pi if the heading is unknown."""
 
 
 def candidates(
@@ -100,7 +102,8 @@ def candidates(
 ) -> list[Candidate]:
     """The poses with the most significant peaks of votes, most significant first.
 
-    The shift of the image becomes a horizontal displacement of the camera. The tilt of `expected` stays.
+    The shift of the image is converted to a horizontal displacement of the camera. All poses have the tilt of
+    `expected`.
     """
     low, high = limits.log_altitude
     altitude_m = float(expected.position_m[2]) - limits.ground_m
@@ -146,11 +149,11 @@ def candidates(
 
 
 def refined(sightings: Sightings, catalogue: Catalogue, camera: Camera, coarse: list[Candidate]) -> list[Candidate]:
-    """Let all sightings vote once more near each candidate, with fine bins; most significant candidates first.
+    """Let all sightings vote again near each candidate, with fine bins; most significant poses first.
 
-    In a wide search, the peak of the true pose is spread over several coarse bins, and chance has many bins. The second
-    vote raises the significance of the true pose several times, and hardly changes others. Candidates that follow a
-    certain one are left out.
+    In a wide search, the peak of the true pose is spread over several coarse bins, and the many bins make high peaks by
+    chance likely. The second vote multiplies the significance of the true pose and hardly changes the significance of
+    wrong poses. It stops at the first candidate with `_SURE_SIGNIFICANCE`.
     """
     again: list[Candidate] = []
     log_altitude = (-_REFINED_LOG_ALTITUDE, _REFINED_LOG_ALTITUDE)
@@ -177,9 +180,10 @@ def _range_px(limits: SearchRange, altitude_m: float, camera: Camera) -> float:
 
 
 def _coarser_for(limits: SearchRange, altitude_m: float, camera: Camera, coarser: float) -> float:
-    """Factor, at least 1, by which bins and steps grow, so that a search has at most about `_MAX_WINDOWS` windows.
+    """Factor, at least 1, by which bins and steps grow to keep a search below `_MAX_WINDOWS` windows.
 
-    Altitude, heading and shift along both axes have fewer steps, so the number falls with the fourth power.
+    The factor reduces the steps of altitude, heading and both shifts, so the number of windows falls with its fourth
+    power.
     """
     low, high = limits.log_altitude
     step, bin_px = coarser * _STEP, coarser * _BIN_PX
@@ -189,9 +193,10 @@ def _coarser_for(limits: SearchRange, altitude_m: float, camera: Camera, coarser
 
 
 def _rarest(n_pairs: NDArray[np.integer], max_pairs: int, limit: float) -> NDArray[np.integer]:
-    """The sightings that vote, from the number of craters of similar size of each sighting (M,).
+    """Indices of the sightings that vote, rarest sizes first.
 
-    At least `_MIN_VOTERS` vote, unless they have more than `limit` pairs.
+    `n_pairs` (M,) is the number of craters of similar size of each sighting. The chosen sightings have at most
+    `max_pairs` pairs in total, but at least `_MIN_VOTERS` vote unless these have more than `limit` pairs.
     """
     order = np.argsort(n_pairs, kind="stable")
     pairs = np.cumsum(n_pairs[order])
@@ -208,10 +213,11 @@ def _peaks(
     headings: Array,
     grid: tuple[float, int],
 ) -> Array:
-    """The two best peaks at each heading (2 H, 4): significance, heading, and shift to the right and down, pixels.
+    """The two best peaks (2 H, 4) at each of H headings.
 
-    `seen_px` (M, 2) and `known_px` (N, 2) are relative to the principal point. Sighting i forms pairs with the craters
-    from `first[i]` to before `last[i]`. `grid` holds the size of a bin and the number of bins on each side of zero.
+    The columns are significance, heading, and shift to the right and down, pixels. `seen_px` (M, 2) and `known_px`
+    (N, 2) are relative to the principal point. Sighting i forms pairs with the craters from `first[i]` to
+    `last[i] - 1`. `grid` holds the size of a bin and the number of bins on each side of zero.
     """
     bin_px, reach = grid
     side = 2 * reach + 1
@@ -258,7 +264,7 @@ def _peaks(
                     best, best_row, best_column = count, row, column
                 elif is_apart:
                     second, second_row, second_column = count, row, column
-        # Without the largest peak, which may be the true pose.
+        # Leave out the largest peak, because it may be the true pose.
         for row in range(max(best_row - 3, 0), min(best_row + 4, side)):
             for column in range(max(best_column - 3, 0), min(best_column + 4, side)):
                 count = 0
@@ -271,8 +277,8 @@ def _peaks(
         clustering = max((squares / side**2 - expected**2) / expected, 1.0)
         for k in range(2):
             count, row, column = (best, best_row, best_column) if k == 0 else (second, second_row, second_column)
-            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law. The number of windows
-            # is subtracted, because the largest of more windows is larger by chance.
+            # Logarithm of the likelihood ratio between this count and chance, by Poisson's law. The logarithm of the
+            # number of windows is subtracted, because by chance the maximum over more windows is larger.
             likelihood = count * np.log(max(count, 1.0) / expected) - (count - expected)
             peaks[2 * h + k, 0] = likelihood / clustering - np.log(side**2 / 9.0)
             peaks[2 * h + k, 1] = headings[h]
@@ -282,7 +288,7 @@ def _peaks(
 
 
 def _differ(first: tuple[float, ...], second: tuple[float, ...], near: float) -> bool:
-    """Whether two peaks are different poses, and not neighbours of one peak."""
+    """Whether two peaks are far enough apart to be different poses."""
     turn = (first[2] - second[2] + np.pi) % (2 * np.pi) - np.pi
     shift_px = max(abs(first[3] - second[3]), abs(first[4] - second[4]))
     return shift_px > _APART_PX or abs(first[1] - second[1]) > near or abs(turn) > near
@@ -331,7 +337,7 @@ _DISPLACED = np.array(
         for angle in phase + np.arange(8) * np.pi / 4
     ]
 )
-"""Displacements (24, 2), pixels, at which agreement is chance."""
+"""Displacements (24, 2), pixels, of the projected catalogue. At these, sightings agree with craters by chance only."""
 _AGREE_SIGMAS, _AGREE_SIZE = 2.5, 0.35
 """Largest distance, in standard deviations, and largest difference of the logarithms of the radii of a sighting and a
 crater that agree."""
@@ -371,9 +377,9 @@ def _agreed(
     displaced: Array,
     size_tolerance: float,
 ) -> NDArray[np.int64]:
-    """Number of sightings (D,) with a crater of similar size within reach, for each displacement (D, 2) of the craters.
+    """Number of sightings (D,) with a crater of similar size within reach, for D displacements (D, 2).
 
-    The craters are sorted by their first coordinate.
+    The displacements are added to the craters. The craters are sorted by their first coordinate.
     """
     counts = np.zeros(len(displaced), np.int64)
     for d in range(len(displaced)):

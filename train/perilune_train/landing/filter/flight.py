@@ -1,4 +1,4 @@
-"""Run the filter over a descent: process measurements in time order and return an estimate at every frame."""
+"""Run the filter over the measurements of a descent, with one estimate for each frame."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from perilune_train.landing.filter.stretch import Stretch
 
 _SAME_S = 1e-9
 _ATTITUDE, _BEAM, _RANGE, _FRAME = range(4)
-"""Kinds of measurements, in the order in which those of one time are processed."""
+"""Kinds of measurements. Measurements with equal times are processed in this order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class DopplerLidar:
     time_s: Array
     """Times (n,), seconds since the first frame."""
     beams: list[Beam]
-    """Measurements (n)."""
+    """One measurement for each time (n)."""
     errors: LidarErrors
     """Standard deviations of the measurements."""
 
@@ -56,13 +56,16 @@ class Instruments:
     range_m: Array
     """Distances to the ground along -Z_B (n,), metres; NaN where the altimeter measured no distance."""
     star_tracker: StarTracker | None = None
-    """Attitudes of a star tracker."""
+    """Attitudes of a star tracker; None without a star tracker."""
     doppler_lidar: DopplerLidar | None = None
-    """Ranges and speeds of a Doppler lidar."""
+    """Ranges and speeds of a Doppler lidar; None without a Doppler lidar."""
 
     @classmethod
     def of_trajectory(cls, dataset: Dataset, ids: tuple[str, str], grade: InertialGrade) -> "Instruments":
-        """Read inertial measurements of a grade, and ranges, of a trajectory, given by scene_id and trajectory_id."""
+        """Read the ranges of a trajectory, and its inertial measurements of one grade.
+
+        `ids` are the scene_id and the trajectory_id.
+        """
         columns = ["grade", "time_s", "interval_s", "angular_rate_radps", "specific_force_mps2"]
         rows = dataset.table("inertial", columns, *ids).to_pandas()
         rows = rows[rows["grade"] == grade].sort_values("time_s")
@@ -73,7 +76,10 @@ class Instruments:
         return cls(inertial, ranges["time_s"].to_numpy(np.float64), ranges["range_m"].to_numpy(np.float64))
 
     def with_star_tracker(self, dataset: Dataset, ids: tuple[str, str], sigmas_rad: Array) -> "Instruments":
-        """Add the star tracker of a trajectory; `sigmas_rad` (3,) are its standard deviations about the body's axes."""
+        """Add the star tracker of a trajectory.
+
+        `sigmas_rad` (3,) are the standard deviations of the attitudes about the body's axes, radians.
+        """
         rows = dataset.table("star_tracker", ["time_s", "rotation_wxyz"], *ids).to_pandas().sort_values("time_s")
         attitudes = matrix_from_quaternion(_vectors(rows["rotation_wxyz"], 4))
         return replace(self, star_tracker=StarTracker(rows["time_s"].to_numpy(np.float64), attitudes, sigmas_rad))
@@ -84,7 +90,10 @@ def _vectors(column: pd.Series, length: int) -> Array:
 
 
 def together(flights: Sequence[Instruments]) -> Instruments:
-    """Combine the instruments of F flights; times and ranges are taken from the first flight."""
+    """Combine the inertial measurements of F flights.
+
+    Times and all other measurements are taken from the first flight.
+    """
     inertial = [flight.inertial for flight in flights]
     rate = np.stack([measured.angular_rate_radps for measured in inertial])
     force = np.stack([measured.specific_force_mps2 for measured in inertial])
@@ -104,14 +113,14 @@ class Estimate:
     located: Located | None
     """The accepted fix, if there is one."""
     n_refused: int = 0
-    """Number of ranges, speeds and attitudes since the previous frame that contradict the state and were refused."""
+    """Number of ranges, speeds and attitudes that were refused since the previous frame."""
 
 
 def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
-    """Run a filter over a descent.
+    """Run a filter over a descent; yields one estimate for each frame.
 
-    `seen` yields the sightings of each frame and is advanced once per frame; `frame_time_s` (n,) increases. Inertial
-    measurements that are not finite count as missing. Measurements from before the lander's state are ignored.
+    `frame_time_s` (n,) must increase. `seen` yields the sightings of one frame at a time. Inertial measurements that
+    are not finite count as missing. Measurements older than the lander's state are ignored.
     """
     for (estimate,) in fly_together(
         [lander], instruments, frame_time_s, ((frame_sightings,) for frame_sightings in seen)
@@ -122,10 +131,10 @@ def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Ite
 def fly_together(
     landers: Sequence[Lander], instruments: Instruments, frame_time_s: Array, seen: Iterable[Sequence[Sightings]]
 ) -> Iterator[list[Estimate]]:
-    """Run F filters over flights with measurements at equal times; this is faster than one flight at a time.
+    """Run F filters at once; yields the estimates of all flights, frame by frame.
 
-    `seen` yields the sightings of all flights, frame by frame. The first lander sets the inertial noise, range noise
-    and relief of all flights.
+    This is faster than one flight at a time. The flights have measurements at equal times. `seen` yields the sightings
+    of all flights, frame by frame. The first lander sets the inertial noise, range noise and relief of all flights.
     """
     stars, lidar = instruments.star_tracker, instruments.doppler_lidar
     none = np.zeros(0)
@@ -138,7 +147,6 @@ def fly_together(
     times = np.concatenate(list(of_kind.values()))
     kind = np.concatenate([np.full(len(time_s), key) for key, time_s in of_kind.items()])
     number = np.concatenate([np.arange(len(time_s)) for time_s in of_kind.values()])
-    # At equal times, the frame comes last.
     order = np.lexsort([kind, times])
     sightings, surroundings = iter(seen), [lander.surroundings for lander in landers]
     measured, n_done = instruments.inertial.measured(), 0

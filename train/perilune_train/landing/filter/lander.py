@@ -1,4 +1,4 @@
-"""The filter in flight: one call for each measurement, in order of time.
+"""The filter of one flight, with one method for each kind of measurement, called in time order.
 
 inertial, coast   propagate the state
 range             update the state with the distance to the ground below
@@ -6,11 +6,11 @@ beam              update the state with the range and the speed along a beam of 
 attitude          update the state with the attitude from a star tracker
 sightings         match craters (locate.py), then one of three:
                   - the fix fits the state: update with its craters (`craters_update`)
-                  - the fix contradicts the state, and the previous fix did so too, with an equal offset: replace
-                    position and attitude (`_restart`)
+                  - the fix and the previous fix contradict the state with an equal offset: replace position and
+                    attitude (`_restart`)
                   - otherwise ignore the frame
 
-Between frames the state is propagated for many measurements at once (stretch.py).
+All methods but `sightings` update a part of the state first; stretch.py updates the rest at the next frame.
 """
 
 from collections.abc import Sequence
@@ -34,20 +34,20 @@ from perilune_train.landing.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
 """tracking: the last frame was matched to the catalogue. coasting: the last frame was not matched. lost: no frame was
-matched for 15 s, or a fix contradicts the state."""
+matched for 15 s, or a fix since the last matched frame contradicts the state."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 """Default standard deviations, metres, of a range and of the ground's height relative to the nearest craters."""
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
-"""Standard deviation per axis, metres per second, added to the velocity when a fix that contradicts the state replaces
-it."""
+"""Standard deviation on each axis, metres per second, that is added to the velocity when a fix replaces a state that it
+contradicts."""
 _NEAREST = 10
-"""Number of nearest craters whose median height is taken as the height of the ground below."""
+"""The median height of this number of nearest craters is taken as the height of the ground below."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What the lander knows about its camera and the ground."""
+    """Camera, catalogue and ground of a flight."""
 
     camera: Camera
     """Intrinsics."""
@@ -62,7 +62,7 @@ class Surroundings:
 
 
 def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
-    """Update flights by one range at the current time; returns whether it was accepted (F,).
+    """Update flights by one range at the current time; returns whether each flight accepted it (F,).
 
     A range that is not a positive, finite length is refused.
     """
@@ -107,17 +107,17 @@ class LidarErrors:
     """Time between two measurements of one beam, seconds."""
 
     def range_deviation_m(self, relief_m: float) -> float:
-        """Standard deviation of a range as the filter uses it, metres.
+        """Standard deviation, metres, that the filter assumes for a range along a slanted beam.
 
-        The ground at a slanted beam's end differs from the ground below, and the difference repeats from one range to
-        the next. Without a state for each beam, each range gets its share of the information of one range per
-        correlation time.
+        The ground at the end of a slanted beam differs in height from the ground below the lander, and consecutive
+        ranges share this difference. The filter has no state for it. Instead it enlarges the deviation of the relief,
+        so that all ranges of a beam within one correlation time together count as one.
         """
         return float(np.hypot(self.range_sigma_m, relief_m * np.sqrt(max(1.0, GROUND_S / self.step_s))))
 
 
 def beam_update(stretch: Stretch, beam: Beam, errors: LidarErrors, surroundings: Sequence[Surroundings]) -> None:
-    """Update flights by the range and the speed along a beam; missing ones are left out."""
+    """Update flights by the range and the speed along a beam; missing values are ignored."""
     sigma_m = errors.range_deviation_m(surroundings[0].relief_m)
     _range_along(stretch, beam.range_m, surroundings, sigma_m, beam.direction_in_body)
     if np.isfinite(beam.speed_mps):
@@ -129,7 +129,7 @@ class _Contradiction:
     """A fix that contradicts the state."""
 
     time_s: float
-    """Time of its frame."""
+    """Time of the frame, seconds since the first frame."""
     offset_m: Array
     """Position of the fix minus the position in the state (3,), metres, O_L."""
     covariance: Array
@@ -143,7 +143,7 @@ class _Contradiction:
 
 
 class Lander:
-    """State and status of a lander; every method takes one measurement.
+    """State and status of a lander; each method processes one kind of measurement.
 
     With `keep_poses` the state keeps the pose of every frame, and later measurements correct these poses. This makes
     the filter a smoother.
@@ -161,11 +161,11 @@ class Lander:
     noise: InertialNoise
     """Noise of the inertial unit."""
     _since: Stretch | None
-    """Measurements since `_state`."""
+    """Effect of the measurements since `_state`; None if there are no such measurements."""
 
     @property
     def surroundings(self) -> Surroundings:
-        """What the lander knows about its camera and the ground."""
+        """Camera, catalogue and ground of the flight."""
         return self._around
 
     @property
@@ -190,7 +190,7 @@ class Lander:
         self._stretch.inertial(measured)
 
     def coast(self, until_s: float) -> None:
-        """Propagate without inertial measurements, at constant velocity and attitude and with growing uncertainty."""
+        """Propagate without inertial measurements, at constant velocity and attitude."""
         self._stretch.coast(until_s)
 
     def range(self, range_m: float) -> bool:
@@ -240,8 +240,8 @@ class Lander:
     def _replaces(self, fix: Fix) -> bool:
         """Whether a fix that contradicts the state replaces it: only if the previous fix had an equal offset.
 
-        Unless the state is lost, a fix whose attitude contradicts it is wrong, because the attitude from a gyroscope
-        does not jump.
+        A fix whose attitude contradicts the state is wrong, because the attitude from a gyroscope does not jump. This
+        does not hold if no frame was matched for `_LOST_S`.
         """
         expected, state = self._expected(), self.state
         turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)
@@ -260,7 +260,7 @@ class Lander:
         self.status = "lost" if self._late or self._contradiction is not None else "coasting"
 
     def _restart(self, located: Located) -> None:
-        """Take position and attitude from a fix, and enlarge the velocity's uncertainty by `_UNKNOWN_VELOCITY_MPS`."""
+        """Take position and attitude from a fix, and enlarge the uncertainty of the velocity."""
         fix, state = located.fix, self.state.with_craters(np.zeros(0, int), np.zeros(0))
         expected, by_error = camera_pose(state, self._around.rotation_camera_from_body)
         covariance = state.covariance.copy()

@@ -41,10 +41,10 @@ def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_
 
 
 def camera_pose(state: State, rotation_camera_from_body: Array) -> tuple[Pose, Array]:
-    """The expected pose of the camera at the exposure of a frame with the state's time, and its derivative (6, 25).
+    """The expected camera pose at the exposure of a frame, and the derivative (6, 25) of its error.
 
-    Mounting and time tag are corrected by the state's estimates. The derivative, by the error state, is of the pose
-    error as in `PosePrior`.
+    The time tag of the frame is the time of the state. Mounting and time tag are corrected by the state's estimates.
+    The derivative is with respect to the error state; `PosePrior` defines the pose error.
     """
     mounted = matrix_from_rotation_vector(state.mounting_rad) @ rotation_camera_from_body
     later = matrix_from_rotation_vector(-state.angular_rate_radps * state.time_tag_s)
@@ -61,7 +61,7 @@ def camera_pose(state: State, rotation_camera_from_body: Array) -> tuple[Pose, A
 
 
 def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
-    """Translation and rotation (6,) from the expected pose, and their derivative (6, 25) by the error state."""
+    """Translation and rotation (6,) from the expected pose, and the derivative (6, 25) of its error."""
     expected, by_error = camera_pose(state, rotation_camera_from_body)
     turn = rotation_vectors(pose.rotation_camera_from_site @ expected.rotation_camera_from_site.T)
     return np.concatenate([pose.position_m - expected.position_m, turn]), by_error
@@ -77,8 +77,8 @@ def craters_update(
 ) -> State:
     """Update with the craters that a fix has matched; their horizontal offsets are parts of the state.
 
-    Craters in view that are not matched stay in the state. Otherwise, if the detector missed a crater in one frame, the
-    next frame would treat the crater's catalogue error as independent.
+    Unmatched craters in view stay in the state. If a crater that the detector missed in one frame were removed, the
+    next frame would treat the crater's catalogue error as a new, independent error.
 
     The measurement is linearised about the fix, which is closer to the true pose than the state is (iterated filter,
     Bell & Cathey 1993, doi 10.1109/9.250476).
@@ -107,8 +107,8 @@ def craters_update(
     by_error[:, :, _COMMON_SEEN] += pattern
     innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
-    # Height errors of the catalogue shift craters in the image radially. They are added as noise. As parts of the state
-    # they gave equal errors and normalised errors, with a state half as large again.
+    # Height errors of the catalogue shift craters in the image radially. They are added as noise: as parts of the state
+    # they made it half as large again and gave equal errors and normalised errors.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
     noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
@@ -118,7 +118,7 @@ def craters_update(
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
-    """Covariances of N sightings without noise: with the error state (2 N, M) and with each other (2 N, 2 N).
+    """Covariances of N noise-free sightings: with the error state (2 N, M), with each other (2 N, 2 N).
 
     `by_error` (N, 2, 15) and `by_offset` (N, 2, 2) are the derivatives of the sightings with respect to the errors
     `_ALL_SEE` and to the offsets of their craters. `crater` (N,) gives the index in the state of each sighting's

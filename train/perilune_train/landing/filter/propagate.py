@@ -1,4 +1,4 @@
-"""Propagation of the state by inertial measurements (strapdown integration, e.g. Sola 2017, arXiv 1711.02508)."""
+"""Propagate the state by inertial measurements (strapdown integration; Sola 2017, arXiv 1711.02508)."""
 
 from dataclasses import dataclass, replace
 
@@ -17,12 +17,12 @@ from perilune_train.landing.filter.state import (
 )
 
 _INERTIAL = 15
-"""Number of elements of the error state that inertial measurements change; these are the first ones."""
+"""Number of elements at the start of the error state that inertial measurements change."""
 
 
 @dataclass(frozen=True, slots=True)
 class Increments:
-    """N inertial measurements in time order, each a mean over an interval, for one flight or for F flights."""
+    """N inertial measurements in time order, means over intervals, for one flight or for F flights."""
 
     time_s: Array
     """Ends of the intervals (N,), seconds since the first frame."""
@@ -59,19 +59,20 @@ class Increments:
 
 
 def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, unit: InertialErrors) -> Array:
-    """Initial standard deviations (15,) of the first 15 elements of the error state, from the deviations per axis."""
+    """Initial standard deviations (15,) of the first 15 elements of the error state."""
     gyro_bias_radps = np.radians(unit.gyro_bias_deg_per_h) / HOUR_S
     force_bias_mps2 = unit.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
     return np.repeat([position_m, velocity_mps, np.radians(attitude_deg), gyro_bias_radps, force_bias_mps2], 3)
 
 
 COAST_MPS2, COAST_DEGPS = 2.0, 3.0
-"""Default standard deviations of acceleration and angular rate while inertial measurements are missing."""
+"""Default standard deviations of the acceleration (metres per second^2) and the angular rate (degrees per second) while
+inertial measurements are missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class InertialNoise:
-    """Variances that an inertial unit adds in one second, per axis, and the motion while it measures nothing."""
+    """Variances that an inertial unit adds per second and axis, and noise while measurements are missing."""
 
     turn: float
     """Variance of the attitude, square radians."""
@@ -82,9 +83,9 @@ class InertialNoise:
     force_bias: float
     """Variance of the accelerometer's bias, square metres per second^4."""
     coast_mps2: float = COAST_MPS2
-    """Standard deviation of the acceleration while measurements are missing."""
+    """Standard deviation of the acceleration while measurements are missing, metres per second^2."""
     coast_radps: float = float(np.radians(COAST_DEGPS))
-    """Standard deviation of the angular rate while measurements are missing."""
+    """Standard deviation of the angular rate while measurements are missing, radians per second."""
 
     @classmethod
     def of(cls, errors: InertialErrors) -> "InertialNoise":
@@ -116,7 +117,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motions of F flights over one time span, and their effect on the first 15 elements of the error state."""
+    """Motions of F flights over a time span, and their effect on the first 15 elements of the error state."""
 
     end: Moving
     """The state at the end of the span."""
@@ -130,7 +131,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
     """Integrate consecutive inertial measurements, each over its interval."""
     position, velocity, rotation_site_from_body = start.position_m, start.velocity_mps, start.rotation_site_from_body
     n, step_s = len(measured), measured.interval_s
-    # Time is the first axis.
+    # Time is the first axis, because the loop below takes one step at a time.
     rate = np.moveaxis(measured.angular_rate_radps - start.gyro_bias_radps[:, None], 1, 0)
     force = np.moveaxis(measured.specific_force_mps2 - start.force_bias_mps2[:, None], 1, 0)
     half = rotation_matrices(rate * (step_s / 2)[:, None, None])
@@ -142,7 +143,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
         position = position + velocity * step_s[k] + acceleration * (step_s[k] ** 2 / 2)
         velocity = velocity + acceleration * step_s[k]
     changes = _changes(middle, half, force, step_s)
-    # Multiply from the last measurement to the first.
+    # The noise of a step is propagated by all later steps, so multiply from the last step to the first.
     onward = np.empty((len(position), _INERTIAL, n, _INERTIAL))
     change = np.eye(_INERTIAL)
     for k in reversed(range(n)):
@@ -155,7 +156,7 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
 
 
 def _changes(middle: Array, half: Array, force: Array, step_s: Array) -> Array:
-    """Derivatives (N, F, 15, 15) of the errors after each step with respect to the errors before that step.
+    """Derivatives (N, F, 15, 15) of the errors after a step with respect to the errors before the step.
 
     An attitude error rotates the measured force; bias errors are integrated over the step. `middle` (N, F, 3, 3) holds
     the attitudes at the middle of the steps, and `half` (N, F, 3, 3) the rotations from the start to the middle of each

@@ -40,13 +40,16 @@ N_ERRORS = 25
 _LOW_SUN_DEG, _HIGH_SUN_DEG = 35.0, 60.0
 _LOW_SUN_SIGMAS_PX = np.array([0.06, 0.06, 0.1, 0.13, 0.13])
 _HIGH_SUN_SIGMAS_PX = np.array([0.1, 0.1, 0.2, 0.3, 0.3])
-"""Standard deviations of the shared image error at and below the low Sun, and at and above the high Sun, measured on
-the validation scenes of `shipped-nav` and on two synthetic elevation models. Under a high Sun the detector sees rims by
-their albedo and their slopes toward the Sun, and its centres shift more."""
+"""Standard deviations of the image error that all sightings share, under a low Sun (up to 35 degrees) and a high Sun
+(from 60 degrees), measured on the validation scenes of `shipped-nav` and on two synthetic elevation models. Under a
+high Sun the detector sees rims by their albedo and their slopes toward the Sun, and the detected centres shift more."""
 
 
 def common_sigmas_px(sun_elevation_deg: float | None) -> Array:
-    """Standard deviations (5,) of the shared image error, pixels; those of a high Sun if the elevation is unknown."""
+    """Standard deviations (5,), pixels, of the image error that all sightings share.
+
+    A high Sun is assumed if the elevation is unknown.
+    """
     if sun_elevation_deg is None:
         return _HIGH_SUN_SIGMAS_PX
     high_share = np.clip((sun_elevation_deg - _LOW_SUN_DEG) / (_HIGH_SUN_DEG - _LOW_SUN_DEG), 0, 1)
@@ -55,7 +58,7 @@ def common_sigmas_px(sun_elevation_deg: float | None) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class CameraErrors:
-    """What is known of the camera's errors before the flight."""
+    """Expected errors of the camera before the flight."""
 
     sun_elevation_deg: float | None = None
     """Elevation of the Sun above the site, degrees, which sets the error that all sightings share; None if unknown."""
@@ -71,7 +74,7 @@ EXACT_CAMERA = CameraErrors()
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Estimate of the lander's motion and of the errors of its inertial unit."""
+    """Estimate of the lander's motion, and of the errors of its sensors and its catalogue."""
 
     time_s: float
     """Seconds since the first frame."""
@@ -88,7 +91,7 @@ class State:
     common_px: Array
     """Coefficients (5,), pixels, of the image error that all sightings share; see `common_pattern`."""
     ground_m: float
-    """Height of the ground below, relative to the median height of the nearest craters of the catalogue."""
+    """Height of the ground below, metres, relative to the median height of the nearest craters of the catalogue."""
     craters: NDArray[np.integer]
     """Craters in view (n,), as rows of the catalogue."""
     offsets_m: Array
@@ -130,7 +133,10 @@ class State:
         )  # fmt: skip
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """Remove an estimated error (25 + 2 n + 6 m,) from the state; `covariance` is the new, symmetric covariance."""
+        """Remove an estimated error (25 + 2 n + 6 m,) from the state.
+
+        `covariance` is the new, symmetric covariance.
+        """
         end = N_ERRORS + 2 * len(self.craters)
         past = error[end:].reshape(-1, 6)
         return State(
@@ -166,7 +172,10 @@ class State:
         )
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
-        """The state with the offsets of exactly `craters` (n,); new offsets have standard deviations `sigma_m` (n,)."""
+        """The state with the offsets of `craters` (n,) and of no other craters.
+
+        Offsets of craters that are new to the state have standard deviations `sigma_m` (n,), metres.
+        """
         row_of = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
         row_of[self.craters] = np.arange(len(self.craters))
         before = row_of[craters]
@@ -183,8 +192,7 @@ class State:
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
-        """Translation and rotation (6,) from an earlier frame's kept pose to the true pose, and their covariance (6,
-        6)."""
+        """Translation and rotation (6,) from a kept pose to the true pose, and their covariance (6, 6)."""
         turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
         start = N_ERRORS + 2 * len(self.craters) + 6 * number
         parts = slice(start, start + 6)
@@ -198,7 +206,10 @@ class State:
 
 @compiled
 def _rearranged(covariance: Array, source: NDArray[np.int64]) -> Array:
-    """A covariance (n, n) whose part i is part `source[i]` of another covariance; parts with -1 are zero."""
+    """A covariance (n, n) whose element i is element `source[i]` of another covariance.
+
+    Elements with source -1 have zero covariance.
+    """
     rearranged = np.zeros((len(source), len(source)))
     for i in range(len(source)):
         if source[i] < 0:
@@ -220,7 +231,7 @@ def cross_matrices(vectors: Array) -> Array:
 
 
 def rotation_matrices(turns_rad: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians: `matrix_from_rotation_vector` for many."""
+    """Rotation matrices (..., 3, 3) of many rotation vectors (..., 3), radians."""
     angle = np.sqrt((turns_rad**2).sum(axis=-1))[..., None]
     cross = cross_matrices(turns_rad / np.where(angle > 0, angle, 1.0))
     angle = angle[..., None]
@@ -228,11 +239,11 @@ def rotation_matrices(turns_rad: Array) -> Array:
 
 
 def common_pattern(ray: Array) -> Array:
-    """Derivatives (n, 2, 5) of the image error that all sightings share, at rays (n, 2) on the plane at depth 1.
+    """Derivatives (n, 2, 5) of the shared image error at rays (n, 2) on the plane at depth 1.
 
-    The error is a shift, a scale and two terms that grow with the square of the distance from the image centre. Errors
-    of position, altitude and tilt displace craters in this pattern too, so one frame cannot distinguish them from the
-    image error.
+    All sightings share this error: a shift, a scale and two terms that grow with the square of the distance from the
+    image centre. Errors of position, altitude and tilt displace craters in the same pattern, so one frame cannot
+    distinguish them from the image error.
     """
     x, y = ray.T
     zero, ones = np.zeros_like(x), np.ones_like(x)

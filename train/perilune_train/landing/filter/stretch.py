@@ -1,18 +1,18 @@
-"""Update flights between two frames by inertial measurements, ranges, speeds along a beam, and attitudes.
+"""Update flights between two frames by inertial measurements, ranges, beam speeds and attitudes.
 
 These measurements change and measure only 16 parts of the error state: the first 15 and the height of the ground (the
 core). What they reveal about the other parts (craters, earlier poses) is a linear function of the core's
-errors at the start of the stretch. The other parts are therefore updated once, at its end (compressed filter, Guivant
-& Nebot 2001, doi 10.1109/70.938382):
+errors at the start of the stretch. The other parts are therefore updated once, at the end of the stretch (compressed
+filter, Guivant & Nebot 2001, doi 10.1109/70.938382):
 
 1. Every measurement changes the core, its covariance and its derivative with respect to the core at the start.
 2. `range`, `line_speed` and `attitude` also keep the innovation, and its derivative with respect to the core at the
    start.
 3. `states` applies all kept innovations to the other parts at once.
 
-The filter that updates its whole covariance at every measurement gives an equal result; here a measurement costs as
-much as if there were no craters. Only the attitudes of
-earlier frames differ, by second-order terms: corrections are summed, not applied one after the other.
+A filter that updates its whole covariance at every measurement gives an equal result. Here, a measurement costs only as
+much as without craters. The attitudes of earlier frames differ by second-order terms, because their corrections are
+summed and not applied one after the other.
 
 All flights of a stretch have measurements at the same times, and every operation acts on all of them at once.
 """
@@ -56,9 +56,11 @@ class Stretch:
     """F flights from one frame to the next."""
 
     def __init__(self, states: Sequence[State], noise: InertialNoise, relief_m: float):
-        """Start at a frame's states.
+        """Start at the states of a frame.
 
-        `relief_m` is the standard deviation of the ground's height, a Gauss-Markov process, metres."""
+        `relief_m` is the standard deviation, metres, of the ground's height, which is modelled as a Gauss-Markov
+        process.
+        """
         self._begin, self._noise, self._relief_m = list(states), noise, relief_m
         self.time_s = states[0].time_s
         self._moving = Moving(
@@ -91,7 +93,7 @@ class Stretch:
         return self._moving.rotation_site_from_body
 
     def inertial(self, measured: Increments) -> None:
-        """Propagate to the end of inertial measurements; measurements that are older or not finite are ignored."""
+        """Propagate by inertial measurements; ignore measurements that are older or not finite."""
         measured = measured.measured()
         measured = measured.part(slice(int(np.searchsorted(measured.time_s, self.time_s, side="right")), None))
         if not len(measured):
@@ -120,7 +122,10 @@ class Stretch:
         self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
 
     def coast(self, until_s: float) -> None:
-        """Propagate without inertial measurements, at constant velocity and attitude; add the uncertainty of both."""
+        """Propagate without inertial measurements, at constant velocity and attitude.
+
+        The uncertainty of both grows.
+        """
         gap_s = until_s - self.time_s
         self._moving = replace(self._moving, position_m=self.position_m + self._moving.velocity_mps * gap_s)
         change = np.eye(_INERTIAL)
@@ -132,7 +137,8 @@ class Stretch:
     def _moved(self, time_s: float, change: Array, added: Array, kept: float) -> None:
         """Apply the transition matrix `change` and the process noise `added` of the first 15 errors.
 
-        `kept` is the share of the ground's height error that remains."""
+        `kept` is the share of the ground's height error that remains.
+        """
         whole, noise = np.zeros_like(self._covariance), np.zeros_like(self._covariance)
         whole[:, :_INERTIAL, :_INERTIAL], whole[:, _HEIGHT, _HEIGHT] = change, kept
         noise[:, :_INERTIAL, :_INERTIAL], noise[:, _HEIGHT, _HEIGHT] = added, self._relief_m**2 * (1 - kept**2)
@@ -170,19 +176,20 @@ class Stretch:
     def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
         """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
 
-        `sigmas_rad` (3,) are the standard deviations about the body's axes. An attitude that is not finite is missing.
+        `sigmas_rad` (3,) are the standard deviations about the body's axes, radians. An attitude that is not finite is
+        ignored.
         """
         if not np.isfinite(rotation_site_from_body).all():
             return np.zeros(len(self._covariance), bool)
         spread = self._covariance[:, ATTITUDE, ATTITUDE] + np.diag(sigmas_rad**2)
         turn = self._turn_to(rotation_site_from_body)
-        # Rotation vectors are wrong near half a turn: refuse turns above 90 degrees, which have a smaller trace.
+        # Rotation vectors are unreliable near half a turn. Refuse turns above 90 degrees: their trace is below 1.
         is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
         accepted = is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
         for axis, sigma_rad in enumerate(sigmas_rad):
             by_error = np.zeros((len(turn), len(CORE)))
             by_error[:, ATTITUDE.start + axis] = 1
-            # The first axes have changed the attitude.
+            # The updates about earlier axes have changed the attitude.
             turn = self._turn_to(rotation_site_from_body)
             self._apply(turn[:, axis], by_error, float(sigma_rad), accepted)
         self.n_refused += ~accepted
@@ -195,7 +202,7 @@ class Stretch:
     def _update(
         self, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
     ) -> NDArray[np.bool_]:
-        """Update by one number if it passes the gate; returns whether it does (F,)."""
+        """Update the flights in which one number passes the gate; returns whether it passes (F,)."""
         spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
         accepted = (innovation**2 / spread <= gate(1)) & is_possible
         self._apply(innovation, by_error, sigma, accepted)
@@ -205,12 +212,12 @@ class Stretch:
     def _apply(self, innovation: Array, by_error: Array, sigma: float, accepted: NDArray[np.bool_]) -> None:
         """Update the flights that accept one number.
 
-        `innovation` (F,) is the measured minus the expected number, `by_error` (F, 16) its derivative by the core, and
-        `sigma` its standard deviation.
+        `innovation` (F,) is the measured minus the expected number, `by_error` (F, 16) its derivative with respect to
+        the core, and `sigma` its standard deviation.
         """
         crossed = (self._covariance @ by_error[:, :, None])[:, :, 0]
         spread = (by_error * crossed).sum(axis=1) + sigma**2
-        # Divide by the innovation's standard deviation; 0 where the number is refused.
+        # Divide by the innovation's standard deviation; a scale of 0 leaves out flights that refuse the number.
         scale = accepted / np.sqrt(spread)
         innovation, crossed, by_error = innovation * scale, crossed * scale[:, None], by_error * scale[:, None]
         by_start = (by_error[:, None] @ self._change)[:, 0]

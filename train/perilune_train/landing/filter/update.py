@@ -11,7 +11,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.landing.filter.state import State
 
 GATE_SHARE = 0.001
-"""Share of correct measurements that the gate rejects."""
+"""Probability that the gate rejects a correct measurement."""
 
 
 def passes_gate(difference: Array, covariance: Array) -> bool:
@@ -32,7 +32,7 @@ def updated(state: State, innovation: Array, crossed: Array, spread: Array) -> S
     the error state, and `spread` (n, n) is the covariance of the innovation, including measurement noise.
     """
     root = np.linalg.cholesky(spread)
-    # Scale the innovation so that its elements are independent with deviation 1. The transposes need no copies.
+    # Scale the innovation so that its elements are independent with standard deviation 1. Transposes need no copies.
     innovation = solve_triangular(root, innovation, lower=True, check_finite=False)
     crossed = dtrsm(1.0, root.T, crossed.T, side=1).T
     covariance = crossed.T @ crossed

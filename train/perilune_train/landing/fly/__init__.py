@@ -1,1 +1,1 @@
-"""Fly the filter over the files of one descent: frames, camera, catalogue and measurements of any source."""
+"""Fly the filter over the files of one descent: frames, camera, catalogue and measurements."""

@@ -1,4 +1,4 @@
-"""Read the crater catalogue of a descent, in the site frame or by latitude and longitude. It is untrusted input."""
+"""Read a crater catalogue, in the site frame or by latitude and longitude; untrusted input."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ _REACH_M = 200_000.0
 
 @dataclass(frozen=True, slots=True)
 class CatalogueUse:
-    """How a catalogue is read."""
+    """Stated errors of a catalogue, and how its columns are read."""
 
     position_sigma_m: float
     """Standard deviation of a crater's position, per axis, metres."""
@@ -35,15 +35,16 @@ class CatalogueUse:
     site_deg: tuple[float, float] | None = None
     """Latitude and longitude of the site, degrees; needed for a catalogue by latitude and longitude."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Column names of a catalogue by latitude and longitude; if empty, they are recognised automatically."""
+    """Column names of a catalogue by latitude and longitude; if empty, they are recognised."""
 
 
 def read_catalogue(path: Path, use: CatalogueUse) -> Catalogue:
     """Read a crater catalogue, Parquet or CSV.
 
-    In the site's frame it has x_m, y_m, z_m, diameter_m and, optional, normal_x, normal_y, normal_z; without normals
-    the rims are level. By latitude and longitude it has the columns that `read_craters` reads and, optional, height_m
-    above the sphere through the site. Raises UserError on a missing column or a value that is not a crater.
+    A catalogue in the site frame has the columns x_m, y_m, z_m, diameter_m and optionally normal_x, normal_y, normal_z;
+    without normals the rims are level. A catalogue by latitude and longitude has the columns that `read_craters` reads
+    and optionally height_m, the height above the sphere through the site. Raises UserError on a missing column or an
+    invalid value.
     """
     with open_table(path, CATALOGUE) as table:
         if not table.names or set(CRATER_COLUMNS[:3]) & set(table.names):

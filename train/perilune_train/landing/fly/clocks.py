@@ -10,7 +10,7 @@ from perilune_train.landing.filter.flight import Instruments
 from perilune_train.landing.fly.tables import InstrumentFiles, unit_of
 
 _MIN_SHARE = 0.01
-"""Share of the time of the frames that inertial measurements must cover."""
+"""Smallest share of the time between the first and the last frame that inertial measurements must cover."""
 
 
 def check_clocks(frames: Path, frame_time_s: Array, files: InstrumentFiles, instruments: Instruments) -> None:
@@ -41,7 +41,7 @@ def check_clocks(frames: Path, frame_time_s: Array, files: InstrumentFiles, inst
 def _other_clock(
     path: Path, span_s: tuple[float, float], frames: Path, frames_span_s: tuple[float, float]
 ) -> UserError:
-    """The error about two different time spans, with the unit or the offset that would explain the difference."""
+    """The error about two different time spans, with the unit or offset that may explain the difference."""
     length_s, frames_length_s = span_s[1] - span_s[0], frames_span_s[1] - frames_span_s[0]
     expected = f"the clock of {frames}, {_text(frames_span_s[0])} to {_text(frames_span_s[1])} s"
     if length_s > 0 and (unit := unit_of(length_s / frames_length_s)) is not None:

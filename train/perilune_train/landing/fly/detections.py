@@ -1,4 +1,4 @@
-"""Crater detections in the frames of a descent, from the network of a run, a user's function or a table."""
+"""Crater detections in frames of a descent, from a run's network, a user's function or a table."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -46,8 +46,8 @@ class UnreadableFrame(UserError):
 def flight_config(run: Path) -> DetectConfig:
     """The settings of a detect run, with the scales at which the filter needs detections.
 
-    At scale 2 the detector finds two to four times as many craters, and their centres are more accurate. Where the
-    catalogue lacks the largest craters of the frame, these small ones carry the fix.
+    At scale 2 the detector finds two to four times as many craters as at scale 1, and their centres are more accurate.
+    Where the catalogue lacks the largest craters of the frame, only these small craters make a fix possible.
     """
     config = config_of_run(run)
     evaluation = config.evaluation.model_copy(update={"scales": _SCALES, "max_detections": MAX_SIGHTINGS})
@@ -55,7 +55,7 @@ def flight_config(run: Path) -> DetectConfig:
 
 
 def by_network(run: Path) -> Detect:
-    """Detect craters with the network of a detect run, at the threshold that the run chose."""
+    """Detect craters with the network of a detect run, at the score threshold chosen by the run."""
     config, threshold = flight_config(run), chosen_threshold(run)
     detector = open_detector(RunFolder(run).best, config)
     tiling = Tiling(_TILE_PX, scales=_SCALES)
@@ -67,14 +67,14 @@ def by_function(detector: Detector) -> Detect:
 
     It takes a grey image, uint8 (height, width), and returns an array (N, 5) of x, y, width, height, score: the centre
     and the size of the box around the rim, pixels from the outer corner of the first pixel, and a score from 0 to 1.
-    It may also return a table with the columns x0_px, y0_px, x1_px, y1_px and score, or an object with such a `table`,
-    as the `Craters` of `perilune.load_detector`. The function raises UserError on other values.
+    It may also return a table with the columns x0_px, y0_px, x1_px, y1_px and score, or an object with this table as
+    its attribute `table`, such as the craters that `perilune.load_detector()` returns. Other values raise UserError.
     """
     return lambda path: _checked(detector(_grey(path)), path)
 
 
 def by_table(path: Path, frames: list[Path]) -> Detect:
-    """Take craters from a CSV or Parquet table with the columns of `detections.parquet` of `detect predict`.
+    """Take craters from a CSV or Parquet table, such as detections.parquet from `detect predict`.
 
     The columns are image (file name of the frame), x0_px, y0_px, x1_px, y1_px (the box around the rim, pixels from the
     outer corner of the first pixel) and score (0 to 1). A frame without rows has no craters. Raises UserError if the

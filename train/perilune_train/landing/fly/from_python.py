@@ -19,7 +19,7 @@ from perilune_train.shipped.models import shipped_run
 def fly(
     files: DescentFiles | str | PathLike[str], detector: Detector | None = None, out: str | PathLike[str] | None = None
 ) -> pd.DataFrame:
-    """Estimate position, velocity and attitude at each frame from craters and the measurements of other sensors.
+    """Estimate position, velocity and attitude at each frame from craters and other measurements.
 
     Args:
         files: The files of the descent, or the folder that `perilune-train navigate descent` has written.

@@ -12,7 +12,7 @@ from perilune_train.records.pictures import save_figure
 _STATUS = {"tracking": ("tab:blue", "o"), "coasting": ("tab:orange", "s"), "lost": ("tab:red", "x")}
 
 _START = 3
-"""Number of first frames that do not affect the scale of the axes."""
+"""Number of frames at the start that do not affect the scale of the axes."""
 
 
 def draw_flight(path: Path, estimates: pd.DataFrame) -> None:

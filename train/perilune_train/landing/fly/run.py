@@ -47,7 +47,7 @@ class DescentFiles:
     imu: Path | None
     """Inertial measurements: imu.csv; None without an inertial unit."""
     prior: Path
-    """Expected state at the first frame, and errors of all measurements: prior.yaml."""
+    """Expected state at the first frame, and standard deviations of all errors: prior.yaml."""
     ranges: Path | None = None
     """Ranges of a laser altimeter: ranges.csv."""
     truth: Path | None = None
@@ -64,7 +64,7 @@ class DescentFiles:
 
     @classmethod
     def of_folder(cls, folder: str | PathLike[str]) -> "DescentFiles":
-        """The files of a folder under their usual names; those of `OPTIONAL_FILES` may be absent."""
+        """The files of a folder under their usual names; files named in `OPTIONAL_FILES` may be absent."""
         root = Path(folder)
         needed = (root / name for name in ("frames", "camera.yaml", "catalogue.parquet", "imu.csv", "prior.yaml"))
         optional = (root / name for name in OPTIONAL_FILES)
@@ -134,7 +134,10 @@ def fly_descent(
 
 
 def doubts_of(descent: Descent, *, is_lost: bool = False) -> list[str]:
-    """Reasons to doubt the units of the inertial measurements; a lost flight needs less evidence."""
+    """Reasons to doubt the units of the inertial measurements; empty without doubts.
+
+    If the flight is lost, less evidence is enough for a doubt.
+    """
     mounting, expected = np.array(descent.camera.rotation_camera_from_body), descent.prior
     sigmas = expected.position_sigma_m, expected.velocity_sigma_mps
     prior = Prior(_start(descent), *sigmas, mounting[2], float(descent.frames.time_s[-1]))
@@ -156,7 +159,10 @@ def _lander(descent: Descent) -> Lander:
 
 
 def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
-    """Yield the craters of each frame; an unreadable frame has no craters, and `faults` receives its error message."""
+    """Yield the craters of each frame.
+
+    An unreadable frame has no craters, and `faults` receives the error message under the number of the frame.
+    """
     for number, path in enumerate(descent.frames.paths):
         try:
             found = detect(path)
@@ -166,7 +172,10 @@ def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iter
 
 
 def sightings_of(found: Detections, camera: Camera) -> Sightings:
-    """Convert detections to the pinhole camera that covers the view; leaves out detections without a valid ray."""
+    """Convert detections of a camera to the pinhole camera that covers its view.
+
+    Detections without a valid ray are left out.
+    """
     boxes = np.asarray(found.boxes, np.float64)
     if not any(camera.distortion):
         return Sightings.of_boxes(boxes, found.scores)
@@ -187,7 +196,7 @@ def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Arra
     state = estimate.state
     mounted = matrix_from_rotation_vector(state.mounting_rad) @ rotation_camera_from_body
     rotation = quaternion_from_matrix(mounted @ state.rotation_site_from_body.T)
-    # The camera's attitude errs by the body's attitude and by the mounting.
+    # The error of the camera's attitude consists of the errors of the body's attitude and of the mounting.
     errors = np.concatenate([np.eye(3), -mounted.T], axis=1)
     parts = [*range(N_ERRORS)[ATTITUDE], *range(N_ERRORS)[MOUNTING]]
     attitude_sigma = np.sqrt(np.diag(errors @ state.covariance[np.ix_(parts, parts)] @ errors.T))

@@ -1,4 +1,4 @@
-"""camera.yaml and prior.yaml of a descent: what is known before the flight. Both are untrusted input."""
+"""Read camera.yaml and prior.yaml, the knowledge before a descent; both are untrusted input."""
 
 import json
 from dataclasses import asdict, replace
@@ -39,13 +39,13 @@ class UnitErrors(Section):
     gyro_bias_deg_per_h: _Positive
     """Bias of the angular rate at the start, degrees per hour."""
     gyro_bias_walk_deg_per_h: _Positive
-    """Random walk of this bias in one hour, degrees per hour."""
+    """Random walk of the bias of the angular rate in one hour, degrees per hour."""
     angular_random_walk_deg: _Positive
     """White noise of the angular rate: angle after integration over one hour, degrees."""
     accelerometer_bias_mg: _Positive
     """Bias of the specific force at the start, thousandths of standard gravity."""
     accelerometer_bias_walk_mg: _Positive
-    """Random walk of this bias in one hour, thousandths of standard gravity."""
+    """Random walk of the bias of the specific force in one hour, thousandths of standard gravity."""
     velocity_random_walk_mps: _Positive
     """White noise of the specific force: velocity after integration over one hour, metres per second."""
 
@@ -54,50 +54,50 @@ class FlightPrior(Section):
     """prior.yaml: the expected state at the first frame and the errors of all measurements."""
 
     position_m: tuple[_Coordinate, _Coordinate, _Coordinate]
-    """Expected position of the camera, O_L."""
+    """Expected position of the camera, metres, O_L."""
     velocity_mps: tuple[_Coordinate, _Coordinate, _Coordinate]
-    """Expected velocity, O_L."""
+    """Expected velocity, metres per second, O_L."""
     rotation_wxyz: tuple[_Coordinate, _Coordinate, _Coordinate, _Coordinate]
     """Expected rotation_camera_from_site, unit quaternion."""
     position_sigma_m: _Deviation
-    """Standard deviation of the position on each axis."""
+    """Standard deviation of the position on each axis, metres."""
     velocity_sigma_mps: _Deviation
-    """Standard deviation of the velocity on each axis."""
+    """Standard deviation of the velocity on each axis, metres per second."""
     attitude_sigma_deg: Annotated[float, Field(gt=0, le=180)]
-    """Standard deviation of the attitude on each axis."""
+    """Standard deviation of the attitude about each axis, degrees."""
     inertial: InertialGrade | UnitErrors = "tactical"
-    """Grade of the inertial unit, or its errors."""
+    """Grade of the inertial unit, or the errors of the unit."""
     range_sigma_m: _Deviation = RANGE_SIGMA_M
-    """Standard deviation of a range."""
+    """Standard deviation of a range of the laser altimeter, metres."""
     relief_m: _Deviation = RELIEF_M
-    """Standard deviation of the ground's height relative to the nearest craters."""
+    """Standard deviation of the ground's height relative to the nearest craters, metres."""
     star_tracker_sigma_arcsec: tuple[_Positive, _Positive, _Positive] = (10.0, 10.0, 60.0)
     """Standard deviations of the star tracker about the body's axes, seconds of arc."""
     doppler_speed_sigma_mps: _Deviation = 0.02
-    """Standard deviation of a speed along a beam of the Doppler lidar."""
+    """Standard deviation of a speed along a beam of the Doppler lidar, metres per second."""
     doppler_range_sigma_m: _Deviation = 2.0
-    """Standard deviation of a range along a beam of the Doppler lidar."""
+    """Standard deviation of a range along a beam of the Doppler lidar, metres."""
     camera_mounting_sigma_deg: Annotated[float, Field(ge=0, le=10)] = 0.1
-    """Standard deviation of the camera's mounting about each axis."""
+    """Standard deviation of the camera's mounting about each axis, degrees."""
     camera_time_sigma_s: Annotated[float, Field(ge=0, le=1)] = 0.05
-    """Standard deviation of the constant difference between the exposure of the frames and their times."""
+    """Standard deviation of the constant difference between the exposure and the time of a frame, seconds."""
     coast_acceleration_sigma_mps2: _Positive = COAST_MPS2
-    """Standard deviation of the acceleration while inertial measurements are missing."""
+    """Standard deviation of the acceleration while inertial measurements are missing, metres per second^2."""
     coast_rate_sigma_degps: _Positive = COAST_DEGPS
     """Standard deviation of the angular rate while inertial measurements are missing, degrees per second."""
     catalogue_position_sigma_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    """Standard deviation of a crater's position in the catalogue on each axis."""
+    """Standard deviation of a crater's position in the catalogue on each axis, metres."""
     catalogue_diameter_sigma_share: _Share = 0.03
     """Standard deviation of a crater's diameter in the catalogue, divided by the diameter."""
     sun_elevation_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    """Elevation of the Sun above the site, degrees; the detector errs more under a high Sun, which is assumed if this
-    is absent."""
+    """Elevation of the Sun above the site, degrees. Under a high Sun, the errors of detected centres are larger; if the
+    elevation is absent, a high Sun is assumed."""
     site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     """Latitude of the origin of O_L, degrees, for a catalogue in latitude and longitude."""
     site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
     """Longitude of the origin of O_L, east positive, degrees."""
     catalogue_columns: dict[CatalogueColumn, str] = Field(default_factory=dict)
-    """Columns of a catalogue in latitude and longitude; if empty, known catalogues are recognised."""
+    """Column names of a catalogue in latitude and longitude; if empty, they are recognised."""
 
     @model_validator(mode="after")
     def _unit_quaternion(self) -> "FlightPrior":
@@ -152,15 +152,15 @@ class FlightPrior(Section):
 
     @property
     def lidar_errors(self) -> LidarErrors:
-        """Standard deviations of the Doppler lidar, with one measurement of each beam per second."""
+        """Standard deviations of the Doppler lidar, for one measurement of each beam per second."""
         return LidarErrors(self.doppler_speed_sigma_mps, self.doppler_range_sigma_m, 1.0)
 
 
 def read_camera(path: Path) -> CameraRecord:
-    """Read camera.yaml: the fields of `camera` in dataset.json, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
+    """Read camera.yaml, or a calibration file of OpenCV, ROS, Kalibr or EuRoC.
 
-    Distortion and mounting may be absent. Raises UserError on a missing file, a wrong value, or a camera that is not at
-    the body's origin.
+    camera.yaml has the fields of `camera` in dataset.json. Distortion and mounting may be absent. Raises UserError on a
+    missing file, a wrong value, or a camera that is not at the body's origin.
     """
     content = read_camera_file(path)
     if isinstance(content, Calibration):

@@ -1,4 +1,4 @@
-"""Read the frames and measurements of a descent, or files of EuRoC and TUM-VI. All are untrusted input."""
+"""Read frames and measurements of a descent, or files of EuRoC and TUM-VI, all untrusted input."""
 
 import re
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ _UNIT_TOLERANCE = 1e-3
 _MIN_STEP_S = 1e-3
 """Shortest time between two measurements of one beam that the filter assumes, seconds."""
 _GAP = 5
-"""An interval between samples longer than this many times the median is a gap."""
+"""An interval between samples is a gap if it is longer than this multiple of the median interval."""
 _LARGEST_S = 1e11
 """Largest valid time in seconds. Times in milliseconds since 1970 are about 1e12 and exceed it."""
 
@@ -56,10 +56,10 @@ class FrameFiles:
 
 
 def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
-    """Read frames.csv (columns file, time_s) of a folder, or EuRoC's data.csv with the images in the folder data.
+    """Read the frames of a folder: frames.csv, or data.csv of EuRoC with images in the folder data.
 
-    Raises UserError if times do not increase, a file is missing or outside the folder, or an image differs in size from
-    the camera.
+    frames.csv has the columns file and time_s. Raises UserError if times do not increase, a file is missing or outside
+    the folder, or an image differs in size from the camera.
     """
     path = folder / FRAMES_FILE
     if not path.exists() and (folder / _EUROC_FRAMES_FILE).is_file():
@@ -148,7 +148,10 @@ def _read_doppler_lidar(path: Path, errors: LidarErrors) -> DopplerLidar:
 
 
 def read_euroc(path: Path, limits: TableLimits, columns: dict[str, Kind]) -> Columns:
-    """Read columns, named without their units; the header may be a comment."""
+    """Read columns of a file of EuRoC or TUM-VI; the keys of `columns` are names without units.
+
+    The header may be a comment. Raises UserError if a column is missing.
+    """
     names, is_comment = _header(path, limits)
     plain = {name: plain_name(name) for name in names}
     missing = [name for name in columns if name not in plain.values()]
@@ -161,7 +164,7 @@ def read_euroc(path: Path, limits: TableLimits, columns: dict[str, Kind]) -> Col
 
 
 def plain_name(name: str) -> str:
-    """The name of a column without its unit; the column may be `timestamp [ns]`."""
+    """The name of a column without its unit: `timestamp` for `timestamp [ns]`."""
     return re.sub(r"\s*\[.*$", "", name.lstrip("# "))
 
 
@@ -197,7 +200,7 @@ def _read_inertial(path: Path) -> Increments:
 
 
 def _of_samples(path: Path, names: tuple[str, ...]) -> Increments:
-    """Means over the intervals between samples whose times are in nanoseconds. Gaps are left out."""
+    """Convert samples, with times in nanoseconds, to means over the intervals between them, without gaps."""
     table = read_euroc(path, INERTIAL, {_TIME_NS: "integer", **dict.fromkeys(names, "number")})
     if table.n_rows < 2:
         raise UserError(path, "rows", table.n_rows, "at least two measurements")
@@ -223,7 +226,10 @@ def nanoseconds_as_seconds(table: Columns) -> Array:
 
 
 def _increasing(table: Columns, strictly: bool = True) -> Array:
-    """Times in seconds. Raises UserError if they decrease or cannot be seconds; if `strictly`, also if they repeat."""
+    """Times in seconds. Raises UserError if they decrease or cannot be seconds.
+
+    If `strictly`, also raises UserError if they repeat.
+    """
     time_s = table.finite("time_s")
     table.check("time_s", np.abs(time_s) <= _LARGEST_S, "seconds; these may be nanoseconds: divide by 1e9")
     step_s = np.diff(time_s)
@@ -236,7 +242,7 @@ def _increasing(table: Columns, strictly: bool = True) -> Array:
 
 
 def _check_steps(table: Columns, end_s: Array, interval_s: Array) -> None:
-    """Raises UserError if the times of measurements are in a different unit from their intervals."""
+    """Raise UserError if the times of measurements and the lengths of their intervals differ in unit."""
     if len(end_s) < 2:
         return
     step, interval = float(np.median(np.diff(end_s))), float(np.median(interval_s))
@@ -247,7 +253,7 @@ def _check_steps(table: Columns, end_s: Array, interval_s: Array) -> None:
 
 
 def unit_of(ratio: float) -> tuple[str, float] | None:
-    """The unit of time that a ratio to seconds suggests, and how many of these units make a second."""
+    """The unit of time that has about `ratio` units per second, with the exact number; None if none fits."""
     for name, per_s in (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)):
         if per_s / 5 < ratio < 5 * per_s:
             return name, per_s

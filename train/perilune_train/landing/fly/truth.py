@@ -30,8 +30,8 @@ class Truth:
 def read_truth(path: Path, time_s: Array, rotation_camera_from_body: Array) -> Truth:
     """Read the true camera poses of frames at times (n,) from truth.csv or from an EuRoC file.
 
-    An EuRoC file has poses of the body: they are interpolated, and `rotation_camera_from_body` (3, 3) converts them.
-    Raises UserError if the times do not fit the frames, or if a value is not a number.
+    An EuRoC file has poses of the body. These are interpolated, and `rotation_camera_from_body` (3, 3) converts them to
+    poses of the camera. Raises UserError if the times do not fit the frames, or if a value is not a number.
     """
     if any("p_RS_R_x" in name for name in column_names(path, POSES)):
         return _of_euroc(path, time_s, rotation_camera_from_body)

@@ -1,9 +1,9 @@
 """Check the units of inertial measurements, and suggest units that fit better.
 
-A reading is one interpretation of the numbers in a log. Each reading is integrated from the prior, without craters. It
-fits if its mean specific force is of the order of the Moon's gravity, the path stays above the ground and below the
-height that thrust can reach, and the camera keeps the ground in view. A poor fit does not prove that the units are
-wrong: a lander in free fall measures no specific force.
+A reading is one interpretation of the numbers in a file of inertial measurements. Each reading is integrated from the
+prior, without craters. It fits if its mean specific force is of the order of the Moon's gravity, the path stays above
+the ground and below the height that thrust can reach, and the camera keeps the ground in view. A poor fit does not
+prove that the units are wrong: a lander in free fall measures no specific force.
 """
 
 from collections.abc import Iterator
@@ -46,34 +46,34 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
-    """One way to interpret the numbers in a log."""
+    """One way to interpret the numbers in a file of inertial measurements."""
 
     name: str
     """Name of the reading in messages."""
     force: float = 1.0
     """Factor applied to the specific forces."""
     added_mps2: float = 0.0
-    """Upward specific force that is missing from the log."""
+    """Upward specific force that is missing from the file, metres per second^2."""
     rate: float = 1.0
     """Factor applied to the angular rates."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Path:
-    """The path that results from a reading of the measurements."""
+    """The path that results from one reading."""
 
     force_mps2: float
-    """Mean upward specific force."""
+    """Mean upward specific force, metres per second^2."""
     lowest_m: float
-    """Lowest height."""
+    """Lowest height above z = 0, metres."""
     climbs: bool
     """Whether the path ends higher than the prior allows for a descent."""
     leaves_s: float
     """Time after the first frame at which the camera's axis no longer points at the ground, or infinity."""
     rate_radps: float
-    """Root mean square of the angular rate."""
+    """Root mean square of the angular rate, radians per second."""
     slack_m: float
-    """Depth below the ground that the prior's errors can explain at the lowest point."""
+    """Largest depth below the ground, metres, at the lowest point that the prior's errors can explain."""
 
     @property
     def has_force(self) -> bool:
@@ -107,7 +107,7 @@ _RATES = (_Reading(""), _Reading("angular rates in degrees per second (times 0.0
 
 
 def doubts(measured: Increments, prior: Prior, *, is_lost: bool) -> list[str]:
-    """Describe each doubt about the units of a log in one text.
+    """Reasons to doubt the units of inertial measurements, as text; empty without doubts.
 
     If `is_lost`, the flight has lost its position, and less evidence is enough for a doubt.
     """
@@ -154,7 +154,7 @@ def _better(steps: Increments, prior: Prior, *, is_unsteady: bool) -> Iterator[s
 
 
 def _joined(measured: Increments, start_s: float, end_s: float) -> Increments | None:
-    """The measurements between two times, merged into at most _MAX_STEPS steps; None if there are no measurements."""
+    """The measurements between two times, merged into at most `_MAX_STEPS`; None without measurements."""
     first, behind = np.searchsorted(measured.time_s, [start_s, end_s], side="right")
     if first >= behind:
         return None

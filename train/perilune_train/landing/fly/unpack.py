@@ -1,4 +1,4 @@
-"""Write one descent of a dataset as files for `navigate fly`, with random errors in the prior and the catalogue."""
+"""Write one descent of a dataset as files for `navigate fly`, with random errors added."""
 
 from pathlib import Path
 
@@ -45,10 +45,11 @@ def unpack_descent(
     offset: tuple[float, float, float],
     seed: int,
 ) -> int:
-    """Write the files of a trajectory (scene_id, trajectory_id) to the new folder `out`; returns the number of frames.
+    """Write the files of a trajectory to the new folder `out`; returns the number of frames.
 
-    `offset` holds the standard deviations of the prior's errors per axis: position (m), velocity (m/s) and attitude
-    (degrees). `seed` determines the errors of the catalogue and the prior. Raises UserError if the dataset lacks the
+    `ids` are scene_id and trajectory_id. Unless `exact`, the catalogue has random errors. `offset` holds the standard
+    deviations of the prior's errors per axis: position (m), velocity (m/s) and attitude (degrees). `seed` determines
+    the errors of the catalogue and the prior. Raises UserError if the dataset lacks the
     trajectory or its inertial measurements.
     """
     columns = ["frame_id", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "png_path"]
@@ -120,7 +121,7 @@ def _write_sensors(dataset: Dataset, ids: tuple[str, str], out: Path) -> None:
 
 
 def _recorded_sigmas(dataset: Dataset, scene_id: str) -> dict[str, object]:
-    """Keys of prior.yaml for the standard deviations of star tracker and Doppler lidar, from a scene's recipe."""
+    """The standard deviations of star tracker and Doppler lidar for prior.yaml, from a scene's recipe."""
     recipe = dataset.info.recipes[dataset.table("scenes", ["recipe"], scene_id)["recipe"][0].as_py()]
     settings = recipe.config.get(recipe.kind)
     instruments = settings.get("instruments") if isinstance(settings, dict) else None

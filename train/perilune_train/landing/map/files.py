@@ -1,4 +1,4 @@
-"""Read and write the files of a map: one catalogue per scene, and the standard deviations of its errors."""
+"""Read and write the files of a map: one catalogue per scene, and their stated errors."""
 
 import json
 from dataclasses import dataclass
@@ -35,7 +35,10 @@ class SceneMap:
 
 
 def write_maps(folder: Path, dataset: Dataset, maps: list[SceneMap]) -> None:
-    """Write <scene_id>.parquet for each scene, and map.json with stated errors, Sun position and terrain hashes."""
+    """Write <scene_id>.parquet for each scene, and map.json.
+
+    For each scene, map.json has the stated errors, the position of the Sun and the hash of the terrain.
+    """
     columns = ["scene_id", "sun_azimuth_deg", "sun_elevation_deg", "content_sha256"]
     by_scene = dataset.table("scenes", columns).to_pandas().set_index("scene_id").to_dict("index")
     scenes = {}
@@ -83,7 +86,7 @@ def read_maps(folder: Path, dataset: Dataset) -> dict[str, Catalogue]:
 
 
 def _sigmas(record: dict[str, float]) -> tuple[float, float]:
-    """Stated standard deviations of position and diameter. Raises ValueError unless they are finite and at least 0."""
+    """Stated standard deviations of position and diameter; ValueError unless finite and at least 0."""
     values = float(record["position_sigma_m"]), float(record["diameter_sigma_share"])
     if not all(0 <= value < 1e3 for value in values):
         raise ValueError(f"deviations {values}, expected 0 to 1000")

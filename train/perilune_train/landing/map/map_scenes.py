@@ -1,4 +1,4 @@
-"""Make a crater catalogue of each scene of a survey: detect craters, match both images, and write the results."""
+"""Make a crater catalogue of each scene of a survey from two orbiter images."""
 
 from collections.abc import Callable
 from pathlib import Path

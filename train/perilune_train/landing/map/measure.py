@@ -18,10 +18,10 @@ plus twice the absolute difference of the logarithms of the radii."""
 
 
 def measured(mapped: Catalogue, exact: Catalogue, covered_m: Array) -> pd.DataFrame:
-    """Return one row per diameter bin: number of mapped craters, share of these that are real, recall and errors.
+    """One row per diameter bin: number of mapped craters, precision, recall and errors.
 
-    `covered_m` (2,) is the largest |x| and |y| of ground that both images show. Craters outside it do not count as
-    missed.
+    `covered_m` (2,) holds the largest |x| and |y| of the ground that both images show, metres. Craters outside do not
+    count as missed.
     """
     truth = KDTree(exact.centre_m[:, :2])
     distance_m, index = truth.query(mapped.centre_m[:, :2], min(_CANDIDATES, len(exact)))

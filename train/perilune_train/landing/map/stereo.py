@@ -13,8 +13,8 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 
 _CLASSES_PX = (30.0, 12.0, 5.0, 0.0)
-"""Smallest radius of each size class, pixels, largest first. The heights of one class narrow the search for the
-next."""
+"""Smallest radius of each size class, pixels, largest first. The heights of one class narrow the search for craters of
+the next class."""
 _RELIEF_M = 30.0
 """Standard deviation of heights, metres, assumed before any crater is matched."""
 _MIN_RELIEF_M = 1.0
@@ -72,8 +72,11 @@ class Ground:
     """Standard deviation of a crater's height relative to the height that `at` returns, metres."""
 
     def at(self, place_m: Array, without_nearest: bool = False) -> Array:
-        """Heights (M,) of points (M, 2): median of the nearest craters, or of all if there are few; 0 without
-        craters."""
+        """Heights (M,), metres, of the ground at points (M, 2).
+
+        A height is the median of the nearest craters, or of all craters if there are few; 0 without craters.
+        `without_nearest` leaves out the crater nearest to each point.
+        """
         if len(self.height_m) <= _NEIGHBOURS:
             return np.full(len(place_m), np.median(self.height_m) if len(self.height_m) else 0.0)
         _, near = KDTree(self.place_m).query(place_m, _NEIGHBOURS + without_nearest)
@@ -107,7 +110,7 @@ def matched(first: View, second: View) -> Matched:
     ground, pairs = Ground(), np.zeros((0, 2), np.intp)
     for number, least_px in enumerate(_CLASSES_PX):
         most_px = _CLASSES_PX[number - 1] if number else np.inf
-        # A crater near the limit of a class may be on the other side of it in the other view.
+        # A crater near the limit of a size class may belong to the neighbouring class in the other view.
         parts = [
             np.flatnonzero(
                 (view.sightings.radius_px >= share * least_px) & (view.sightings.radius_px < most_px / share)
@@ -148,7 +151,7 @@ def _spread(values: Array, chosen: NDArray[np.intp], view: View) -> Array:
 
 
 def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Ground) -> NDArray[np.intp]:
-    """Pairs (N, 2) of sightings that are each other's nearest in ground position and size."""
+    """Pairs (N, 2) of sightings that are mutual nearest neighbours in ground position and size."""
     if not len(parts[0]) or not len(parts[1]):
         return np.zeros((0, 2), np.intp)
     baseline = second.pose.position_m - first.pose.position_m
@@ -178,7 +181,7 @@ def _pairs(first: View, second: View, parts: list[NDArray[np.intp]], ground: Gro
 
 
 def _ground(first: View, second: View, pairs: NDArray[np.intp]) -> Ground:
-    """The ground from matched craters, at the heights where the two rays of each crater are closest."""
+    """The ground from matched craters: a crater has the height at which its two rays are closest."""
     start = [view.pose.position_m for view in (first, second)]
     rays = [view.rays[chosen] for view, chosen in zip((first, second), pairs.T, strict=True)]
     # Both rays have z = -1, so their distance is a linear function of the height.

@@ -1,4 +1,4 @@
-"""Run all methods that estimate a position relative to the site: fixes of single frames, and the filter."""
+"""Run the methods that estimate a position relative to the site: single-frame fixes and the filter."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ class Catalogues:
     """The catalogues of the scenes of a split, by scene_id."""
 
     exact: Mapping[str, Catalogue]
-    """Without errors."""
+    """Catalogues without errors."""
     rough: Mapping[str, Catalogue]
-    """With the errors of a catalogue made from orbit."""
+    """Catalogues with random errors, like those of catalogues from orbiter images."""
     mapped: Mapping[str, Catalogue]
-    """Made by the project's detector from orbiter images; may be empty."""
+    """Catalogues from `navigate map`, made by a detector from orbiter images; may be empty."""
 
 
 def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, Catalogue]) -> Catalogues:
@@ -51,7 +51,7 @@ def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, C
 def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: Catalogues) -> dict[str, pd.DataFrame]:
     """Errors of each method, one row per frame; methods that have no frames are left out.
 
-    The filter needs inertial measurements of grade `tactical`. Without them only fixes are computed.
+    The filter needs inertial measurements of grade `tactical`; without them, only fixes are computed.
     """
     sources = {"": catalogues.rough, ", exact catalogue": catalogues.exact, ", map": catalogues.mapped}
     sources = {name: source for name, source in sources.items() if source}
@@ -79,11 +79,11 @@ def absolute_summary(method: str, errors: pd.DataFrame) -> dict[str, float]:
 
 
 def on_the_same_frames(errors: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, float]]:
-    """Compare fixes and filter on equal frames, one entry per kind of catalogue; keys are the methods of the fixes.
+    """Compare fixes and filter on the same frames; keys are the names of the fix methods.
 
-    The rows of fixes contain correct fixes only, and fixes are rarely correct where frames are hard. So the RMSE of the
-    fixes and of the filter are comparable only on the frames with a correct fix. `filter_better_share` is the share of
-    all frames in which the filter's error is smaller; a frame without a fix counts for the filter.
+    `fix_summary` uses correct fixes only, and in hard frames fixes are rarely correct. The RMSE of fixes and the RMSE
+    of the filter are therefore comparable only on frames with a correct fix. `filter_better_share` is the share of all
+    frames in which the filter's error is smaller; a frame without a fix counts for the filter.
     """
     compared = {}
     for fix in ("fix", "fix, exact catalogue", "fix, map"):

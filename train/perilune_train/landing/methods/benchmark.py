@@ -38,8 +38,8 @@ def score_landing(
 ) -> Metrics:
     """Score fixes, lost-in-space fixes and the filter with a detector; returns the metrics.
 
-    `maps` contains one folder from `navigate map` for each part of the benchmark, named after the part. A part without
-    a folder gets no rows for the map. Writes a page, the metrics, a table of all frames and a picture to the new folder
+    `maps` contains one folder from `navigate map` for each part of the benchmark, named after the part. Parts without a
+    folder are not scored with a map. Writes a page, the metrics, a table of all frames and a picture to the new folder
     `out`; writes nothing if it fails. Raises UserError if the benchmark is missing or changed, or if the detector was
     fitted to its terrain (unless `allow_overlap`).
     """

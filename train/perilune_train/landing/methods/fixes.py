@@ -20,11 +20,14 @@ PRIOR_M, PRIOR_DEG = 100.0, 1.0
 WRONG_PX = 5.0
 """A fix with a larger error, in pixels on the ground, counts as wrong."""
 LOST_ABOVE_M, LOST_ALTITUDE_SHARE = 800.0, 0.1
-"""Limits for lost in space: smallest altitude, metres, and largest relative error of the known altitude."""
+"""Limits of lost-in-space fixes: smallest altitude, metres, and largest relative error of the known altitude."""
 
 
 def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
-    """Errors of the fixes of all frames, from priors with random errors of 100 m and 1 degree per axis (1 sigma)."""
+    """Errors of the fixes of all frames, computed from priors with random errors.
+
+    The standard deviations of the priors are `PRIOR_M` and `PRIOR_DEG` on each axis.
+    """
     rng, sigma = np.random.default_rng(seed), np.repeat([PRIOR_M, np.radians(PRIOR_DEG)], 3)
     rows = []
     for descent in _followed("fixes", descents):
@@ -39,8 +42,8 @@ def fixes_near_a_prior(descents: list[SeenDescent], catalogues: Mapping[str, Cat
 def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Catalogue], seed: int) -> pd.DataFrame:
     """Errors of the lost-in-space fixes of all frames above 800 m.
 
-    The camera is known to be level and the altitude is known to 10 %. The heading is unknown, and so is the position
-    within the catalogue.
+    The camera is known to be level and the altitude is known to 10 %. The heading and the position within the catalogue
+    are unknown.
     """
     rng, rows = np.random.default_rng(seed), []
     for descent in _followed("lost in space", descents):
@@ -96,13 +99,13 @@ def _row(descent: SeenDescent, true: Pose, located: Located | None, seconds: flo
 
 
 def step_to(pose: Pose, true: Pose) -> Array:
-    """The step (6,) to the true pose: translation (metres, O_L), then rotation from the left (radians, O_C)."""
+    """The step (6,) to the true pose: shift (metres, O_L), then rotation from the left (radians, O_C)."""
     turn = rotation_vectors(true.rotation_camera_from_site @ pose.rotation_camera_from_site.T)
     return np.concatenate([true.position_m - pose.position_m, turn])
 
 
 def fix_summary(fixes: pd.DataFrame) -> dict[str, float]:
-    """Metrics of a method: errors of correct fixes, and shares of frames without a fix and with a wrong fix."""
+    """Metrics of a method: errors of correct fixes, and shares of frames with a correct and a wrong fix."""
     right = fixes[fixes["error_px"] < WRONG_PX]
     return {
         "n_frames": float(len(fixes)),

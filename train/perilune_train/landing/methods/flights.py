@@ -1,4 +1,4 @@
-"""Run the filter over descents; compute its errors at every frame and the standard deviations that it states."""
+"""Run the filter over descents, and tabulate its errors and stated standard deviations."""
 
 import time
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from perilune_train.landing.filter.state import ATTITUDE, POSITION, CameraErrors
 from perilune_train.landing.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
-"""Standard deviations at the start, per axis, of position (metres) and velocity (metres per second)."""
+"""Standard deviations at the start on each axis: position (metres) and velocity (metres per second)."""
 BAND = (1.24, 14.45)
 """Interval that contains the sum of six squared standard normal numbers with probability 95 %."""
 
@@ -107,13 +107,16 @@ def mounting_of(dataset: Dataset) -> Array:
 
 
 def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
-    """Standard deviations at the start: `START_M`, `START_MPS`, the given attitude, and the biases of the grade."""
+    """Standard deviations (15,) at the start.
+
+    They are `START_M`, `START_MPS`, `attitude_deg`, and the biases of the grade on each axis.
+    """
     return start_sigmas(START_M, START_MPS, attitude_deg, GRADES[grade])
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Assumed errors of the filter at the first frame, and the true error."""
+    """Standard deviations that the filter assumes at the first frame, and the true error."""
 
     unit: InertialErrors
     """Errors of the inertial unit."""
@@ -131,7 +134,10 @@ def flight(
     start: Start,
     smooth: bool = False,
 ) -> pd.DataFrame:
-    """Errors of the filter at every frame of a descent; with `smooth`, of the smoother, which uses all frames."""
+    """Errors of the filter at every frame of a descent.
+
+    With `smooth` they are the errors of the smoother, which estimates every pose from the measurements of all frames.
+    """
     lander = lander_of(descent, rotation_camera_from_body, catalogue, start, smooth)
     estimates = list(fly(lander, instruments, descent.time_s, descent.sightings))
     rows = [row_of(descent, estimate, rotation_camera_from_body) for estimate in estimates]

@@ -49,8 +49,8 @@ def fly_methods(
     `navigator` and `detector` are folders of runs; `maps` is the folder of a map from `navigate map`. Writes
     methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
     pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`; writes nothing if
-    it fails. Raises UserError if a network was fitted to the terrain of the split and this is not accepted, or if the
-    dataset lacks frames.
+    it fails. Raises UserError if a network was fitted to the terrain of the split (unless `evaluated` allows overlap),
+    or if the dataset lacks frames.
     """
     address, split = evaluated.dataset, evaluated.split
     # Record the commit at the start: the checkout may change during the run.

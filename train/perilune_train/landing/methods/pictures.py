@@ -23,7 +23,7 @@ _ENLARGED = 4
 
 
 def draw_by_altitude(path: Path, tables: dict[str, pd.DataFrame]) -> None:
-    """Draw the median position error and 90 % of all errors by altitude, and the normalised errors squared.
+    """Draw position errors (median, 5 to 95 %) and normalised errors squared by altitude.
 
     Each table has altitude_m, error_m and squared, one row per frame; frames without an estimate have NaN.
     """

@@ -1,4 +1,4 @@
-"""Descents with the craters that a detector finds in every frame."""
+"""Run a detector over the frames of descents."""
 
 import time
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class SeenDescent:
 
 
 def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
-    """Descents with the craters that the detector of a run finds, and the detection time, seconds per frame."""
+    """Detect craters in all frames; returns the descents and the detection time, seconds per frame."""
     detector, threshold = open_detector(RunFolder(run).best, flight_config(run)), chosen_threshold(run)
     scenes = dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist()
     sun_elevation_deg = {row["scene_id"]: row["sun_elevation_deg"] for row in scenes}

@@ -1,4 +1,4 @@
-"""Draw random errors for a descent: errors at the start, inertial errors, and the fault of the scenario."""
+"""Draw random errors for a descent: start errors, inertial errors, and the fault of the scenario."""
 
 from dataclasses import dataclass, replace
 
@@ -72,7 +72,7 @@ def _none() -> Sightings:
 
 
 def _with_false(sightings: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
-    """Add a false sighting for each sighting, with equal size and score, at a random position in the image."""
+    """Add a false sighting for each sighting: equal size and score, at a random position in the image."""
     shuffled = rng.permutation(len(sightings))
     centre = np.concatenate([sightings.centre_px, rng.uniform(0, size_px, (len(sightings), 2))])
     radius = np.concatenate([sightings.radius_px, sightings.radius_px[shuffled]])

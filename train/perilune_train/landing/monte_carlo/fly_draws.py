@@ -1,4 +1,4 @@
-"""Fly the filter over random draws of every descent of a split, in parallel; write a table, a page and pictures."""
+"""Fly the filter over random draws of every descent of a split, in parallel."""
 
 import os
 import time
@@ -43,7 +43,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 PAGE, TABLE = "monte_carlo.md", "draws.parquet"
 PICTURES = ("errors.png", "consistency.png")
 REFERENCE: InertialGrade = "navigation"
-"""Grade of the inertial measurements that are taken as the true motion. Its errors are smaller than the errors of
+"""Grade of the inertial measurements that are taken as the true motion. Their errors are smaller than the errors of
 `GRADE` by factors of 6 (noise of the specific force) to 1000."""
 GRADE: InertialGrade = "tactical"
 _TOGETHER = 20
@@ -86,8 +86,8 @@ def fly_draws(
 
     `detector` is the folder of a run; its detector processes every frame once. Writes monte_carlo.md, draws.parquet and
     pictures to the new folder `out`; writes nothing if it fails. The result does not depend on the number of workers,
-    which is one per core by default. Raises UserError if the detector was fitted to the terrain of the split and this
-    is not accepted, or if the dataset lacks frames or inertial measurements.
+    which is one per core by default. Raises UserError if the detector was fitted to the terrain of the split (unless
+    `evaluated` allows overlap), or if the dataset lacks frames or inertial measurements.
     """
     dataset, split = open_single(evaluated.dataset), evaluated.split
     best = RunFolder(detector).best
@@ -135,8 +135,8 @@ def _reference(dataset: Dataset, ids: tuple[str, str], address: Address) -> Inst
 def flown_draws(job: Job, number: int, draws: Sequence[int]) -> list[pd.DataFrame]:
     """Fly draws of one descent together.
 
-    Each draw depends on the seed, the number of the descent and the number of the draw. The other draws in the batch
-    change it by rounding errors only.
+    `number` is the index of the descent. The random numbers of a draw depend on the seed, the descent and the draw. The
+    other draws in the batch change the results by rounding errors only.
     """
     site, sigmas = job.sites[number], job.sigmas
     landers, drawn_descents = [], []
@@ -200,7 +200,7 @@ def _flown(job: Job, batches: list[tuple[int, range]], workers: int) -> Iterator
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Start processes with one thread for linear algebra, since threads of several workers slow each other down."""
+    """Limit new processes to one linear-algebra thread: threads of several workers slow each other down."""
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:

@@ -15,7 +15,8 @@ from perilune_train.records.markdown import number, table
 from perilune_train.records.pictures import save_figure
 
 WRONG_SQUARED = 60.0
-"""Normalised squared error with six degrees of freedom; a correct covariance exceeds it in 5e-11 of all cases."""
+"""Largest normalised squared error that does not count as wrong. With six degrees of freedom and a correct covariance,
+a share of 5e-11 of all errors is larger."""
 _COLUMNS = {
     "position_rmse_m": "position RMSE (m)",
     "position_end_rmse_m": "position RMSE at the end (m)",
