@@ -325,3 +325,13 @@ def test_flights_together_are_those_one_by_one():
             np.testing.assert_allclose(estimate.state.covariance, expected.state.covariance, rtol=1e-5, atol=1e-9)
     assert "tracking" in {one.status for one in found[-1]}
     assert all(craft.state.time_s == ranges[-1] for craft in crafts)
+
+
+def test_a_frame_before_the_state_is_skipped_with_its_sightings():
+    craft, rng, _ = lander(9)
+    true = Pose(POSITION_M, MOUNTING)
+    frames = [NOTHING, sighted(WORLD, true, rng)]
+    still = Increments(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    estimates = list(fly(craft, Instruments(still, np.zeros(0), np.zeros(0)), np.array([-1.0, 0.0]), frames))
+    assert [estimate.frame for estimate in estimates] == [1]
+    assert estimates[0].status == "tracking"

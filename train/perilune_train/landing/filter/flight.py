@@ -151,7 +151,11 @@ def fly_together(
     sightings, surroundings = iter(seen), [lander.surroundings for lander in landers]
     measured, n_done = instruments.inertial.measured(), 0
     stretch = _stretch(landers)
-    for k in order[times[order] >= stretch.time_s - _SAME_S]:
+    for k in order:
+        if times[k] < stretch.time_s - _SAME_S:
+            if kind[k] == _FRAME:
+                next(sightings)
+            continue
         end = int(np.searchsorted(measured.time_s, times[k] + _SAME_S, side="right"))
         stretch.inertial(measured.part(slice(n_done, end)))
         n_done = end
