@@ -35,7 +35,7 @@ REMOVED_COLUMNS = {
 }
 """Columns of the table of removed craters, and their types.
 
-scene_id and crater_id are those of the dataset, and `seed` is the random seed of the scene. x_m and y_m are the centre
+scene_id and crater_id come from the dataset, and `seed` is the random seed of the scene. x_m and y_m are the centre
 in O_L, depth_ratio is the ratio of depth to diameter, and `reach_m` is the distance within which the removal changes
 the ground. n_frames counts the planned frames in which the crater is visible.
 """

@@ -25,7 +25,7 @@ _STREAM = "served"
 def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
     """Random seed and Sun of the further scene `number`, from 1; the Sun is drawn from `dataset.nav.sun`.
 
-    The seed differs from the seeds of all scenes in datasets, so that no dataset has this terrain.
+    No scene of a dataset has this seed, so no dataset has this terrain.
     """
     return drawn_scene(config, config.nav.sun, _STREAM, number)
 

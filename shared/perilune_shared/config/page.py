@@ -119,5 +119,5 @@ def _flow(value: Any) -> str:
 
 
 def _is_span(value: Section) -> bool:
-    """Whether a section has only the bounds `low` and `high`, so that it is shown on one line."""
+    """Whether a section has no keys but `low` and `high`; such a section is shown on one line."""
     return set(type(value).model_fields) == {"low", "high"}

@@ -1,7 +1,7 @@
 """Errors of inertial measurement units by grade, to simulate the table `inertial` and for filters.
 
 Each axis has white noise, and a bias that starts at a random value and follows a random walk. A grade may also have
-scale factors and misaligned axes. Quantisation is not simulated.
+scale factors and misaligned axes, which filters neglect. Quantisation is not simulated.
 """
 
 from dataclasses import dataclass

@@ -92,7 +92,7 @@ def descent(
 ) -> list[Pose]:
     """Return poses, with velocities, along a parabola that ends above the site.
 
-    The poses are those of a dataset without perturbations (`NominalTrajectory.parabola`): the camera looks straight
+    A dataset without perturbations has such poses (`NominalTrajectory.parabola`): the camera looks straight
     down, and south is up in the images. The trajectory starts `downrange_m` from the site, in the direction
     `azimuth_deg`. Frames are evenly spaced in time. Raises UserError on values out of range.
 

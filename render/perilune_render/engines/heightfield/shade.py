@@ -99,7 +99,7 @@ def _normal(vertices, k):
 def _corners(ground, facet, x, y):
     """Vertices of a triangle, edges from its first vertex, z of their cross product, two weights.
 
-    The weights are those of the second and third vertex at (x, y).
+    The two weights belong to the second and the third vertex at (x, y).
     """
     n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
     part, row, column = facet.part, facet.row, facet.column

@@ -100,7 +100,7 @@ class Craters:
     ) -> "Craters":
         """Circular primary craters, in the given order, with bowl-shaped floors.
 
-        The arrays (N,) are the fields of the same names. Rim heights are those of the profile `fassett_thomson`.
+        The arrays (N,) are the fields of the same names. The profile `fassett_thomson` gives the rim heights.
         """
         n = len(x_m)
         rim = fresh_rim_height_m(diameter_m, fresh_depth_m)

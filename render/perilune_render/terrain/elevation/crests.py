@@ -80,7 +80,7 @@ def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Ar
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Ellipses of N craters. Without a crest, position and radius are those of the input."""
+    """Ellipses of N craters. A crater without a crest keeps its position and radius."""
 
     x_m: Array
     y_m: Array

@@ -31,7 +31,7 @@ _NEAR_SIGMAS, _SEARCH_SIGMAS, _SURE_SIGMAS = 5.0, 10.0, 30.0
 fix at which a search stops without trying further candidates."""
 _CLEAR_SIGNIFICANCE, _CLEARLY_AHEAD = 14.0, 1.3
 """Smallest significance of the best refined candidate of a camera that is lost in space, and smallest ratio to the
-significance of the next different pose. On validation scenes, wrong poses reach 11, and the true pose has 14 to 120."""
+significance of the next different pose. On validation scenes, wrong poses reach 11, and the true pose has 14 to 135."""
 _AHEAD = 1.3
 """Smallest ratio between the support of the best and the second-best pose of a search."""
 _MAX_TILT_RAD = float(np.radians(5))

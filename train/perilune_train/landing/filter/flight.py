@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_train.landing.craters.locate import Located
 from perilune_train.landing.craters.sightings import Sightings
@@ -74,15 +74,6 @@ class Instruments:
         time_s, interval_s = (rows[name].to_numpy(np.float64) for name in ("time_s", "interval_s"))
         inertial = Increments(time_s, interval_s, rate, force)
         return cls(inertial, ranges["time_s"].to_numpy(np.float64), ranges["range_m"].to_numpy(np.float64))
-
-    def with_star_tracker(self, dataset: Dataset, ids: tuple[str, str], sigmas_rad: Array) -> "Instruments":
-        """Add the star tracker of a trajectory.
-
-        `sigmas_rad` (3,) are the standard deviations of the attitudes about the body's axes, radians.
-        """
-        rows = dataset.table("star_tracker", ["time_s", "rotation_wxyz"], *ids).to_pandas().sort_values("time_s")
-        attitudes = matrix_from_quaternion(_vectors(rows["rotation_wxyz"], 4))
-        return replace(self, star_tracker=StarTracker(rows["time_s"].to_numpy(np.float64), attitudes, sigmas_rad))
 
 
 def _vectors(column: pd.Series, length: int) -> Array:
