@@ -200,14 +200,19 @@ def _interrupts() -> Iterator[list[bool]]:
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             hook(unraisable)
 
-    hook = sys.unraisablehook
+    def printed(kind: Any, error: Any, traceback: Any) -> None:
+        # C code prints errors of its imports and callbacks, for example with PyErr_Print.
+        if not pressed:
+            print_error(kind, error, traceback)
+
+    hook, print_error = sys.unraisablehook, sys.excepthook
     signal.signal(signal.SIGINT, press)
-    sys.unraisablehook = ignored
+    sys.unraisablehook, sys.excepthook = ignored, printed
     try:
         yield pressed
     finally:
         signal.signal(signal.SIGINT, before)
-        sys.unraisablehook = hook
+        sys.unraisablehook, sys.excepthook = hook, print_error
 
 
 def _end_children() -> None:

@@ -92,6 +92,23 @@ def test_ctrl_c_ends_a_command_that_is_in_native_code(ignored):
         assert error == "stopped; finished files stay valid; run the same command again to resume\n"
 
 
+PRINTED = """
+import ctypes, time
+from perilune_shared.console.command_line import run_command_line
+code = b"import os, signal; os.kill(os.getpid(), signal.SIGINT); x = 1"
+def command():
+    ctypes.pythonapi.PyRun_SimpleString(code)  # calls PyErr_Print, as libraries do after a failed import
+    time.sleep(60)
+run_command_line(command, ended_after_s=0.2)
+"""
+
+
+def test_ctrl_c_in_an_import_from_c_prints_no_traceback():
+    done = subprocess.run([sys.executable, "-c", PRINTED], capture_output=True, text=True, timeout=60)
+    assert done.stderr == "stopped; finished files stay valid; run the same command again to resume\n"
+    assert done.returncode == 130
+
+
 LATE = """
 import signal, sys, time
 from perilune_shared.console.command_line import run_command_line
