@@ -73,6 +73,10 @@ def unfit(packages: list[dict[str, str]], version: str) -> list[str]:
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & set(sys.argv):
+        print(__doc__)
+        sys.exit()
     if len(sys.argv) != 4 or sys.argv[1] not in ("write", "check"):
-        sys.exit(__doc__)
+        print("error: expected write or check, a Python version and a folder; see --help", file=sys.stderr)
+        sys.exit(2)
     {"write": write, "check": check}[sys.argv[1]](sys.argv[2], Path(sys.argv[3]))

@@ -111,8 +111,8 @@ def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -
     Ctrl-C ends the command with one line and exit code 130. If the command is still running `ended_after_s` seconds
     after Ctrl-C, the process is ended together with its child processes. Ctrl-C is ignored once all work is done.
     """
-    with _interrupts() as interrupted, ended_by_interrupt(after_s=ended_after_s, at_end=_end_children):
-        message = _error_of(app, interrupted)
+    with ended_by_interrupt(after_s=ended_after_s, at_end=_end_children):
+        message = _error_of(app)
     if message is None:
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         return
@@ -120,14 +120,17 @@ def run_command_line(app: Callable[[], object], *, ended_after_s: float = 1.5) -
     sys.exit(EXIT_INTERRUPTED if message == STOPPED else EXIT_USER_ERROR)
 
 
-def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
+def _error_of(app: Callable[[], object]) -> str | None:
     """Run a command line; return the line to print after an error or Ctrl-C, or None after success."""
+    interrupted: list[bool] = []
     try:
-        _check_arguments()
-        set_up_program()
-        for name, value in (_UNTRACKED | _matplotlib_folder()).items():
-            os.environ.setdefault(name, value)
-        _run(app)
+        # Entered inside the `try`: from the first instruction of this block on, Ctrl-C raises KeyboardInterrupt.
+        with _interrupts(interrupted):
+            _check_arguments()
+            set_up_program()
+            for name, value in (_UNTRACKED | _matplotlib_folder()).items():
+                os.environ.setdefault(name, value)
+            _run(app)
     except UserError as error:
         return STOPPED if interrupted else f"error: {error}"
     except _UsageError as error:
@@ -182,13 +185,12 @@ def _matplotlib_folder() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _interrupts() -> Iterator[list[bool]]:
-    """On Ctrl-C, raise KeyboardInterrupt and append to the yielded list. No effect if Ctrl-C is ignored."""
-    pressed: list[bool] = []
+def _interrupts(pressed: list[bool]) -> Iterator[None]:
+    """On Ctrl-C, append to `pressed` and raise KeyboardInterrupt. No effect if Ctrl-C is ignored."""
     before = signal.getsignal(signal.SIGINT)
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or (before is not signal.default_int_handler and not ends_at_interrupt()):
-        yield pressed
+        yield
         return
 
     def press(*_: object) -> None:
@@ -209,7 +211,7 @@ def _interrupts() -> Iterator[list[bool]]:
     signal.signal(signal.SIGINT, press)
     sys.unraisablehook, sys.excepthook = ignored, printed
     try:
-        yield pressed
+        yield
     finally:
         signal.signal(signal.SIGINT, before)
         sys.unraisablehook, sys.excepthook = hook, print_error
