@@ -14,7 +14,7 @@ _PER_SCORE, _USUAL_SCORE = 1.5, 0.8
 """The standard deviation that differs from frame to frame has the value above at `_USUAL_SCORE`. The logarithm of this
 deviation grows by `_PER_SCORE` per unit of decreasing score."""
 MAX_SIGHTINGS = 500
-"""Largest number of craters of a frame that are matched, which limits the time of a step."""
+"""Largest number of craters of a frame that are matched in flight, which limits the time of a step."""
 _SIZE_SHARE = 0.15
 """Standard deviation of a detected radius, as a share of the radius."""
 
@@ -32,18 +32,19 @@ class Sightings:
 
     @classmethod
     def of_boxes(cls, boxes: Array, scores: Array) -> "Sightings":
-        """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius.
-
-        If there are more than `MAX_SIGHTINGS`, those with the highest scores are kept.
-        """
+        """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius."""
         scores = np.asarray(scores)
-        if len(scores) > MAX_SIGHTINGS:
-            best = np.argsort(-scores, kind="stable")[:MAX_SIGHTINGS]
-            boxes, scores = boxes[best], scores[best]
         size = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None)
         radius = np.sqrt(size.prod(axis=1)) / 2
         order = np.argsort(-radius)
         return cls((boxes[order, :2] + boxes[order, 2:]) / 2, radius[order], scores[order])
+
+    def strongest(self, count: int = MAX_SIGHTINGS) -> "Sightings":
+        """The `count` sightings with the highest scores, sorted by decreasing radius."""
+        if len(self) <= count:
+            return self
+        best = np.sort(np.argsort(-self.score, kind="stable")[:count])
+        return Sightings(self.centre_px[best], self.radius_px[best], self.score[best])
 
     def __len__(self) -> int:
         return len(self.radius_px)

@@ -168,7 +168,7 @@ def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iter
             found = detect(path)
         except UnreadableFrame as error:
             faults[number], found = str(error), _NOTHING
-        yield sightings_of(found, descent.camera.intrinsics())
+        yield sightings_of(found, descent.camera.intrinsics()).strongest()
 
 
 def sightings_of(found: Detections, camera: Camera) -> Sightings:

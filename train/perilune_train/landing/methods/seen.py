@@ -60,7 +60,7 @@ def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -
                 begun = time.perf_counter()
                 for predicted in detect_at_scales(detector, trajectory.images[start : start + _BATCH]):
                     kept = above(predicted, threshold)
-                    sightings.append(Sightings.of_boxes(kept.boxes, kept.scores))
+                    sightings.append(Sightings.of_boxes(kept.boxes, kept.scores).strongest())
                 seconds += time.perf_counter() - begun
                 progress.advance(bar, len(trajectory.images[start : start + _BATCH]))
             rows = dataset.table("frames", ["time_s", "velocity_mps"], *trajectory.ids).sort_by("time_s")
