@@ -65,6 +65,21 @@ def test_frames_of_a_descent_make_no_map(quick, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_an_unfinished_survey_makes_no_map(quick_survey, tmp_path):
+    """A rendering that was stopped before its first frame leaves a valid dataset without frames."""
+    begun = tmp_path / "begun"
+    shutil.copytree(quick_survey, begun)
+    info = json.loads((begun / "dataset.json").read_text(encoding="utf-8"))
+    info["complete"], info["counts"] = False, dict.fromkeys(info["counts"], 0)
+    (begun / "dataset.json").write_text(json.dumps(info), encoding="utf-8")
+    for name in ("manifest", "index"):
+        shutil.rmtree(begun / name)
+    done = in_process.call(main, "navigate", "map", "--dataset", begun, "--out", tmp_path / "out")
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr, done.stderr
+    assert "frames" in done.stderr and not (tmp_path / "out").exists()
+
+
 def test_a_survey_without_frames_and_a_packed_one(quick_survey, mapped, tmp_path):
     survey = open_dataset(quick_survey)
     subset(survey, tmp_path / "absent", images="none")

@@ -56,6 +56,9 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
     """
     dataset = open_single(address)
     frames = dataset.table("frames").to_pandas().sort_values("frame_id")
+    if frames.empty:
+        expected = "two per scene: run `perilune-render survey` again to finish the survey"
+        raise UserError(dataset.store, "frames", 0, expected)
     for scene_id, scene_frames in frames.groupby("scene_id"):
         if len(scene_frames) != 2:
             expected = "2, as `perilune-render survey` makes them"
@@ -142,6 +145,7 @@ def page_of(dataset: Dataset, maps: list[SceneMap]) -> str:
     lines += [
         "Poses of the images are exact. A crater of the map is true if one of the terrain is near: distance in radii,",
         "plus twice the difference of the logarithms of both radii, is below 0.8. Errors are those of true craters.",
+        "Craters of an elevation model itself are not known, so their detections count as false here.",
         "",
     ]
     for scene_map in maps:
