@@ -15,10 +15,8 @@ from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.search import Area
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.craters.vote import (
-    FINE,
     LOST,
-    QUICK,
-    WHOLE,
+    LOST_FINELY,
     Candidate,
     SearchRange,
     candidates,
@@ -46,7 +44,7 @@ def test_a_pose_is_found_with_and_without_the_largest_craters(catalogue, altitud
         assert np.linalg.norm(located.fix.pose.position_m - true.position_m) * CAMERA.fx_px / altitude_m < 5
 
 
-@pytest.mark.parametrize("effort", [QUICK, FINE, WHOLE], ids=["quick", "fine", "whole"])
+@pytest.mark.parametrize("effort", [LOST, LOST_FINELY], ids=["coarsely", "finely"])
 def test_candidates_contain_shift_altitude_and_heading(effort):
     rng = np.random.default_rng(2)
     true = pose(rng, 900.0, tilt_deg=0.0, heading_rad=0.3)
@@ -82,7 +80,7 @@ def test_groups_of_craters_and_repeated_sightings_are_not_significant():
         part, centre_m=np.column_stack([centres_m, np.zeros(480)]), radius_m=np.full(480, 4.0 * 900 / CAMERA.fx_px)
     )
     limits = SearchRange(0.0, 200.0, 20.0, (-0.1, 0.1), np.radians(8))
-    found = candidates(seen, grouped, CAMERA, expected, limits, WHOLE)
+    found = candidates(seen, grouped, CAMERA, expected, limits, LOST)
     assert found[0].significance < 20
 
 

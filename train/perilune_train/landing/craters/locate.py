@@ -7,15 +7,13 @@ import numpy as np
 from perilune_shared.geometry.camera import Camera
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import MIN_MATCHES, Fix, PosePrior, refine
+from perilune_train.landing.craters.pair_vote import pair_candidates
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.search import Area, search
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.craters.vote import (
-    FINE,
     LOST,
     LOST_FINELY,
-    QUICK,
-    WHOLE,
     Candidate,
     SearchRange,
     Support,
@@ -43,14 +41,16 @@ _N_REFINED = 4
 """Number of refined candidates from which fixes are computed."""
 _N_POLISHED = 3
 """Largest number of fits from a candidate."""
-_SIGMAS = 3.5
-_ATTEMPTS = ((1.0, QUICK), (1.0, FINE), (1.0, WHOLE), (3.0, QUICK))
-"""Searches in the order in which they are tried: search radius as a multiple of the radius from the prior's standard
-deviations, and effort. The last search has a larger radius, because the prior may be wrong."""
+_STILL_PX = 0.5
+"""Fits end if the last one moves the image by less than this, pixels."""
+_ATTEMPTS = ((2.0, 500_000), (3.5, 4_000_000), (10.5, 4_000_000))
+"""Searches in the order in which they are tried: range in standard deviations of the prior, and `max_tried` of
+`pair_candidates`. The first search is the fastest. The last has a large range, because the prior may be wrong."""
 _NEAREST = 30
 """Number of nearest craters whose median height is taken as the height of the ground."""
-_MIN_MARGIN = 0.06
-"""Smallest altitude margin in a search, as a share of the altitude. It is needed because the ground is not level."""
+_MIN_MARGIN, _MIN_SHIFT_PX, _MIN_HEADING_RAD = 0.06, 20.0, float(np.radians(2))
+"""Smallest ranges of a search: of the altitude, as a share, of the shift and of the heading. The ground is not
+level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,17 +82,19 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
         fix = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose, start_px)
         if fix is not None and support(sightings, catalogue, camera, fix.pose).sigmas >= _NEAR_SIGMAS:
             return Located(fix, searched=False)
-    margin = max(_SIGMAS * float(sigma[2]) / altitude_m, _MIN_MARGIN)
-    log_altitude = np.log(max(1 - margin, 0.2)), np.log(1 + margin)
-    heading_rad = min(max(_SIGMAS * float(sigma[5]), np.radians(2)), np.pi)
-    for factor, effort in _ATTEMPTS:
-        shift_m = factor * _SIGMAS * float(sigma[:2].max())
-        shift_px = factor * max(_SIGMAS * float(sigma[3:5].max()) * camera.fx_px, 20.0)
-        limits = SearchRange(ground_m, shift_m, shift_px, log_altitude, heading_rad)
-        voted = candidates(sightings, catalogue, camera, prior.pose, limits, effort)
-        if effort is not QUICK:
-            voted = refined(sightings, catalogue, camera, voted)[:_N_REFINED]
-        poses = [candidate.pose for candidate in voted]
+    for sigmas, max_tried in _ATTEMPTS:
+        margin = max(sigmas * float(sigma[2]) / altitude_m, _MIN_MARGIN)
+        limits = SearchRange(
+            ground_m,
+            sigmas * float(sigma[:2].max()),
+            max(sigmas * float(sigma[3:5].max()) * camera.fx_px, _MIN_SHIFT_PX),
+            (np.log(max(1 - margin, 0.2)), np.log(1 + margin)),
+            min(max(sigmas * float(sigma[5]), _MIN_HEADING_RAD), np.pi),
+        )
+        voted, is_sure = pair_candidates(sightings, catalogue, camera, prior.pose, limits, max_tried)
+        if not is_sure and sigmas == _ATTEMPTS[0][0]:
+            continue
+        poses = [candidate.pose for candidate in voted[:_N_REFINED]]
         fix = _best(sightings, catalogue, camera, poses, min(float(sigma[3:5].max()), _KNOWN_TILT_RAD))
         if fix is not None:
             return Located(fix, searched=True)
@@ -165,11 +167,12 @@ def _polished(
 
     A candidate is off by several pixels at the edges of the frame. A free fit from there may match only a part of the
     frame, with a wrong tilt. Therefore the first fit has a prior on the tilt, with standard deviation `tilt_rad`. Free
-    fits follow, each from the previous result, while the support grows.
+    fits follow, each from the previous result, while they move the image and the support grows.
     """
     first = refine(sightings, catalogue, camera, _around(pose, tilt_rad), pose)
     best, agreed = None, Support(0, 0.0, 1.0)
     start = pose if first is None else first.pose
+    ground_m = catalogue.ground_m(start.position_m, _NEAREST)
     for _ in range(_N_POLISHED):
         fix = refine(sightings, catalogue, camera, _around(start), start)
         if fix is None:
@@ -177,10 +180,24 @@ def _polished(
         later = support(sightings, catalogue, camera, fix.pose)
         if later.excess <= agreed.excess:
             break
+        moved_px = _moved_px(camera, start, fix.pose, ground_m)
         best, agreed, start = fix, later, fix.pose
-        if agreed.sigmas < _NEAR_SIGMAS:
+        if agreed.sigmas < _NEAR_SIGMAS or moved_px < _STILL_PX:
             break
     return agreed, best
+
+
+def _moved_px(camera: Camera, first: Pose, second: Pose, ground_m: float) -> float:
+    """Largest motion of the image's corners and middle, pixels, from one pose to another over level ground."""
+    right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
+    place_px = np.array([[0.5, 0.5], [right, 0.5], [0.5, bottom], [right, bottom], [right / 2, bottom / 2]])
+    ray = camera.rays(place_px)
+    down = ray @ first.rotation_camera_from_site
+    if not (down[:, 2] < 0).all():
+        return np.inf
+    ground = first.position_m + down * ((ground_m - first.position_m[2]) / down[:, 2:])
+    later = (ground - second.position_m) @ second.rotation_camera_from_site.T
+    return float(np.abs(later[:, :2] / later[:, 2:] - ray[:, :2] / ray[:, 2:]).max() * camera.fx_px)
 
 
 def _tilt(first: Pose, second: Pose) -> float:

@@ -1,4 +1,4 @@
-"""Search for a pose near an expected pose, by votes of pairs of a sighting and a crater.
+"""Search for a pose over a whole catalogue, by votes of pairs of a sighting and a crater.
 
 An error of the expected pose shifts, scales and turns the image of the catalogue. For each altitude and heading of a
 grid, every pair of similar size votes for the shift that maps its crater onto its sighting. The correct pairs vote for
@@ -57,11 +57,8 @@ class Effort:
     """Largest number of votes over all altitudes and headings. In a search over a large range, fewer sightings vote."""
 
 
-QUICK, FINE, WHOLE = Effort(2.0, 40_000, 8), Effort(1.0, 200_000, 16), Effort(2.0, 1_500_000, 32)
-"""Efforts of searches with a prior: the first search, and two more if it finds nothing. In the last search nearly all
-sightings vote, because over an elevation model the catalogue may lack craters of the rarest sizes."""
 LOST, LOST_FINELY = Effort(2.0, 3_000_000, 64, 2e9), Effort(1.0, 3_000_000, 16, 8e9)
-"""Efforts of searches without a prior: the first search takes seconds. If it finds nothing, the second search takes up
+"""Efforts of the two searches: the first search takes seconds. If it finds nothing, the second search takes up
 to half a minute."""
 
 
