@@ -80,11 +80,13 @@ def refine(
     prior: PosePrior,
     start: Pose,
     start_px: float = _SOFT_PX[0],
+    rounds: list[Pose] | None = None,
 ) -> Fix | None:
     """Estimate the best-fitting pose near a start; None if fewer than six sightings match.
 
     `start_px` is the standard deviation of the start's error in the image, pixels. If the start is far from the true
     pose, the result is wrong: use `vote.support` to compare the number of agreeing sightings with chance.
+    The pose after each round is appended to `rounds`, for a trace.
     """
     if not len(sightings):
         return None
@@ -110,6 +112,8 @@ def refine(
             expected.jacobian(),
         )
         pose = _stepped(pose, prior, precision, normal, gradient)
+        if rounds is not None:
+            rounds.append(pose)
     for number in range(_N_HARD):
         # In the first of these rounds, the pose still has the error of the last soft round.
         gate_px = 0.5 if number == 0 else 0.0
@@ -125,6 +129,8 @@ def refine(
             error, centre_sigma, size_sigma, gate_px, expected.jacobian(crater)
         )
         pose = _stepped(pose, prior, precision, normal, gradient)
+        if rounds is not None:
+            rounds.append(pose)
     normal += precision
     # If the assumed errors are too small for the residuals, enlarge the covariance to match the residuals.
     squares = np.sum(weight[:, None] * (error[:, :2] / centre_sigma[:, None]) ** 2)

@@ -34,7 +34,8 @@ class Sightings:
     def of_boxes(cls, boxes: Array, scores: Array) -> "Sightings":
         """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius.
 
-        If there are more than `MAX_SIGHTINGS`, those with the highest scores are kept.
+        Sightings of equal radius keep the order of their boxes. If there are more than `MAX_SIGHTINGS`, those with
+        the highest scores are kept.
         """
         scores = np.asarray(scores)
         if len(scores) > MAX_SIGHTINGS:
@@ -42,7 +43,7 @@ class Sightings:
             boxes, scores = boxes[best], scores[best]
         size = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None)
         radius = np.sqrt(size.prod(axis=1)) / 2
-        order = np.argsort(-radius)
+        order = np.argsort(-radius, kind="stable")
         return cls((boxes[order, :2] + boxes[order, 2:]) / 2, radius[order], scores[order])
 
     def __len__(self) -> int:
