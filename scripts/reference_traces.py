@@ -35,12 +35,14 @@ from perilune_train.shipped.models import shipped_run
 
 TRACES = Path(__file__).parent.parent / "examples" / "traces"
 """Folder of the reference traces."""
-_MAX_DETECTIONS = 110
-"""Largest number of detections of a frame, those with the highest scores."""
 _MARGIN_PX, _LEAST_PX = 48.0, 1.2
 """Craters of the catalogue that are never in view with this margin and at least this radius are left out."""
 _MOUNTING_DEG = 30.0
 """Rotation of the body's axes about Z_B in the descent with all sensors, so that no mounting matrix is symmetric."""
+_RATE_BITS, _FORCE_BITS = 22, 16
+"""Inertial measurements are rounded to multiples of 2^-bits of their unit."""
+_NO_CRATERS = 5
+"""Frame without detections in the descent with all sensors."""
 _DISTORTION = (-0.12, 0.03, 0.001, -0.0007, 0.0)
 
 
@@ -58,16 +60,21 @@ class Recipe:
     """One of this number of frames is kept."""
     every_range: int
     """One of this number of ranges is kept."""
-    stated_position_sigma_m: float
-    """Standard deviation of the prior's position that prior.yaml states, metres; the prior is off by about 60 m."""
+    max_detections: int
+    """Largest number of detections of a frame, those with the highest scores."""
+    position_sigma_m: float = 60.0
+    """Standard deviation of the prior's position on each axis, metres."""
+    shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Further error of the prior's position, metres, O_L."""
     all_sensors: bool = False
     """Whether the descent has all sensors, outages, a lens with distortion and a turned camera."""
 
 
 RECIPES = {
-    "nominal": Recipe("highland", ("scene-0000", "trajectory-0000"), "tactical", 3, 20, 60.0),
-    "sensors": Recipe("highland", ("scene-0001", "trajectory-0001"), "cubesat", 4, 30, 60.0, all_sensors=True),
-    "restart": Recipe("relief", ("scene-0000", "trajectory-0000"), "tactical", 4, 30, 8.0),
+    "nominal": Recipe("highland", ("scene-0000", "trajectory-0000"), "tactical", 3, 20, 110),
+    "sensors": Recipe("highland", ("scene-0001", "trajectory-0001"), "cubesat", 4, 30, 110, all_sensors=True),
+    # The shift contradicts the stated deviation, so the filter restarts.
+    "restart": Recipe("relief", ("scene-0000", "trajectory-0000"), "tactical", 4, 30, 160, 4.0, (45.0, -30.0, 10.0)),
 }
 
 
@@ -79,9 +86,10 @@ def make_inputs(datasets: dict[str, str]) -> None:
         with tempfile.TemporaryDirectory() as scratch:
             unpacked = Path(scratch) / "descent"
             dataset = open_single(datasets[recipe.dataset])
-            unpack_descent(dataset, recipe.trajectory, unpacked, recipe.grade, False, (60.0, 1.0, 0.5), 0)
+            offset = recipe.position_sigma_m, 1.0, 0.5
+            unpack_descent(dataset, recipe.trajectory, unpacked, recipe.grade, False, offset, 0)
             descent = _with_fewer_rows(read_descent(DescentFiles.of_folder(unpacked)), recipe)
-            found = {path.name: _best(network(path)) for path in descent.frames.paths}
+            found = {path.name: _best(network(path), recipe.max_detections) for path in descent.frames.paths}
             if recipe.all_sensors:
                 descent, found = _with_faults(descent, found)
             shutil.rmtree(folder, ignore_errors=True)
@@ -102,9 +110,9 @@ def make_tables() -> None:
         say(f"{folder}: {len(tables['steps'])} steps; frames: {outcomes}; {size / 1000:.0f} kB with inputs")
 
 
-def _best(found: Detections) -> Detections:
+def _best(found: Detections, count: int) -> Detections:
     """The detections with the highest scores, rounded to 1/256 px."""
-    kept = np.sort(np.argsort(-found.scores, kind="stable")[:_MAX_DETECTIONS])
+    kept = np.sort(np.argsort(-found.scores, kind="stable")[:count])
     return Detections(_rounded(found.boxes[kept], 8), _rounded(found.scores[kept], 10))
 
 
@@ -137,7 +145,8 @@ def _with_fewer_rows(descent: Descent, recipe: Recipe) -> Descent:
         *((_stars(instruments), _lidar(instruments)) if recipe.all_sensors else ()),
     )  # fmt: skip
     frames = FrameFiles(descent.frames.paths[kept], descent.frames.time_s[kept])
-    prior = descent.prior.model_copy(update={"position_sigma_m": recipe.stated_position_sigma_m})
+    position_m = tuple(np.add(descent.prior.position_m, recipe.shift_m).tolist())
+    prior = descent.prior.model_copy(update={"position_m": position_m})
     return replace(descent, catalogue=catalogue, instruments=instruments, frames=frames, prior=prior)
 
 
@@ -146,7 +155,7 @@ def _halved(measured: Increments) -> Increments:
     n = len(measured) // 2 * 2
     rate, force = (
         _rounded(values[:n].reshape(-1, 2, 3).mean(axis=1), bits)
-        for values, bits in ((measured.angular_rate_radps, 22), (measured.specific_force_mps2, 16))
+        for values, bits in ((measured.angular_rate_radps, _RATE_BITS), (measured.specific_force_mps2, _FORCE_BITS))
     )
     time_s = measured.time_s[:n][1::2]
     return Increments(time_s, measured.interval_s[:n:2] + measured.interval_s[1:n:2], rate, force)
@@ -175,7 +184,8 @@ def _with_faults(descent: Descent, found: dict[str, Detections]) -> tuple[Descen
     assert stars is not None
     turn = matrix_from_rotation_vector(np.radians([0.0, 0.0, _MOUNTING_DEG]))
     inertial = instruments.inertial
-    rate, force = inertial.angular_rate_radps @ turn.T, inertial.specific_force_mps2 @ turn.T
+    rate = _rounded(inertial.angular_rate_radps @ turn.T, _RATE_BITS)
+    force = _rounded(inertial.specific_force_mps2 @ turn.T, _FORCE_BITS)
     # No measurements for 4 seconds (rows missing) and for 0.4 seconds (values missing).
     kept = (inertial.time_s <= 38.0) | (inertial.time_s > 42.0)
     rate[(inertial.time_s > 20.0) & (inertial.time_s <= 20.4)] = np.nan
@@ -200,6 +210,7 @@ def _with_faults(descent: Descent, found: dict[str, Detections]) -> tuple[Descen
     record = descent.camera.model_copy(update={"distortion": _DISTORTION, "rotation_camera_from_body": _rows(mounting)})
     prior = descent.prior.model_copy(update={"camera_mounting_sigma_deg": 0.02, "camera_time_sigma_s": 0.01})
     distorted = {name: _distorted(each, pinhole, lens) for name, each in found.items()}
+    distorted[descent.frames.paths[_NO_CRATERS].name] = Detections(np.zeros((0, 4)), np.zeros(0))
     return replace(descent, camera=record, instruments=instruments, prior=prior), distorted
 
 
