@@ -360,7 +360,7 @@ bench-suppress: setup-dev # time of non-maximum suppression of a batch, compared
 
 # With RECORD=files, first copy these JSON files of runs or benchmarks into results/.
 traces: setup ## fly the landing filter over the inputs of the reference traces again, after a change of the filter
-	@$(BIN)/python scripts/reference_traces.py tables
+	@$(BIN)/python -m scripts.reference_traces tables
 
 # The same settings as in docs/notebook/2026-11-28-landing.md; takes an hour on two cores.
 TRACE_DATA := --set dataset.nav.n_frames=40 --set dataset.nav.split_by=scene --set dataset.nav.val_share=0 \
@@ -374,7 +374,7 @@ trace-inputs: setup # render the descents of the reference traces from their see
 	  --set dataset.name=relief-a --pixel-m 5 --out data/reference-relief.tif
 	@$(BIN)/perilune-render dataset --preset large --kind nav --dem data/reference-relief.tif --set dataset.name=dem-a --set dataset.nav.n_scenes=1 \
 	  --set dataset.nav.trajectories_per_scene=2 $(TRACE_DATA) --out data/reference-relief
-	@$(BIN)/python scripts/reference_traces.py inputs
+	@$(BIN)/python -m scripts.reference_traces inputs
 
 results: setup ## write the headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
 	@$(if $(RECORD),$(BIN)/python scripts/results.py record $(RECORD))

@@ -1,10 +1,11 @@
 """Make the reference traces of the landing filter: their inputs from datasets, and their tables from the inputs.
 
-    python scripts/reference_traces.py inputs --highland data/highland/nav --relief data/relief/nav
-    python scripts/reference_traces.py tables
+    python -m scripts.reference_traces inputs --highland data/highland/nav --relief data/relief/nav
+    python -m scripts.reference_traces tables
 
 `inputs` unpacks three descents, detects their craters and keeps a part of the measurements, so that the traces are
-small. `tables` flies the filter over these inputs again, which is needed after each change of the filter.
+small. `tables` flies the filter over these inputs again, and writes the tables of docs/reference/landing-filter.md. It
+is needed after each change of the filter.
 """
 
 import argparse
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scripts.trace_page import write_page
 
 from perilune_shared.console.terminal import say
 from perilune_shared.dataset.manifest import open_single
@@ -108,6 +110,7 @@ def make_tables() -> None:
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
         outcomes = ", ".join(f"{count} {each}" for each, count in tables["frames"]["outcome"].value_counts().items())
         say(f"{folder}: {len(tables['steps'])} steps; frames: {outcomes}; {size / 1000:.0f} kB with inputs")
+    write_page()
 
 
 def _best(found: Detections, count: int) -> Detections:
@@ -186,8 +189,8 @@ def _with_faults(descent: Descent, found: dict[str, Detections]) -> tuple[Descen
     inertial = instruments.inertial
     rate = _rounded(inertial.angular_rate_radps @ turn.T, _RATE_BITS)
     force = _rounded(inertial.specific_force_mps2 @ turn.T, _FORCE_BITS)
-    # No measurements for 4 seconds (rows missing) and for 0.4 seconds (values missing).
-    kept = (inertial.time_s <= 38.0) | (inertial.time_s > 42.0)
+    # No measurements for 2 seconds (rows missing) and for 0.4 seconds (values missing).
+    kept = (inertial.time_s <= 38.0) | (inertial.time_s > 40.0)
     rate[(inertial.time_s > 20.0) & (inertial.time_s <= 20.4)] = np.nan
     range_m = instruments.range_m.copy()
     range_m[[3, 7]] = np.nan, range_m[7] + 300.0

@@ -26,9 +26,9 @@ class Column:
     meaning: str
     """What the columns contain."""
     variances: tuple[str, ...] = ()
-    """If not empty: the column of the variance of each column; the square root of the reference's variance is then the
-    scale. An element of a covariance has two such columns, one for its row and one for its column, separated by a
-    blank."""
+    """If not empty: the columns of variances that give the scale of each column. One name: the scale is the square root
+    of the reference's variance. Two names, separated by a blank: the scale of an element of a covariance is the square
+    root of the product of the variances of its row and its column."""
     is_text: bool = False
     """Whether the columns are texts."""
 
@@ -93,7 +93,7 @@ STEPS = Table(
             "m, m/s or rad",
             0.0,
             "measurement minus prediction; an attitude has three, a range and a speed have one, others none (NaN)",
-            tuple(f"innovation_covariance_{k}_{k} innovation_covariance_{k}_{k}" for k in range(3)),
+            tuple(f"innovation_covariance_{k}_{k}" for k in range(3)),
         ),
         _covariance("innovation_covariance", 3, "covariance of the innovation, with noise; NaN without innovation"),
         *_MOTION,
@@ -173,7 +173,7 @@ MATCHES = Table(
             "px",
             0.0,
             "sighting minus predicted centre; NaN if the update does not use the match",
-            tuple(f"{name} {name}" for name in _INNOVATION),
+            _INNOVATION,
         ),
         Column(
             ("innovation_covariance_x_x", "innovation_covariance_x_y", "innovation_covariance_y_y"),

@@ -152,8 +152,7 @@ def _differences(
         return np.where(expected == got, 0.0, np.inf)
     scale = np.maximum(column.scale, np.abs(expected))
     if variances:
-        first, second = (ours.numbers(each)[rows[0]] for each in variances.split())
-        scale = np.sqrt(first * second)
+        scale = np.sqrt(np.prod([ours.numbers(each)[rows[0]] for each in variances.split()], axis=0))
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.abs(got - expected) / scale
     # A variance of exactly 0 has no scale: errors that the filter knows to be zero.
