@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from perilune_train.landing.filter.flight import fly
 from perilune_train.landing.fly.run import lander_of, sightings
 from perilune_train.landing.trace.columns import TABLES
 from perilune_train.landing.trace.compare import compare_traces
-from perilune_train.landing.trace.write import INPUTS, read_inputs, trace_of, write_table
+from perilune_train.landing.trace.write import INPUTS, flown, read_inputs, trace_of, write_table
 
 ROOT = TRACES.parent.parent
 REGENERATE = "the filter has changed: type  make traces  and state the change in docs/reference/landing-filter.md"
@@ -79,14 +80,38 @@ def test_the_reference_traces_have_every_kind_of_step_and_are_small():
     assert sum(path.stat().st_size for path in TRACES.rglob("*")) < 2_100_000
 
 
+@pytest.mark.parametrize(("change", "tolerance"), [(1e-15, 1e-10), (1e-9, 1e-5)])
+@pytest.mark.parametrize("name", RECIPES)
+def test_small_changes_of_the_inputs_have_small_effects(name, change, tolerance, tmp_path):
+    """No decision changes, so other implementations can agree to 1e-9 although they round differently."""
+    rng = np.random.default_rng(1)
+
+    def changed(values):
+        return values * (1 + change * rng.uniform(-1, 1, np.shape(values)))
+
+    descent, detect = read_inputs(TRACES / name / INPUTS)
+    instruments, catalogue = descent.instruments, descent.catalogue
+    rate, force = (
+        changed(getattr(instruments.inertial, part)) for part in ("angular_rate_radps", "specific_force_mps2")
+    )
+    inertial = replace(instruments.inertial, angular_rate_radps=rate, specific_force_mps2=force)
+    instruments = replace(instruments, inertial=inertial, range_m=changed(instruments.range_m))
+    catalogue = replace(catalogue, centre_m=changed(catalogue.centre_m), radius_m=changed(catalogue.radius_m))
+    for table, rows in flown(replace(descent, instruments=instruments, catalogue=catalogue), detect).items():
+        write_table(rows, tmp_path / f"{table}.parquet")
+    compared = compare_traces(TRACES / name, tmp_path, tolerance)
+    assert not compared[-1].difference
+    assert max(each.largest for each in compared) > 0
+
+
 def test_a_recorder_changes_nothing(again):
     descent, detect = read_inputs(TRACES / "restart" / INPUTS)
     lander = lander_of(descent)
-    flown = list(fly(lander, descent.instruments, descent.frames.time_s, sightings(descent, detect, {})))
+    estimates = list(fly(lander, descent.instruments, descent.frames.time_s, sightings(descent, detect, {})))
     frames = pd.read_parquet(again / "restart/frames.parquet")
-    assert [estimate.status for estimate in flown] == frames["status"].to_list()
-    assert np.array_equal([estimate.state.position_m for estimate in flown], frames[["x_m", "y_m", "z_m"]])
-    assert [estimate.n_refused for estimate in flown] == frames["n_refused"].to_list()
+    assert [estimate.status for estimate in estimates] == frames["status"].to_list()
+    assert np.array_equal([estimate.state.position_m for estimate in estimates], frames[["x_m", "y_m", "z_m"]])
+    assert [estimate.n_refused for estimate in estimates] == frames["n_refused"].to_list()
 
 
 @pytest.fixture

@@ -71,6 +71,8 @@ class Fix:
     """Weights of the matches (K,), from 0 for outliers to 1."""
     rms_px: float
     """Root mean square distance between matched centres, per axis, pixels."""
+    start: Pose
+    """Pose from which the rounds started."""
 
 
 def refine(
@@ -137,9 +139,8 @@ def refine(
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
-    return Fix(
-        pose, covariance, sighting, in_field[expected.index[crater]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2)))
-    )
+    rms_px = float(np.sqrt(np.mean(error[:, :2] ** 2)))
+    return Fix(pose, covariance, sighting, in_field[expected.index[crater]], weight, rms_px, start)
 
 
 def _first_round(start_px: float) -> int:

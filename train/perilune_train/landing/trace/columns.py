@@ -126,6 +126,7 @@ FRAMES = Table(
         *_pose("expected", "expected pose before the frame"),
         _covariance("expected_covariance", 6, "covariance of the expected pose"),
         Column(("expected_error_px",), "px", 1.0, "standard deviation of the expected pose in the image"),
+        *_pose("start", "pose from which the rounds of the fix started; NaN without a fix"),
         *_pose("fix", "pose of the fix; NaN without a fix"),
         _covariance("fix_covariance", 6, "covariance of the fix"),
         Column(("fix_nis",), "", 1.0, "normalised innovation squared of the fix against the expected pose"),
@@ -156,7 +157,7 @@ SIGHTINGS = Table(
 )
 ROUNDS = Table(
     "rounds",
-    "one round of the fix near the expected pose; no rows where no such fix was tried",
+    "one round of a fix; after a search, of its last fit",
     ("frame", "round"),
     _pose("pose", "pose after the round"),
 )

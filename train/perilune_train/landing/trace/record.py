@@ -6,7 +6,6 @@ import pandas as pd
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, rotation_vectors
 from perilune_train.landing.craters.fix import PosePrior, refine
 from perilune_train.landing.craters.locate import (
-    NEAR_PX,
     Located,
     expected_error_px,
     ground_below_m,
@@ -84,7 +83,7 @@ class TraceRecorder:
         accepted, located = located is not None, located or locate(seen, around.catalogue, around.camera, expected)
         altitude_m = max(float(pose.position_m[2] - ground_below_m(around.catalogue, pose.position_m)), 1.0)
         error_px = expected_error_px(expected, altitude_m, around.camera)
-        self._add_rounds(number, seen, pose, error_px)
+        self._add_rounds(number, seen, located, error_px)
         fits = located is not None and _fits(located, expected)
         outcome = "no_fix" if located is None else "contradiction" if not accepted else "update" if fits else "restart"
         self._add_matches(number, seen, located, before, is_used=outcome == "update")
@@ -122,11 +121,18 @@ class TraceRecorder:
         if located is None:
             names = ["rms_px", "n_by_chance", "sigma_by_chance", "fix_nis", *covariance_names("fix_covariance", 6)]
             pose = Pose(np.full(3, np.nan), np.full((3, 3), np.nan))
-            return {**_pose("fix", pose), **dict.fromkeys(names, np.nan), "n_matched": 0, "n_agreed": 0}
+            return {
+                **_pose("start", pose),
+                **_pose("fix", pose),
+                **dict.fromkeys(names, np.nan),
+                "n_matched": 0,
+                "n_agreed": 0,
+            }
         fix = located.fix
         agreed = support(seen, around.catalogue, around.camera, fix.pose)
         innovation, spread = _innovation(located, expected)
         return {
+            **_pose("start", fix.start),
             **_pose("fix", fix.pose),
             **_triangle("fix_covariance", fix.covariance),
             "fix_nis": float(innovation @ np.linalg.solve(spread, innovation)),
@@ -137,11 +143,16 @@ class TraceRecorder:
             "sigma_by_chance": agreed.sigma_by_chance,
         }
 
-    def _add_rounds(self, number: int, seen: Sightings, pose: Pose, error_px: float) -> None:
-        """Record the rounds of the fix near the expected pose."""
+    def _add_rounds(self, number: int, seen: Sightings, located: Located | None, error_px: float) -> None:
+        """Record the rounds of a fix; after a search, these are the rounds of its last fit."""
+        if located is None:
+            return
         rounds: list[Pose] = []
-        if error_px < NEAR_PX:
-            refine(seen, self._around.catalogue, self._around.camera, weak_prior(pose), pose, error_px, rounds)
+        start, catalogue, camera = located.fix.start, self._around.catalogue, self._around.camera
+        if located.searched:
+            refine(seen, catalogue, camera, weak_prior(start), start, rounds=rounds)
+        else:
+            refine(seen, catalogue, camera, weak_prior(start), start, error_px, rounds)
         self._rows["rounds"] += [{"frame": number, "round": k, **_pose("pose", each)} for k, each in enumerate(rounds)]
 
     def _add_matches(

@@ -72,7 +72,11 @@ def write_trace(folder: Path, out: Path) -> dict[str, pd.DataFrame]:
 
 def trace_of(inputs: Path) -> dict[str, pd.DataFrame]:
     """Fly the filter over the inputs of a trace; returns the tables of the trace by name."""
-    descent, detect = read_inputs(inputs)
+    return flown(*read_inputs(inputs))
+
+
+def flown(descent: Descent, detect: Detect) -> dict[str, pd.DataFrame]:
+    """Fly the filter over a descent; returns the tables of the trace by name."""
     recorder = TraceRecorder(surroundings_of(descent))
     seen = sightings(descent, detect, {})
     for _ in fly(lander_of(descent, recorder), descent.instruments, descent.frames.time_s, seen):
