@@ -359,7 +359,9 @@ bench-suppress: setup-dev # time of non-maximum suppression of a batch, compared
 	@$(BIN)/python -m benchmarks.train.suppress
 
 # With RECORD=files, first copy these JSON files of runs or benchmarks into results/.
-traces: setup ## fly the landing filter over the inputs of the reference traces again, after a change of the filter
+# An existing environment is left unchanged: a linked one may belong to another checkout.
+traces: ## fly the landing filter over the inputs of the reference traces again, after a change of the filter
+	@test -x $(BIN)/python || $(MAKE) --no-print-directory setup
 	@$(BIN)/python -m scripts.reference_traces tables
 
 # The same settings as in docs/notebook/2026-11-28-landing.md; takes an hour on two cores.
