@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-one-light bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-one-light bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results traces trace-inputs release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -359,6 +359,25 @@ bench-suppress: setup-dev # time of non-maximum suppression of a batch, compared
 	@$(BIN)/python -m benchmarks.train.suppress
 
 # With RECORD=files, first copy these JSON files of runs or benchmarks into results/.
+# An existing environment is left unchanged: a linked one may belong to another checkout.
+traces: ## fly the landing filter over the inputs of the reference traces again, after a change of the filter
+	@test -x $(BIN)/python || $(MAKE) --no-print-directory setup
+	@$(BIN)/python -m scripts.reference_traces tables
+
+# The same settings as in docs/notebook/2026-11-28-landing.md; takes an hour on two cores.
+TRACE_DATA := --set dataset.nav.n_frames=40 --set dataset.nav.split_by=scene --set dataset.nav.val_share=0 \
+  --set dataset.nav.test_share=1 --set 'dataset.nav.flight.azimuth_deg={low: 0, high: 360}' --set 'dataset.nav.sun.elevation_deg={low: 8, high: 65}'
+trace-inputs: setup # render the descents of the reference traces from their seeds and make inputs and tables anew
+	@$(BIN)/perilune-render dataset --preset large --kind nav --config configs/highland.yaml --set dataset.name=sensors-a --set dataset.nav.n_scenes=2 \
+	  --set dataset.nav.trajectories_per_scene=2 $(TRACE_DATA) --set dataset.render.engine=heightfield \
+	  --set 'dataset.nav.instruments.inertial_grades=[cubesat,tactical,navigation]' --set dataset.nav.instruments.star_tracker_rate_hz=1 \
+	  --set 'dataset.nav.instruments.star_tracker_outages_s=[{low: 30, high: 45}]' --set dataset.nav.instruments.doppler_rate_hz=5 --out data/reference-highland
+	@test -f data/reference-relief.tif || $(BIN)/perilune-render ground --preset large --kind nav --config configs/highland.yaml \
+	  --set dataset.name=relief-a --pixel-m 5 --out data/reference-relief.tif
+	@$(BIN)/perilune-render dataset --preset large --kind nav --dem data/reference-relief.tif --set dataset.name=dem-a --set dataset.nav.n_scenes=1 \
+	  --set dataset.nav.trajectories_per_scene=2 $(TRACE_DATA) --out data/reference-relief
+	@$(BIN)/python -m scripts.reference_traces inputs
+
 results: setup ## write the headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
 	@$(if $(RECORD),$(BIN)/python scripts/results.py record $(RECORD))
 	@$(BIN)/python scripts/results.py write

@@ -91,6 +91,8 @@ USES = (
         "--frames descent/frames --camera descent/camera.yaml --catalogue descent/catalogue.parquet --imu "
         "descent/imu.csv --prior descent/prior.yaml --out flight",
     ),
+    use("perilune-train navigate trace", "--descent descent --out trace"),
+    use("perilune-train navigate check-trace", "trace trace"),
     use("perilune-train navigate benchmark", "--data nowhere", code=2),
     use("perilune-train navigate benchmark-landing", "--data nowhere", code=2),
     use("perilune-train explain", "--dataset drawn", *_TINY),

@@ -7,10 +7,11 @@ import typer
 
 from perilune_shared.config.resolve import resolve
 from perilune_shared.console.command_line import OverwriteFolder, add_renamed
-from perilune_shared.console.terminal import answer_page, say, say_page
+from perilune_shared.console.terminal import answer, answer_page, say, say_page
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.inertial_grades import GRADES
+from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.replacement import replaceable
 from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
 from perilune_train.landing.monte_carlo.scenario import SCENARIOS, Draws
@@ -405,6 +406,66 @@ def fly(
         length = (table[[f"error_{axis}_m" for axis in "xyz"]] ** 2).sum(axis=1)
         rms, end = length.mean() ** 0.5, length.iloc[-1] ** 0.5
         answer_page(f"position error: {rms:.2f} m r.m.s., {end:.2f} m at the last frame")
+
+
+@app.command("trace")
+def trace(
+    descent: Annotated[
+        Path,
+        typer.Option(
+            help="Folder that `navigate descent` has written, or the folder `inputs` of a trace. With"
+            " detections.parquet, no images are read."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="New folder for the trace.")] = Path("trace"),
+    overwrite: OverwriteFolder = False,
+) -> None:
+    """Write every input, intermediate and output of the filter over a descent, to check another implementation.
+
+    Writes inputs/ (what the filter reads, with all defaults), and the tables steps.parquet (state and covariance after
+    each propagation and update), frames.parquet, sightings.parquet, rounds.parquet, matches.parquet and
+    craters.parquet. The page "Interface control: landing filter" describes each column.
+    """
+    if not descent.is_dir():
+        raise UserError("--descent", "folder", descent, "a folder that `navigate descent` has written")
+    # torch takes seconds to load.
+    from perilune_train.landing.trace.write import write_trace
+
+    with (
+        replaceable(out, ("steps.parquet", "inputs"), overwrite=overwrite, inputs=(descent,)) as replaced,
+        new_folder(replaced) as folder,
+    ):
+        tables = write_trace(descent, folder)
+    outcomes = tables["frames"]["outcome"].value_counts().items()
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes)
+    say(f"{out}: {len(tables['steps'])} steps, {len(tables['frames'])} frames ({counts})")
+
+
+@app.command("check-trace")
+def check_trace(
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Folder that `navigate trace` has written.")],
+    other: Annotated[
+        Path, typer.Argument(metavar="TRACE", help="Folder with some or all of the tables, as Parquet or CSV.")
+    ],
+    tolerance: Annotated[
+        float, typer.Option(min=0, max=1, help="Largest accepted difference, divided by the scale of the column.")
+    ] = 1e-9,
+) -> None:
+    """Compare the trace of another implementation with a reference trace. Exit code 1 if they differ.
+
+    Prints one line per table: the largest difference, divided by the scale of its column. Stops at the first table with
+    a difference beyond the tolerance and names its first row and column.
+    """
+    # pyarrow takes a second to load.
+    from perilune_train.landing.trace.compare import compare_traces
+
+    compared = compare_traces(reference, other, tolerance)
+    for each in compared:
+        if each.difference:
+            answer(each.difference)
+            raise typer.Exit(1)
+        columns = f"{each.n_columns} of {each.of_columns} columns"
+        answer(f"{each.table}: {each.n_rows} rows, {columns}, largest difference {each.largest:.1e}")
 
 
 @app.command("descent")

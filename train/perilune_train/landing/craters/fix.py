@@ -71,6 +71,8 @@ class Fix:
     """Weights of the matches (K,), from 0 for outliers to 1."""
     rms_px: float
     """Root mean square distance between matched centres, per axis, pixels."""
+    start: Pose
+    """Pose from which the rounds started."""
 
 
 def refine(
@@ -80,11 +82,13 @@ def refine(
     prior: PosePrior,
     start: Pose,
     start_px: float = _SOFT_PX[0],
+    rounds: list[Pose] | None = None,
 ) -> Fix | None:
     """Estimate the best-fitting pose near a start; None if fewer than six sightings match.
 
     `start_px` is the standard deviation of the start's error in the image, pixels. If the start is far from the true
     pose, the result is wrong: use `vote.support` to compare the number of agreeing sightings with chance.
+    The pose after each round is appended to `rounds`, for a trace.
     """
     if not len(sightings):
         return None
@@ -110,6 +114,8 @@ def refine(
             expected.jacobian(),
         )
         pose = _stepped(pose, prior, precision, normal, gradient)
+        if rounds is not None:
+            rounds.append(pose)
     for number in range(_N_HARD):
         # In the first of these rounds, the pose still has the error of the last soft round.
         gate_px = 0.5 if number == 0 else 0.0
@@ -125,15 +131,16 @@ def refine(
             error, centre_sigma, size_sigma, gate_px, expected.jacobian(crater)
         )
         pose = _stepped(pose, prior, precision, normal, gradient)
+        if rounds is not None:
+            rounds.append(pose)
     normal += precision
     # If the assumed errors are too small for the residuals, enlarge the covariance to match the residuals.
     squares = np.sum(weight[:, None] * (error[:, :2] / centre_sigma[:, None]) ** 2)
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
-    return Fix(
-        pose, covariance, sighting, in_field[expected.index[crater]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2)))
-    )
+    rms_px = float(np.sqrt(np.mean(error[:, :2] ** 2)))
+    return Fix(pose, covariance, sighting, in_field[expected.index[crater]], weight, rms_px, start)
 
 
 def _first_round(start_px: float) -> int:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import MIN_MATCHES, Fix, PosePrior, refine
 from perilune_train.landing.craters.pair_vote import pair_candidates
@@ -22,7 +23,7 @@ from perilune_train.landing.craters.vote import (
     support,
 )
 
-_NEAR_PX = 6.0
+NEAR_PX = 6.0
 """Largest standard deviation of the expected pose, in pixels on the ground, for which no search is needed."""
 _NEAR_SIGMAS, _SEARCH_SIGMAS, _SURE_SIGMAS = 5.0, 10.0, 30.0
 """Smallest support, in standard deviations of chance: of a fix near the expected pose, of a fix by a search, and of a
@@ -71,15 +72,12 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     """
     if len(sightings) < MIN_MATCHES:
         return None
-    ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
+    ground_m = ground_below_m(catalogue, prior.pose.position_m)
     altitude_m = max(float(prior.pose.position_m[2] - ground_m), 1.0)
     sigma = np.sqrt(np.diag(prior.covariance))
-    on_ground_px = float(np.hypot(sigma[:2].max() / altitude_m, sigma[3:5].max())) * camera.fx_px
-    # Errors of altitude and heading move the edges of the image, but not its centre.
-    edge_px = float(np.hypot(sigma[2] / altitude_m, sigma[5])) * camera.width_px / 2
-    start_px = float(np.hypot(on_ground_px, edge_px))
-    if start_px < _NEAR_PX:
-        fix = refine(sightings, catalogue, camera, _around(prior.pose), prior.pose, start_px)
+    start_px = expected_error_px(prior, altitude_m, camera)
+    if start_px < NEAR_PX:
+        fix = refine(sightings, catalogue, camera, weak_prior(prior.pose), prior.pose, start_px)
         if fix is not None and support(sightings, catalogue, camera, fix.pose).sigmas >= _NEAR_SIGMAS:
             return Located(fix, searched=False)
     for sigmas, max_tried in _ATTEMPTS:
@@ -101,6 +99,20 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     return None
 
 
+def ground_below_m(catalogue: Catalogue, position_m: Array) -> float:
+    """Height of the ground, metres, that a search assumes below a position (2,) or (3,), O_L."""
+    return catalogue.ground_m(position_m, _NEAREST)
+
+
+def expected_error_px(prior: PosePrior, altitude_m: float, camera: Camera) -> float:
+    """Standard deviation, pixels, of the expected pose's error in the image at an altitude above the ground."""
+    sigma = np.sqrt(np.diag(prior.covariance))
+    on_ground_px = float(np.hypot(sigma[:2].max() / altitude_m, sigma[3:5].max())) * camera.fx_px
+    # Errors of altitude and heading move the edges of the image, but not its centre.
+    edge_px = float(np.hypot(sigma[2] / altitude_m, sigma[5])) * camera.width_px / 2
+    return float(np.hypot(on_ground_px, edge_px))
+
+
 def lost_in_space(
     sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, area: Area
 ) -> Located | None:
@@ -113,7 +125,7 @@ def lost_in_space(
     hypotheses = search(sightings, catalogue, camera, rotation_camera_from_site, area)
     fix = _best(sightings, catalogue, camera, [hypothesis.pose for hypothesis in hypotheses], _KNOWN_TILT_RAD)
     if fix is None and len(sightings) >= MIN_MATCHES:
-        ground_m = catalogue.ground_m(area.centre_m, _NEAREST)
+        ground_m = ground_below_m(catalogue, area.centre_m)
         low, high = area.altitude_m
         middle_m = float(np.sqrt(low * high))
         middle = Pose(np.array([*area.centre_m, ground_m + middle_m]), rotation_camera_from_site)
@@ -169,12 +181,12 @@ def _polished(
     frame, with a wrong tilt. Therefore the first fit has a prior on the tilt, with standard deviation `tilt_rad`. Free
     fits follow, each from the previous result, while they move the image and the support grows.
     """
-    first = refine(sightings, catalogue, camera, _around(pose, tilt_rad), pose)
+    first = refine(sightings, catalogue, camera, weak_prior(pose, tilt_rad), pose)
     best, agreed = None, Support(0, 0.0, 1.0)
     start = pose if first is None else first.pose
     ground_m = catalogue.ground_m(start.position_m, _NEAREST)
     for _ in range(_N_POLISHED):
-        fix = refine(sightings, catalogue, camera, _around(start), start)
+        fix = refine(sightings, catalogue, camera, weak_prior(start), start)
         if fix is None:
             break
         later = support(sightings, catalogue, camera, fix.pose)
@@ -211,7 +223,7 @@ def _same(first: Pose, second: Pose) -> bool:
     return float(np.linalg.norm(first.position_m - second.position_m)) < 0.1 * float(first.position_m[2])
 
 
-def _around(pose: Pose, tilt_rad: float = _WEAK_TILT_RAD) -> PosePrior:
+def weak_prior(pose: Pose, tilt_rad: float = _WEAK_TILT_RAD) -> PosePrior:
     """A prior around a pose.
 
     By default it is weak: the fix then depends on the sightings alone, and no sighting is counted twice.

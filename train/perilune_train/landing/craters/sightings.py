@@ -32,11 +32,14 @@ class Sightings:
 
     @classmethod
     def of_boxes(cls, boxes: Array, scores: Array) -> "Sightings":
-        """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius."""
+        """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius.
+
+        Sightings of equal radius keep the order of their boxes.
+        """
         scores = np.asarray(scores)
         size = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None)
         radius = np.sqrt(size.prod(axis=1)) / 2
-        order = np.argsort(-radius)
+        order = np.argsort(-radius, kind="stable")
         return cls((boxes[order, :2] + boxes[order, 2:]) / 2, radius[order], scores[order])
 
     def strongest(self, count: int = MAX_SIGHTINGS) -> "Sightings":

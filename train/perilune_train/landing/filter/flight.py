@@ -173,4 +173,5 @@ def fly_together(
 
 
 def _stretch(landers: Sequence[Lander]) -> Stretch:
-    return Stretch([lander.state for lander in landers], landers[0].noise, landers[0].surroundings.relief_m)
+    states, first = [lander.state for lander in landers], landers[0]
+    return Stretch(states, first.noise, first.surroundings.relief_m, first.recorder)

@@ -29,7 +29,7 @@ from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.measurements import camera_pose, craters_update, pose_fits
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
 from perilune_train.landing.filter.state import ATTITUDE, CAMERA, N_ERRORS, POSITION, VELOCITY, State
-from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Stretch
+from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Recorder, Stretch
 from perilune_train.landing.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
@@ -149,8 +149,15 @@ class Lander:
     the filter a smoother.
     """
 
-    def __init__(self, state: State, noise: InertialNoise, around: Surroundings, keep_poses: bool = False):
-        self.status = "coasting"
+    def __init__(
+        self,
+        state: State,
+        noise: InertialNoise,
+        around: Surroundings,
+        keep_poses: bool = False,
+        recorder: Recorder | None = None,
+    ):
+        self.status, self.recorder = "coasting", recorder
         self._keep_poses = keep_poses
         self.noise, self._around = noise, around
         self._contradiction: _Contradiction | None = None
@@ -158,6 +165,8 @@ class Lander:
         self._state, self._since = state, None
 
     status: Status
+    recorder: Recorder | None
+    """Receives every step, for a trace; None without a trace."""
     noise: InertialNoise
     """Noise of the inertial unit."""
     _since: Stretch | None
@@ -182,7 +191,7 @@ class Lander:
     @property
     def _stretch(self) -> Stretch:
         if self._since is None:
-            self._since = Stretch([self._state], self.noise, self._around.relief_m)
+            self._since = Stretch([self._state], self.noise, self._around.relief_m, self.recorder)
         return self._since
 
     def inertial(self, measured: Increments) -> None:
@@ -213,7 +222,10 @@ class Lander:
 
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the current time; returns the fix if it was accepted."""
+        before = self.state
         located = self._matched(seen)
+        if self.recorder is not None:
+            self.recorder.frame(before, seen, located, self.state, self.status)
         if self._keep_poses:
             self.state = self.state.keeping_pose()
         return located

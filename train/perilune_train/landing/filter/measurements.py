@@ -1,5 +1,7 @@
 """Measurement models of the filter: craters, and poses estimated from craters."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,7 +77,36 @@ def craters_update(
     camera: Camera,
     rotation_camera_from_body: Array,
 ) -> State:
-    """Update with the craters that a fix has matched; their horizontal offsets are parts of the state.
+    """The state after an update with the craters that a fix has matched, as `crater_innovations` compares them."""
+    measured = crater_innovations(state, fix, sightings, catalogue, camera, rotation_camera_from_body)
+    return updated(measured.state, measured.innovation_px.ravel(), measured.crossed, measured.spread)
+
+
+@dataclass(frozen=True, slots=True)
+class CraterInnovations:
+    """The sightings of N matched craters, compared with the state."""
+
+    state: State
+    """The state with the offsets of these craters and of the unmatched craters that remain in view."""
+    match: NDArray[np.integer]
+    """Indices of the matches in the fix (N,)."""
+    innovation_px: Array
+    """Sighting minus predicted centre (N, 2), pixels."""
+    crossed: Array
+    """Covariance (2 N, M) of the innovations with the error state."""
+    spread: Array
+    """Covariance (2 N, 2 N) of the innovations, with noise."""
+
+
+def crater_innovations(
+    state: State,
+    fix: Fix,
+    sightings: Sightings,
+    catalogue: Catalogue,
+    camera: Camera,
+    rotation_camera_from_body: Array,
+) -> CraterInnovations:
+    """Compare the sightings of a fix with the state's prediction, which includes the offsets of the craters.
 
     Unmatched craters in view stay in the state. If a crater that the detector missed in one frame were removed, the
     next frame would treat the crater's catalogue error as a new, independent error.
@@ -105,7 +136,7 @@ def craters_update(
     )
     by_error = by_pose @ pose_by_error[:, _ALL_SEE]
     by_error[:, :, _COMMON_SEEN] += pattern
-    innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
+    innovation_px = sightings.centre_px[sighting[seen.index]] - predicted
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
     # Height errors of the catalogue shift craters in the image radially. They are added as noise: as parts of the state
     # they made it half as large again and gave equal errors and normalised errors.
@@ -114,7 +145,7 @@ def craters_update(
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
     number = np.arange(len(noise))
     spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
-    return updated(state, innovation, crossed, spread)
+    return CraterInnovations(state, used[seen.index], innovation_px, crossed, spread)
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:

@@ -19,11 +19,14 @@ All flights of a stretch have measurements at the same times, and every operatio
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.landing.craters.locate import Located
+from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.propagate import Increments, InertialNoise, Moving, integrated
 from perilune_train.landing.filter.state import (
     ATTITUDE,
@@ -52,16 +55,33 @@ _GAP_S = 0.05
 """Shortest gap between inertial measurements that counts as missing measurements, seconds."""
 
 
+class Recorder(Protocol):
+    """Receives every step of a filter, for a trace."""
+
+    def step(self, stretch: "Stretch", kind: str, innovation: Array, spread: Array, accepted: Array) -> None:
+        """Receive a propagation or an update of F flights by n numbers, after it was applied.
+
+        `innovation` (F, n) is the measurement minus its prediction, `spread` (F, n, n) its covariance, and `accepted`
+        (F,) says which flights accepted it. Propagations have n = 0.
+        """
+
+    def frame(self, before: State, seen: Sightings, located: Located | None, after: State, status: str) -> None:
+        """Receive the states before and after a frame, its sightings, and the fix if it was accepted."""
+
+
 class Stretch:
     """F flights from one frame to the next."""
 
-    def __init__(self, states: Sequence[State], noise: InertialNoise, relief_m: float):
+    def __init__(
+        self, states: Sequence[State], noise: InertialNoise, relief_m: float, recorder: Recorder | None = None
+    ):
         """Start at the states of a frame.
 
         `relief_m` is the standard deviation, metres, of the ground's height, which is modelled as a Gauss-Markov
         process.
         """
         self._begin, self._noise, self._relief_m = list(states), noise, relief_m
+        self._recorder = recorder
         self.time_s = states[0].time_s
         self._moving = Moving(
             np.stack([state.position_m for state in states]),
@@ -120,6 +140,7 @@ class Stretch:
         kept = np.exp(-(measured.time_s[-1] - self.time_s) / GROUND_S)
         self._ground_m = kept * self._ground_m
         self._moved(float(measured.time_s[-1]), motion.change, motion.added, kept)
+        self._record("propagate")
 
     def coast(self, until_s: float) -> None:
         """Propagate without inertial measurements, at constant velocity and attitude.
@@ -133,6 +154,7 @@ class Stretch:
         speed_mps = self._noise.coast_mps2 * gap_s
         sigmas = np.repeat([speed_mps * gap_s / 2, speed_mps, self._noise.coast_radps * gap_s, 0.0, 0.0], 3)
         self._moved(until_s, change, np.diag(sigmas**2), 1.0)
+        self._record("coast")
 
     def _moved(self, time_s: float, change: Array, added: Array, kept: float) -> None:
         """Apply the transition matrix `change` and the process noise `added` of the first 15 errors.
@@ -160,7 +182,8 @@ class Stretch:
         by_error = np.zeros((len(cosine), len(CORE)))
         by_error[:, 2], by_error[:, _HEIGHT] = 1 / cosine, -1 / cosine
         by_error[:, ATTITUDE] = (height_m / cosine**2)[:, None] * np.cross(beam_in_body, rotation[:, 2])
-        return self._update(range_m - height_m / cosine, by_error, sigma_m, points_down)
+        kind = "range" if beam_in_body is DOWN else "beam_range"
+        return self._update(kind, range_m - height_m / cosine, by_error, sigma_m, points_down)
 
     def line_speed(self, speed_mps: float, sigma_mps: float, beam_in_body: Array) -> NDArray[np.bool_]:
         """Update by the speed over ground along a beam; returns whether each flight accepted the speed (F,).
@@ -171,7 +194,7 @@ class Stretch:
         in_body = (velocity[:, None] @ rotation)[:, 0]
         by_error = np.zeros((len(rotation), len(CORE)))
         by_error[:, VELOCITY], by_error[:, ATTITUDE] = rotation @ beam_in_body, np.cross(beam_in_body, in_body)
-        return self._update(speed_mps - in_body @ beam_in_body, by_error, sigma_mps)
+        return self._update("beam_speed", speed_mps - in_body @ beam_in_body, by_error, sigma_mps)
 
     def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
         """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
@@ -182,7 +205,7 @@ class Stretch:
         if not np.isfinite(rotation_site_from_body).all():
             return np.zeros(len(self._covariance), bool)
         spread = self._covariance[:, ATTITUDE, ATTITUDE] + np.diag(sigmas_rad**2)
-        turn = self._turn_to(rotation_site_from_body)
+        turn = innovation = self._turn_to(rotation_site_from_body)
         # Rotation vectors are unreliable near half a turn. Refuse turns above 90 degrees: their trace is below 1.
         is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
         accepted = is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
@@ -193,6 +216,7 @@ class Stretch:
             turn = self._turn_to(rotation_site_from_body)
             self._apply(turn[:, axis], by_error, float(sigma_rad), accepted)
         self.n_refused += ~accepted
+        self._record("attitude", innovation, spread, accepted)
         return accepted
 
     def _turn_to(self, rotation_site_from_body: Array) -> Array:
@@ -200,14 +224,25 @@ class Stretch:
         return rotation_vectors(np.swapaxes(self._moving.rotation_site_from_body, 1, 2) @ rotation_site_from_body)
 
     def _update(
-        self, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
+        self, kind: str, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
     ) -> NDArray[np.bool_]:
         """Update the flights in which one number passes the gate; returns whether it passes (F,)."""
         spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
         accepted = (innovation**2 / spread <= gate(1)) & is_possible
         self._apply(innovation, by_error, sigma, accepted)
         self.n_refused += ~accepted
+        self._record(kind, innovation[:, None], spread[:, None, None], accepted)
         return accepted
+
+    def _record(
+        self, kind: str, innovation: Array | None = None, spread: Array | None = None, accepted: Array | None = None
+    ) -> None:
+        """Report a step to the recorder, if there is one."""
+        if self._recorder is not None:
+            n = len(self._begin)
+            innovation = np.zeros((n, 0)) if innovation is None else innovation
+            spread = np.zeros((n, 0, 0)) if spread is None else spread
+            self._recorder.step(self, kind, innovation, spread, np.ones(n, bool) if accepted is None else accepted)
 
     def _apply(self, innovation: Array, by_error: Array, sigma: float, accepted: NDArray[np.bool_]) -> None:
         """Update the flights that accept one number.

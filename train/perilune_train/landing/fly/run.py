@@ -20,6 +20,7 @@ from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
 from perilune_train.landing.filter.lander import Lander, Surroundings
 from perilune_train.landing.filter.state import ATTITUDE, MOUNTING, N_ERRORS, POSITION, State
+from perilune_train.landing.filter.stretch import Recorder
 from perilune_train.landing.fly.catalogue import read_catalogue
 from perilune_train.landing.fly.clocks import check_clocks
 from perilune_train.landing.fly.detections import Detect, UnreadableFrame
@@ -116,8 +117,8 @@ def fly_descent(
     rows: list[dict[str, object]] = []
     faults: dict[int, str] = {}
     with contextlib.nullcontext() if out is None else new_folder(out) as folder:
-        lander = _lander(descent)
-        seen = _sightings(descent, detect, faults)
+        lander = lander_of(descent)
+        seen = sightings(descent, detect, faults)
         mounting = np.array(descent.camera.rotation_camera_from_body)
         for estimate in fly(lander, descent.instruments, descent.frames.time_s, seen):
             row = _row(estimate, descent.frames, mounting, faults.get(estimate.frame, ""))
@@ -150,15 +151,19 @@ def _start(descent: Descent) -> State:
     return replace(descent.prior.state(mounting), time_s=float(descent.frames.time_s[0]))
 
 
-def _lander(descent: Descent) -> Lander:
+def surroundings_of(descent: Descent) -> Surroundings:
+    """Camera, catalogue and ground of a descent; the camera is the pinhole that covers the view."""
     mounting, prior = np.array(descent.camera.rotation_camera_from_body), descent.prior
-    state = _start(descent)
     camera = descent.camera.intrinsics().covering_pinhole()
-    around = Surroundings(camera, mounting, descent.catalogue, prior.range_sigma_m, prior.relief_m)
-    return Lander(state, prior.noise, around)
+    return Surroundings(camera, mounting, descent.catalogue, prior.range_sigma_m, prior.relief_m)
 
 
-def _sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
+def lander_of(descent: Descent, recorder: Recorder | None = None) -> Lander:
+    """The filter at the first frame of a descent; `recorder` receives its steps."""
+    return Lander(_start(descent), descent.prior.noise, surroundings_of(descent), recorder=recorder)
+
+
+def sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
     """Yield the craters of each frame.
 
     An unreadable frame has no craters, and `faults` receives the error message under the number of the frame.

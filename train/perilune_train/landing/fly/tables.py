@@ -68,7 +68,7 @@ def read_frame_files(folder: Path, camera: Camera) -> FrameFiles:
         column, time_s = _FILE, nanoseconds_as_seconds(table)
     else:
         table = read_table(path, FRAMES, {"file": "text", "time_s": "number"})
-        column, time_s = "file", _increasing(table)
+        column, time_s = "file", increasing(table)
     if not table.n_rows:
         raise UserError(path, "rows", 0, "one row for each frame")
     paths = []
@@ -108,7 +108,7 @@ def read_instruments(files: InstrumentFiles, star_sigmas_rad: Array, lidar: Lida
     range_time_s, range_m = np.zeros(0), np.zeros(0)
     if files.ranges is not None:
         lengths = read_table(files.ranges, RANGES, dict.fromkeys(RANGE_COLUMNS, "number"))
-        range_time_s, range_m = _increasing(lengths), lengths.numbers("range_m")
+        range_time_s, range_m = increasing(lengths), lengths.numbers("range_m")
     stars = None if files.star_tracker is None else _read_star_tracker(files.star_tracker, star_sigmas_rad)
     beams = None if files.doppler_lidar is None else _read_doppler_lidar(files.doppler_lidar, lidar)
     return Instruments(inertial, range_time_s, range_m, stars, beams)
@@ -119,7 +119,7 @@ _NO_INERTIAL = Increments(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((
 
 def _read_star_tracker(path: Path, sigmas_rad: Array) -> StarTracker:
     table = read_table(path, ATTITUDES, dict.fromkeys(STAR_TRACKER_COLUMNS, "number"))
-    time_s = _increasing(table)
+    time_s = increasing(table)
     quaternions = np.column_stack([table.numbers(name) for name in STAR_TRACKER_COLUMNS[1:]])
     length = np.linalg.norm(quaternions, axis=1)
     is_missing = np.isnan(quaternions).any(axis=1)
@@ -131,7 +131,7 @@ def _read_star_tracker(path: Path, sigmas_rad: Array) -> StarTracker:
 
 def _read_doppler_lidar(path: Path, errors: LidarErrors) -> DopplerLidar:
     table = read_table(path, BEAMS, dict.fromkeys(DOPPLER_LIDAR_COLUMNS, "number"))
-    time_s = _increasing(table, strictly=False)
+    time_s = increasing(table, strictly=False)
     directions = np.column_stack([table.finite(name, -1, 1) for name in BEAM_DIRECTION])
     table.check(
         BEAM_DIRECTION[2],
@@ -192,7 +192,7 @@ def _read_inertial(path: Path) -> Increments:
     table = read_table(path, INERTIAL, dict.fromkeys(INERTIAL_COLUMNS, "number"))
     if not table.n_rows:
         raise UserError(path, "rows", 0, "one row for each measurement")
-    end_s, interval_s = _increasing(table), table.finite("interval_s")
+    end_s, interval_s = increasing(table), table.finite("interval_s")
     table.check("interval_s", (interval_s > 0) & (interval_s <= 1), "above 0, at most 1 s")
     _check_steps(table, end_s, interval_s)
     rates, forces = (np.column_stack([table.numbers(name) for name in names]) for names in (RATES, FORCES))
@@ -225,7 +225,7 @@ def nanoseconds_as_seconds(table: Columns) -> Array:
     return time_ns / 1e9
 
 
-def _increasing(table: Columns, strictly: bool = True) -> Array:
+def increasing(table: Columns, strictly: bool = True) -> Array:
     """Times in seconds. Raises UserError if they decrease or cannot be seconds.
 
     If `strictly`, also raises UserError if they repeat.

@@ -1,0 +1,1 @@
+"""A trace of the filter: every input, intermediate and output, to check other implementations."""
