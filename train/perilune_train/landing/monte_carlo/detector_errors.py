@@ -59,11 +59,7 @@ class DetectorErrors:
     """Standard deviations of the errors of matched detections."""
 
     common_px: tuple[float, ...]
-    """Five coefficients of the shared image error, constant over a descent, pixels."""
-    common_change_px: tuple[float, ...]
-    """Changes of these coefficients from frame to frame around their mean, pixels."""
-    common_correlation: float
-    """Correlation of the changes in consecutive frames."""
+    """Five coefficients of the shared image error, constant over a descent, pixels: root mean square over descents."""
     static_share: float
     """Error of a centre that repeats in every frame, on each axis, divided by the radius."""
     noise_factor: float
@@ -86,7 +82,7 @@ def measured_errors(descents: Sequence[tuple[SeenDescent, list[FrameMatches]]], 
     Errors that repeat are measured by the products of the errors of a crater in consecutive frames, and the other
     errors by their differences. `source` names the dataset. Raises UserError if too few detections match.
     """
-    means, changes, lagged, pairs = [], [], [], []
+    means, pairs = [], []
     for descent, matches in descents:
         common, before = [], None
         for sightings, match in zip(descent.sightings, matches, strict=True):
@@ -100,8 +96,6 @@ def measured_errors(descents: Sequence[tuple[SeenDescent, list[FrameMatches]]], 
             before = now
         if common:
             means.append(np.mean(common, axis=0))
-            changes.append(np.array(common) - means[-1])
-            lagged.append((changes[-1][1:] * changes[-1][:-1]).sum(axis=0))
     joined = np.concatenate([np.zeros((0, 8)), *pairs])
     if len(joined) < _MIN_PAIRS:
         raise UserError(
@@ -111,11 +105,8 @@ def measured_errors(descents: Sequence[tuple[SeenDescent, list[FrameMatches]]], 
     size_bias = float(np.mean(joined[:, [2, 5]]))
     repeated = np.mean(first[:, :2] * second[:, :2])
     noise = np.mean((first[:, :2] - second[:, :2]) ** 2 / (sigma**2).sum(axis=1, keepdims=True))
-    changed = np.concatenate(changes)
     return DetectorErrors(
         tuple(np.sqrt(np.mean(np.square(means), axis=0)).tolist()),
-        tuple(changed.std(axis=0).tolist()),
-        float(np.clip(np.mean(np.sum(lagged, axis=0) / np.maximum((changed**2).sum(axis=0), 1e-12)), 0, 0.99)),
         float(np.sqrt(max(repeated, 0.0))),
         float(np.sqrt(noise)),
         size_bias,
@@ -167,7 +158,7 @@ def drawn_sightings(
     common = np.array(errors.common_px) * rng.normal(size=5)
     static = errors.static_share * rng.normal(size=(n_craters, 2))
     size = errors.size_bias + errors.size_static * rng.normal(size=n_craters)
-    kept, change, found = errors.common_correlation, np.array(errors.common_change_px) * rng.normal(size=5), []
+    found = []
     for sightings, match in zip(descent.sightings, matches, strict=True):
         pattern = common_pattern(descent.camera.rays(match.centre_px)[:, :2])
         noise_px = (
@@ -175,11 +166,10 @@ def drawn_sightings(
         )
         centre, radius = sightings.centre_px.copy(), sightings.radius_px.copy()
         centre[match.sighting] = (
-            match.centre_px + pattern @ (common + change) + match.radius_px[:, None] * static[match.crater] + noise_px
+            match.centre_px + pattern @ common + match.radius_px[:, None] * static[match.crater] + noise_px
         )
         noise = errors.size_noise * rng.normal(size=len(match.crater))
         radius[match.sighting] = match.radius_px * np.exp(size[match.crater] + noise)
         order = np.argsort(-radius, kind="stable")
         found.append(Sightings(centre[order], radius[order], sightings.score[order]))
-        change = kept * change + np.sqrt(1 - kept**2) * np.array(errors.common_change_px) * rng.normal(size=5)
     return found
