@@ -9,6 +9,7 @@ flight. Writes runs/bench/monte_carlo.json.
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,9 +20,10 @@ import typer
 from benchmarks.figures import write_figures
 from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.dataset.manifest import open_single
-from perilune_train.landing.methods.flights import default_sigmas, mounting_of
-from perilune_train.landing.monte_carlo.fly_draws import GRADE, Job, all_draws, sites_of
+from perilune_train.landing.methods.flights import mounting_of
+from perilune_train.landing.monte_carlo.fly_draws import Job, all_draws, sites_of
 from perilune_train.landing.monte_carlo.page import run_summary
+from perilune_train.landing.monte_carlo.scenario import Draws
 from perilune_train.shipped.models import shipped_run
 
 _TIMED_DRAWS = 20
@@ -37,14 +39,15 @@ def main(
     """Fly all draws and write the times."""
     opened = open_single(str(dataset))
     sites = sites_of(opened, split, shipped_run("detect"), str(dataset))
-    job = Job(sites, mounting_of(opened), default_sigmas(GRADE, 0.5), "nominal", 0)
+    job = Job(sites, mounting_of(opened), Draws(count=draws))
+    few = replace(job, draws=Draws(count=min(draws, _TIMED_DRAWS)))
     began = os.getloadavg()[0]
     begun = time.perf_counter()
-    rows = pd.concat(all_draws(job, draws, workers), ignore_index=True)
+    rows = pd.concat(all_draws(job, workers), ignore_index=True)
     seconds = time.perf_counter() - begun
     torch.set_num_threads(1)
     begun = time.process_time()
-    all_draws(job, min(draws, _TIMED_DRAWS), 1)
+    all_draws(few, 1)
     processor_s = time.process_time() - begun
     flights = draws * len(sites)
     figures = {
@@ -53,7 +56,7 @@ def main(
         "workers": workers,
         "wall_s": seconds,
         "minutes_of_1200_flights": seconds / flights * 1200 / 60,
-        "processor_s_per_flight": processor_s / (min(draws, _TIMED_DRAWS) * len(sites)),
+        "processor_s_per_flight": processor_s / (few.draws.count * len(sites)),
         "load_before": began,
         **{key: value for key, value in run_summary(rows).items() if value == value},
     }

@@ -4,7 +4,7 @@ Each axis has white noise, and a bias that starts at a random value and follows 
 scale factors and misaligned axes, which filters neglect. Quantisation is not simulated.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 InertialGrade = Literal["cubesat", "tactical", "navigation"]
@@ -47,3 +47,5 @@ Multisensor Integrated Navigation Systems, 2nd edition, 2013, section 4.4). The 
 minute a bias changes by about an eighth of its size. The errors of `cubesat` are our own choice for small
 micromechanical units: about three times as large as those of `tactical`, with scale factors and misalignments that
 such units have after calibration at the factory."""
+CALIBRATED = replace(GRADES["tactical"], gyro_bias_deg_per_h=0.5, gyro_bias_walk_deg_per_h=0.5)
+"""Inertial unit of a lander with a star tracker: tactical, with the gyroscope's bias calibrated before the descent."""

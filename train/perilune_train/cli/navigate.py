@@ -14,7 +14,7 @@ from perilune_shared.geometry.inertial_grades import GRADES
 from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.replacement import replaceable
 from perilune_train.cli.options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
-from perilune_train.landing.monte_carlo.scenario import SCENARIOS, Draws
+from perilune_train.landing.monte_carlo.scenario import ALTIMETERS, DETECTIONS, SCENARIOS, UNITS, Draws, Sensors
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.shipped.models import shipped_run
 
@@ -288,29 +288,77 @@ def monte_carlo(
         typer.Option(min=0.001, max=10, help="Standard deviation of the initial attitude error on each axis, degrees."),
     ] = 0.5,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of all draws.")] = 0,
+    first_draw: Annotated[
+        int, typer.Option(min=0, help="Number of the first draw, to repeat single draws or to add further draws.")
+    ] = 0,
+    imu: Annotated[str, typer.Option(help="Inertial unit: " + ", ".join(UNITS) + ".")] = "tactical",
+    scale_ppm: Annotated[
+        float | None,
+        typer.Option(
+            min=0, max=100_000, help="Standard deviation of its scale factors, millionths. [default: of the unit]"
+        ),
+    ] = None,
+    misalignment_arcsec: Annotated[
+        float | None,
+        typer.Option(
+            min=0, max=100_000, help="Standard deviation of its misalignments, seconds of arc. [default: of the unit]"
+        ),
+    ] = None,
+    altimeter: Annotated[str, typer.Option(help="Ranges: " + ", ".join(ALTIMETERS) + ".")] = "drawn",
+    star_tracker_hz: Annotated[
+        float, typer.Option(min=0, max=100, help="Attitudes of a star tracker per second; 0: no star tracker.")
+    ] = 0.0,
+    doppler_hz: Annotated[
+        float, typer.Option(min=0, max=100, help="Speeds of a Doppler lidar per second and beam; 0: no Doppler lidar.")
+    ] = 0.0,
+    detections: Annotated[str, typer.Option(help="Errors of detections: " + ", ".join(DETECTIONS) + ".")] = "recorded",
+    star_tracker_outage_s: Annotated[
+        float, typer.Option(min=0, max=1e5, help="Seconds without star tracker, at a random time.")
+    ] = 0.0,
+    altimeter_outage_s: Annotated[
+        float, typer.Option(min=0, max=1e5, help="Seconds without ranges, at a random time.")
+    ] = 0.0,
+    detections_outage_s: Annotated[
+        float, typer.Option(min=0, max=1e5, help="Seconds without detections, at a random time.")
+    ] = 0.0,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes. [default: one per core]")] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/monte-carlo"),
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Run the filter on each descent with random initial states, catalogues and inertial errors.
+    """Run the filter on each descent with random initial states, catalogues and sensor errors.
 
-    The detector runs once on every frame; all draws use its detections. Writes monte_carlo.md (table and pictures),
-    draws.parquet (one row per draw and frame), errors.png and consistency.png.
+    The detector runs once on every frame. Writes monte_carlo.md (tables and pictures), draws.parquet (one row per draw
+    and frame), consistency.parquet (one row per frame), consistency.json (one object per descent), errors.png,
+    consistency.png, ellipses.png and miss.png; with --detections drawn also detector_errors.json.
     """
     if split not in SPLITS:
         raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     if scenario not in SCENARIOS:
         raise UserError("--scenario", "", scenario, "one of " + ", ".join(SCENARIOS))
+    if imu not in UNITS:
+        raise UserError("--imu", "", imu, "one of " + ", ".join(UNITS))
+    if altimeter not in ALTIMETERS:
+        raise UserError("--altimeter", "", altimeter, "one of " + ", ".join(ALTIMETERS))
+    if detections not in DETECTIONS:
+        raise UserError("--detections", "", detections, "one of " + ", ".join(DETECTIONS))
+    if star_tracker_outage_s and not star_tracker_hz:
+        raise UserError("--star-tracker-outage-s", "", star_tracker_outage_s, "a star tracker (--star-tracker-hz)")
+    if altimeter_outage_s and altimeter == "none":
+        raise UserError("--altimeter-outage-s", "", altimeter_outage_s, "an altimeter (--altimeter drawn)")
     # torch takes seconds to load.
     from perilune_train.landing.monte_carlo.fly_draws import PAGE, fly_draws
     from perilune_train.records.provenance import EvaluatedSplit
 
     network = detector or shipped_run("detect")
-    drawn = Draws(scenario, draws, attitude_deg, seed)
+    sensors = Sensors(
+        imu, scale_ppm, misalignment_arcsec, altimeter, star_tracker_hz, doppler_hz,
+        star_tracker_outage_s, altimeter_outage_s, detections_outage_s,
+    )  # fmt: skip
+    drawn = Draws(scenario, draws, attitude_deg, seed, first_draw, sensors, detections)
     with replaceable(out, (PAGE, "draws.parquet"), overwrite=overwrite, inputs=(dataset, network)) as folder:
         fly_draws(EvaluatedSplit(dataset, split, allow_overlap), network, folder, drawn, workers)
-    say(f"{out / PAGE}: table and pictures; draws.parquet")
+    say(f"{out / PAGE}: tables and pictures; draws.parquet, consistency.parquet, consistency.json")
 
 
 @app.command("map")

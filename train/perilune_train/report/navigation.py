@@ -51,7 +51,8 @@ _LANDING_COLUMNS = {
 }
 _LANDING_PICTURES = {
     "errors.png": "Position errors over all draws: 50, 95 and 100 % quantiles, and the median of three stated sigmas.",
-    "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is correct.",
+    "consistency.png": "Mean normalised error squared over the draws of a descent, 6 if the covariance is correct, and"
+    " normalised innovation squared per part, by altitude.",
 }
 _METHOD_COLUMNS = {
     "kind": "kind",

@@ -13,7 +13,7 @@ from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GR
 from perilune_train.landing.craters.catalogue import CatalogueErrors, with_errors
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import STATIC_SHARE, Sightings
-from perilune_train.landing.filter.flight import Instruments, fly, fly_together, together
+from perilune_train.landing.filter.flight import DopplerLidar, Instruments, StarTracker, fly, fly_together, together
 from perilune_train.landing.filter.lander import Beam, Lander, LidarErrors, Surroundings
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
 from perilune_train.landing.filter.state import EXACT_CAMERA, N_ERRORS, CameraErrors, State
@@ -292,19 +292,38 @@ def test_the_smoother_keeps_all_frames_and_ends_where_the_filter_ends():
 
 
 def test_flights_together_are_those_one_by_one():
-    """Measurements of three flights at the same times, with a gap, a missed range and a missing measurement."""
+    """Measurements of three flights at the same times, with a gap; each flight misses others."""
     time_s, rng = 0.05 * np.arange(1, 101), np.random.default_rng(0)
     time_s = time_s[(time_s < 2.02) | (time_s > 2.53)]
     rate, force = 0.01 * rng.normal(size=(3, len(time_s), 3)), 0.02 * rng.normal(size=(3, len(time_s), 3))
     rate[:, 7] = np.nan
     force[..., 2] += 1.62
     frames, ranges = np.arange(5.0), np.arange(0.1, 5, 0.2)
-    range_m = 1400 - 35 * ranges + rng.normal(size=len(ranges))
-    range_m[3] = np.nan
+    range_m = 1400 - 35 * ranges + rng.normal(size=(3, len(ranges)))
+    range_m[0, 3] = range_m[1, 5:9] = np.nan
+    attitudes = np.array([[matrix_from_rotation_vector(1e-4 * rng.normal(size=3)) for _ in frames] for _ in range(3)])
+    attitudes[1, 2:] = np.nan
+    direction = np.array([0.38, 0, -0.925]) / np.hypot(0.38, 0.925)
+    speeds, slants = VELOCITY_MPS @ direction + 0.02 * rng.normal(size=(3, 5)), (1400 - 35 * frames) / 0.925 + 0.0
+    speeds[2, 1:3] = np.nan
+    lidars = [
+        DopplerLidar(
+            frames + 0.5,
+            [Beam(direction, speed, slant - 17.5 if k else np.nan) for speed, slant in zip(own, slants, strict=True)],
+            LidarErrors(0.02, 2.0, 1.0),
+        )
+        for k, own in enumerate(speeds.tolist())
+    ]
     inertial = Increments(time_s, np.full(len(time_s), 0.05), rate, force)
     alone = [
-        Instruments(dataclasses.replace(inertial, angular_rate_radps=one, specific_force_mps2=other), ranges, range_m)
-        for one, other in zip(rate, force, strict=True)
+        Instruments(
+            dataclasses.replace(inertial, angular_rate_radps=rate[k], specific_force_mps2=force[k]),
+            ranges,
+            range_m[k],
+            StarTracker(frames, attitudes[k], np.full(3, 1e-4)),
+            lidars[k],
+        )
+        for k in range(3)
     ]
     seen = [
         [
@@ -321,6 +340,8 @@ def test_flights_together_are_those_one_by_one():
         for k, estimate in enumerate(estimates):
             expected = flown[k][number]
             assert (estimate.status, estimate.frame) == (expected.status, number)
+            assert estimate.n_refused == expected.n_refused
+            assert estimate.state.n_innovations == expected.state.n_innovations
             np.testing.assert_allclose(estimate.state.position_m, expected.state.position_m, atol=1e-7)
             np.testing.assert_allclose(estimate.state.covariance, expected.state.covariance, rtol=1e-5, atol=1e-9)
     assert "tracking" in {one.status for one in found[-1]}

@@ -28,7 +28,7 @@ class StarTracker:
     time_s: Array
     """Times (n,), seconds since the first frame."""
     rotation_body_from_site: Array
-    """Attitudes (n, 3, 3); NaN where the tracker saw no stars."""
+    """Attitudes (n, 3, 3), or (F, n, 3, 3) for F flights; NaN where the tracker saw no stars."""
     sigmas_rad: Array
     """Standard deviations (3,) about the body's axes, radians."""
 
@@ -54,7 +54,8 @@ class Instruments:
     range_time_s: Array
     """Times of the ranges (n,), seconds since the first frame."""
     range_m: Array
-    """Distances to the ground along -Z_B (n,), metres; NaN where the altimeter measured no distance."""
+    """Distances to the ground along -Z_B (n,), or (F, n) for F flights, metres; NaN where the altimeter measured no
+    distance."""
     star_tracker: StarTracker | None = None
     """Attitudes of a star tracker; None without a star tracker."""
     doppler_lidar: DopplerLidar | None = None
@@ -81,14 +82,31 @@ def _vectors(column: pd.Series, length: int) -> Array:
 
 
 def together(flights: Sequence[Instruments]) -> Instruments:
-    """Combine the inertial measurements of F flights.
-
-    Times and all other measurements are taken from the first flight.
-    """
+    """Combine the measurements of F flights, which have equal times. Beams have equal directions."""
     inertial = [flight.inertial for flight in flights]
     rate = np.stack([measured.angular_rate_radps for measured in inertial])
     force = np.stack([measured.specific_force_mps2 for measured in inertial])
-    return replace(flights[0], inertial=replace(inertial[0], angular_rate_radps=rate, specific_force_mps2=force))
+    first = flights[0]
+    stars, lidar = first.star_tracker, first.doppler_lidar
+    if stars is not None:
+        attitudes = [flight.star_tracker.rotation_body_from_site for flight in flights if flight.star_tracker]
+        stars = replace(stars, rotation_body_from_site=np.stack(attitudes))
+    if lidar is not None:
+        beams = zip(*(flight.doppler_lidar.beams for flight in flights if flight.doppler_lidar), strict=True)
+        lidar = replace(lidar, beams=[_joined(of_flights) for of_flights in beams])
+    return Instruments(
+        replace(inertial[0], angular_rate_radps=rate, specific_force_mps2=force),
+        first.range_time_s,
+        np.stack([flight.range_m for flight in flights]),
+        stars,
+        lidar,
+    )
+
+
+def _joined(beams: Sequence[Beam]) -> Beam:
+    """The measurements of one beam in F flights."""
+    speeds, ranges = ([getattr(beam, name) for beam in beams] for name in ("speed_mps", "range_m"))
+    return Beam(beams[0].direction_in_body, np.array(speeds), np.array(ranges))
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +181,12 @@ def fly_together(
             yield estimates
             stretch = _stretch(landers)
         elif kind[k] == _RANGE:
-            range_update(stretch, float(instruments.range_m[number[k]]), surroundings)
+            range_update(stretch, instruments.range_m[..., number[k]], surroundings)
         elif kind[k] == _BEAM and lidar is not None:
             beam_update(stretch, lidar.beams[number[k]], lidar.errors, surroundings)
         elif stars is not None:
-            stretch.attitude(stars.rotation_body_from_site[number[k]].T, stars.sigmas_rad)
+            rotation_body_from_site = stars.rotation_body_from_site[..., number[k], :, :]
+            stretch.attitude(np.swapaxes(rotation_body_from_site, -1, -2), stars.sigmas_rad)
     for lander, state in zip(landers, stretch.states(), strict=True):
         lander.state = state
 

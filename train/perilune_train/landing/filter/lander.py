@@ -61,26 +61,29 @@ class Surroundings:
     """Standard deviation of the ground's height relative to the nearest craters, metres."""
 
 
-def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
+def range_update(stretch: Stretch, range_m: float | Array, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
     """Update flights by one range at the current time; returns whether each flight accepted it (F,).
 
-    A range that is not a positive, finite length is refused.
+    `range_m` is one range for all flights, or one for each (F,). A range that is not a positive, finite length is
+    refused.
     """
     return _range_along(stretch, range_m, surroundings, surroundings[0].range_sigma_m, DOWN)
 
 
 def _range_along(
-    stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings], sigma_m: float, beam_in_body: Array
+    stretch: Stretch, range_m: float | Array, surroundings: Sequence[Surroundings], sigma_m: float, beam_in_body: Array
 ) -> NDArray[np.bool_]:
-    if not (np.isfinite(range_m) and range_m > 0):
-        return np.zeros(len(surroundings), bool)
+    length_m = np.broadcast_to(np.asarray(range_m, float), len(surroundings))
+    usable = np.isfinite(length_m) & (length_m > 0)
+    if not usable.any():
+        return usable
     ends = stretch.position_m
     if beam_in_body is not DOWN:
-        ends = ends + range_m * (stretch.rotation_site_from_body @ beam_in_body)
+        ends = ends + np.where(usable, length_m, 0.0)[:, None] * (stretch.rotation_site_from_body @ beam_in_body)
     ground_m = np.array(
         [local.catalogue.ground_m(end, _NEAREST) for end, local in zip(ends, surroundings, strict=True)]
     )
-    return stretch.range(range_m, ground_m, sigma_m, beam_in_body)
+    return stretch.range(np.where(usable, length_m, np.nan), ground_m, sigma_m, beam_in_body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +92,12 @@ class Beam:
 
     direction_in_body: Array
     """Unit vector (3,), O_B, from the lander towards the ground."""
-    speed_mps: float
-    """Speed over ground along the beam, positive towards the ground, metres per second; NaN if it is missing."""
-    range_m: float
-    """Distance to the ground along the beam, metres; NaN if it is missing."""
+    speed_mps: float | Array
+    """Speed over ground along the beam, positive towards the ground, metres per second; NaN if it is missing. An array
+    (F,) holds one speed for each of F flights."""
+    range_m: float | Array
+    """Distance to the ground along the beam, metres; NaN if it is missing. An array (F,) holds one distance for each of
+    F flights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +125,7 @@ def beam_update(stretch: Stretch, beam: Beam, errors: LidarErrors, surroundings:
     """Update flights by the range and the speed along a beam; missing values are ignored."""
     sigma_m = errors.range_deviation_m(surroundings[0].relief_m)
     _range_along(stretch, beam.range_m, surroundings, sigma_m, beam.direction_in_body)
-    if np.isfinite(beam.speed_mps):
+    if np.isfinite(beam.speed_mps).any():
         stretch.line_speed(beam.speed_mps, errors.speed_sigma_mps, beam.direction_in_body)
 
 

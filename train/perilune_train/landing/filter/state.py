@@ -108,6 +108,10 @@ class State:
     """Estimated time of exposure after a frame's time tag, seconds."""
     angular_rate_radps: Array = field(default_factory=lambda: np.zeros(3))
     """Last measured angular rate (3,), O_B, without the estimated bias."""
+    innovation_squared: float = float("nan")
+    """Normalised innovation squared of the update that gave this state; NaN if the state has changed since."""
+    n_innovations: int = 0
+    """Number of independent parts of this innovation."""
 
     @classmethod
     def starting(

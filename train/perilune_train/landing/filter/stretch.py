@@ -168,12 +168,15 @@ class Stretch:
         self._change = whole @ self._change
         self.time_s = time_s
 
-    def range(self, range_m: float, ground_m: Array, sigma_m: float, beam_in_body: Array = DOWN) -> NDArray[np.bool_]:
+    def range(
+        self, range_m: float | Array, ground_m: Array, sigma_m: float, beam_in_body: Array = DOWN
+    ) -> NDArray[np.bool_]:
         """Update by a range to the ground along a beam; returns whether each flight accepted the range (F,).
 
-        `beam_in_body` (3,) is the beam's direction. `ground_m` (F,) are the heights of the ground at the craters
-        nearest to the beam's end; `sigma_m` is the standard deviation of the range, metres. A flight whose beam does
-        not point down refuses the range.
+        `range_m` is one range for all flights, or one for each (F,); NaN where it is missing. `beam_in_body` (3,) is
+        the beam's direction. `ground_m` (F,) are the heights of the ground at the craters nearest to the beam's end;
+        `sigma_m` is the standard deviation of the range, metres. A flight whose beam does not point down refuses the
+        range.
         """
         rotation, height_m = self._moving.rotation_site_from_body, self.position_m[:, 2] - ground_m - self._ground_m
         cosine = -(rotation[:, 2] @ beam_in_body)
@@ -185,10 +188,11 @@ class Stretch:
         kind = "range" if beam_in_body is DOWN else "beam_range"
         return self._update(kind, range_m - height_m / cosine, by_error, sigma_m, points_down)
 
-    def line_speed(self, speed_mps: float, sigma_mps: float, beam_in_body: Array) -> NDArray[np.bool_]:
+    def line_speed(self, speed_mps: float | Array, sigma_mps: float, beam_in_body: Array) -> NDArray[np.bool_]:
         """Update by the speed over ground along a beam; returns whether each flight accepted the speed (F,).
 
-        The speed is the component of the velocity along `beam_in_body` (3,), positive towards the beam's end.
+        The speed is the component of the velocity along `beam_in_body` (3,), positive towards the beam's end; one for
+        all flights, or one for each (F,); NaN where it is missing.
         """
         rotation, velocity = self._moving.rotation_site_from_body, self._moving.velocity_mps
         in_body = (velocity[:, None] @ rotation)[:, 0]
@@ -197,41 +201,52 @@ class Stretch:
         return self._update("beam_speed", speed_mps - in_body @ beam_in_body, by_error, sigma_mps)
 
     def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
-        """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
+        """Update by a measured attitude; returns whether each flight accepted the attitude (F,).
 
-        `sigmas_rad` (3,) are the standard deviations about the body's axes, radians. An attitude that is not finite is
-        ignored.
+        The attitude is one for all flights (3, 3), or one for each (F, 3, 3). `sigmas_rad` (3,) are the standard
+        deviations about the body's axes, radians. An attitude that is not finite is ignored.
         """
-        if not np.isfinite(rotation_site_from_body).all():
-            return np.zeros(len(self._covariance), bool)
+        own = self._moving.rotation_site_from_body
+        measured = np.broadcast_to(np.isfinite(rotation_site_from_body).all(axis=(-2, -1)), len(own))
+        if not measured.any():
+            return np.zeros(len(own), bool)
+        rotation_site_from_body = np.where(measured[:, None, None], rotation_site_from_body, own)
         spread = self._covariance[:, ATTITUDE, ATTITUDE] + np.diag(sigmas_rad**2)
         turn = innovation = self._turn_to(rotation_site_from_body)
         # Rotation vectors are unreliable near half a turn. Refuse turns above 90 degrees: their trace is below 1.
         is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
-        accepted = is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
+        accepted = (
+            measured & is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
+        )
         for axis, sigma_rad in enumerate(sigmas_rad):
             by_error = np.zeros((len(turn), len(CORE)))
             by_error[:, ATTITUDE.start + axis] = 1
             # The updates about earlier axes have changed the attitude.
             turn = self._turn_to(rotation_site_from_body)
             self._apply(turn[:, axis], by_error, float(sigma_rad), accepted)
-        self.n_refused += ~accepted
+        self.n_refused += measured & ~accepted
         self._record("attitude", innovation, spread, accepted)
         return accepted
 
     def _turn_to(self, rotation_site_from_body: Array) -> Array:
-        """Rotation vectors (F, 3), O_B, from the attitudes to another attitude."""
+        """Rotation vectors (F, 3), O_B, from the attitudes to other attitudes."""
         return rotation_vectors(np.swapaxes(self._moving.rotation_site_from_body, 1, 2) @ rotation_site_from_body)
 
     def _update(
         self, kind: str, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
     ) -> NDArray[np.bool_]:
-        """Update the flights in which one number passes the gate; returns whether it passes (F,)."""
+        """Update the flights in which one number passes the gate; returns whether it passes (F,).
+
+        Flights in which the innovation is not finite have no measurement.
+        """
+        measured = np.isfinite(innovation)
+        innovation = np.where(measured, innovation, 0.0)
         spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
-        accepted = (innovation**2 / spread <= gate(1)) & is_possible
+        accepted = (innovation**2 / spread <= gate(1)) & measured & is_possible
         self._apply(innovation, by_error, sigma, accepted)
-        self.n_refused += ~accepted
-        self._record(kind, innovation[:, None], spread[:, None, None], accepted)
+        self.n_refused += measured & ~accepted
+        if measured.any():
+            self._record(kind, innovation[:, None], spread[:, None, None], accepted)
         return accepted
 
     def _record(

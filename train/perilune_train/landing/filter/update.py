@@ -1,5 +1,6 @@
 """Measurement update of the state, and the gate on the normalised innovation squared."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -37,4 +38,5 @@ def updated(state: State, innovation: Array, crossed: Array, spread: Array) -> S
     crossed = dtrsm(1.0, root.T, crossed.T, side=1).T
     covariance = crossed.T @ crossed
     np.subtract(state.covariance, covariance, out=covariance)
-    return state.corrected(innovation @ crossed, covariance)
+    after = state.corrected(innovation @ crossed, covariance)
+    return replace(after, innovation_squared=float(innovation @ innovation), n_innovations=len(innovation))

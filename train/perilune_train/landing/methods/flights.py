@@ -12,7 +12,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.geometry.inertial_errors import drawn_errors
-from perilune_shared.geometry.inertial_grades import GRADES, InertialErrors, InertialGrade
+from perilune_shared.geometry.inertial_grades import CALIBRATED, GRADES, InertialErrors, InertialGrade
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.filter.flight import Estimate, Instruments, StarTracker, fly
 from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
@@ -55,8 +55,8 @@ def flights(
     return pd.concat(tables, ignore_index=True)
 
 
-STAR_TRACKER_UNIT = replace(GRADES["tactical"], gyro_bias_deg_per_h=0.5, gyro_bias_walk_deg_per_h=0.5)
-"""Inertial unit of a lander with a star tracker: tactical, with the gyroscope's bias calibrated before the descent."""
+STAR_TRACKER_UNIT = CALIBRATED
+"""Inertial unit of a lander with a star tracker."""
 STAR_TRACKER_ARCSEC = (10.0, 10.0, 60.0)
 """Standard deviations of the star tracker about the body's axes, seconds of arc."""
 
