@@ -9,7 +9,7 @@ one, with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.104891
 exactly, because the centre of a circle does not project to the centre of its ellipse.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,10 @@ class Fix:
     """Weights of the matches (K,), from 0 for outliers to 1."""
     rms_px: float
     """Root mean square distance between matched centres, per axis, pixels."""
+
+    def part(self, chosen: NDArray[np.bool_]) -> "Fix":
+        """The fix with the chosen matches (K,) only; the pose does not change."""
+        return replace(self, sighting=self.sighting[chosen], crater=self.crater[chosen], weight=self.weight[chosen])
 
 
 def refine(

@@ -22,25 +22,33 @@ from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.landing.craters.ambiguity import match_probability
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import Fix, PosePrior
 from perilune_train.landing.craters.locate import Located, locate
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.filter.measurements import camera_pose, craters_update, pose_fits
+from perilune_train.landing.filter.consistency import CRATER_FIXES, Consistency
+from perilune_train.landing.filter.measurements import camera_pose, craters_update, pose_squared
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
 from perilune_train.landing.filter.state import ATTITUDE, CAMERA, N_ERRORS, POSITION, VELOCITY, State
-from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Stretch
-from perilune_train.landing.filter.update import passes_gate
+from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Check, Stretch
+from perilune_train.landing.filter.update import gate, passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
 """tracking: the last frame was matched to the catalogue. coasting: the last frame was not matched. lost: no frame was
-matched for 15 s, or a fix since the last matched frame contradicts the state."""
+matched for 15 s, a fix since the last matched frame contradicts the state, or the measurements of the last 15 s
+disagree (see consistency.py)."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 """Default standard deviations, metres, of a range and of the ground's height relative to the nearest craters."""
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
 """Standard deviation on each axis, metres per second, that is added to the velocity when a fix replaces a state that it
 contradicts."""
+_MIN_PROBABILITY = 0.8
+"""Matches that are correct with a smaller probability are left out of the update."""
+_FIX_ALLOWANCE = 2.0
+"""The squared normalised innovations of fixes are divided by this number in the check of consistency. Under a high Sun,
+fixes share errors that their covariance lacks: over 15 s, the mean in validation flights is up to 2.5."""
 _NEAREST = 10
 """The median height of this number of nearest craters is taken as the height of the ground below."""
 
@@ -154,10 +162,15 @@ class Lander:
         self._keep_poses = keep_poses
         self.noise, self._around = noise, around
         self._contradiction: _Contradiction | None = None
+        self._is_contradicted = False
         self._matched_s = state.time_s
+        self._consistency = Consistency(state)
+        self.disagreeing: tuple[str, ...] = ()
         self._state, self._since = state, None
 
     status: Status
+    disagreeing: tuple[str, ...]
+    """Sensors whose measurements of the last 15 s disagree with the state more than their stated errors allow."""
     noise: InertialNoise
     """Noise of the inertial unit."""
     _since: Stretch | None
@@ -172,6 +185,7 @@ class Lander:
     def state(self) -> State:
         """The state at the current time."""
         if self._since is not None:
+            self.check(self._since.checks)
             (self.state,) = self._since.states()
         return self._state
 
@@ -211,9 +225,17 @@ class Lander:
         """
         return bool(self._stretch.attitude(rotation_site_from_body, sigmas_rad)[0])
 
+    def check(self, checks: Sequence[Check], number: int = 0) -> None:
+        """Record how well measurements before the next frame agree; the lander is flight `number` of the checks."""
+        for check in checks:
+            self._consistency.add(check.sensor, check.time_s, float(check.squared[number]), check.n_parts)
+
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the current time; returns the fix if it was accepted."""
         located = self._matched(seen)
+        self.disagreeing = self._consistency.disagreeing(self.state)
+        if self.disagreeing:
+            self.status = "lost"
         if self._keep_poses:
             self.state = self.state.keeping_pose()
         return located
@@ -224,17 +246,22 @@ class Lander:
             self._unmatched()
             return None
         fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
-        if not pose_fits(self.state, fix.pose, fix.covariance, rotation_camera_from_body):
+        squared = pose_squared(self.state, fix.pose, fix.covariance, rotation_camera_from_body)
+        self._consistency.add(CRATER_FIXES, self.state.time_s, squared / _FIX_ALLOWANCE, 6)
+        if squared > gate(6):
             if not self._replaces(fix):
+                self._is_contradicted = True
                 self._unmatched()
                 return None
             self._restart(located)
         else:
             local = self._around
+            likely = match_probability(sightings, local.catalogue, local.camera, fix) >= _MIN_PROBABILITY
             self.state = craters_update(
-                self.state, fix, sightings, local.catalogue, local.camera, rotation_camera_from_body
+                self.state, fix.part(likely), sightings, local.catalogue, local.camera, rotation_camera_from_body
             )
-        self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
+        self._contradiction, self._is_contradicted = None, False
+        self._matched_s, self.status = self.state.time_s, "tracking"
         return located
 
     def _replaces(self, fix: Fix) -> bool:
@@ -257,7 +284,7 @@ class Lander:
         return self.state.time_s - self._matched_s > _LOST_S
 
     def _unmatched(self) -> None:
-        self.status = "lost" if self._late or self._contradiction is not None else "coasting"
+        self.status = "lost" if self._late or self._is_contradicted else "coasting"
 
     def _restart(self, located: Located) -> None:
         """Take position and attitude from a fix, and enlarge the uncertainty of the velocity."""

@@ -20,7 +20,7 @@ from perilune_train.landing.filter.state import (
     State,
     common_pattern,
 )
-from perilune_train.landing.filter.update import passes_gate, updated
+from perilune_train.landing.filter.update import gate, updated
 
 _MIN_WEIGHT = 0.1
 """Matches with a smaller weight in the fix are ignored."""
@@ -30,14 +30,14 @@ _COMMON_SEEN = slice(6, 11)
 """The part COMMON within `_ALL_SEE`."""
 
 
-def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
-    """Whether a camera pose is close enough to the state to pass the gate.
+def pose_squared(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> float:
+    """Squared normalised innovation of a camera pose; the pose has six numbers.
 
     `covariance` (6, 6) is the covariance of the pose error, as in `PosePrior`.
     """
     innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
     spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
-    return passes_gate(innovation, spread)
+    return float(innovation @ np.linalg.solve(spread, innovation))
 
 
 def camera_pose(state: State, rotation_camera_from_body: Array) -> tuple[Pose, Array]:
@@ -80,6 +80,8 @@ def craters_update(
     Unmatched craters in view stay in the state. If a crater that the detector missed in one frame were removed, the
     next frame would treat the crater's catalogue error as a new, independent error.
 
+    A sighting that contradicts the state and its crater's offset is left out: its match is wrong.
+
     The measurement is linearised about the fix, which is closer to the true pose than the state is (iterated filter,
     Bell & Cathey 1993, doi 10.1109/9.250476).
     """
@@ -105,7 +107,7 @@ def craters_update(
     )
     by_error = by_pose @ pose_by_error[:, _ALL_SEE]
     by_error[:, :, _COMMON_SEEN] += pattern
-    innovation = (sightings.centre_px[sighting[seen.index]] - predicted).ravel()
+    innovation = sightings.centre_px[sighting[seen.index]] - predicted
     variance = sightings.noise_px[sighting[seen.index]] ** 2 / weight[seen.index]
     # Height errors of the catalogue shift craters in the image radially. They are added as noise: as parts of the state
     # they made it half as large again and gave equal errors and normalised errors.
@@ -114,7 +116,10 @@ def craters_update(
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
     number = np.arange(len(noise))
     spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
-    return updated(state, innovation, crossed, spread)
+    own = spread.reshape(len(noise), 2, len(noise), 2)[number, :, number]
+    squared = np.einsum("ni,ni->n", innovation, np.linalg.solve(own, innovation[:, :, None])[:, :, 0])
+    accepted = np.flatnonzero(np.repeat(squared <= gate(2), 2))
+    return updated(state, innovation.ravel()[accepted], crossed[accepted], spread[np.ix_(accepted, accepted)])
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ All flights of a stretch have measurements at the same times, and every operatio
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,23 @@ _GAP_S = 0.05
 """Shortest gap between inertial measurements that counts as missing measurements, seconds."""
 
 
+RANGES, SPEEDS, ATTITUDES = "ranges", "speeds", "star tracker"
+"""Kinds of measurements, as `Check` names them."""
+
+
+class Check(NamedTuple):
+    """How well a measurement agrees with the states of F flights."""
+
+    sensor: str
+    """Kind of the measurement."""
+    time_s: float
+    """Time of the measurement, seconds since the first frame."""
+    squared: Array
+    """Squared normalised innovations (F,)."""
+    n_parts: int
+    """Number of values of the measurement."""
+
+
 class Stretch:
     """F flights from one frame to the next."""
 
@@ -76,11 +94,14 @@ class Stretch:
         self._rate_radps = np.stack([state.angular_rate_radps for state in states])
         self._kept_updates: list[tuple[Array, Array]] = []
         self.n_refused = np.zeros(len(states), int)
+        self.checks: list[Check] = []
 
     time_s: float
     """Current time, seconds since the first frame."""
     n_refused: NDArray[np.int_]
     """Number of ranges, speeds and attitudes that each flight refused (F,)."""
+    checks: list[Check]
+    """Innovations of all ranges, speeds and attitudes of the stretch."""
 
     @property
     def position_m(self) -> Array:
@@ -160,7 +181,7 @@ class Stretch:
         by_error = np.zeros((len(cosine), len(CORE)))
         by_error[:, 2], by_error[:, _HEIGHT] = 1 / cosine, -1 / cosine
         by_error[:, ATTITUDE] = (height_m / cosine**2)[:, None] * np.cross(beam_in_body, rotation[:, 2])
-        return self._update(range_m - height_m / cosine, by_error, sigma_m, points_down)
+        return self._update(RANGES, range_m - height_m / cosine, by_error, sigma_m, points_down)
 
     def line_speed(self, speed_mps: float, sigma_mps: float, beam_in_body: Array) -> NDArray[np.bool_]:
         """Update by the speed over ground along a beam; returns whether each flight accepted the speed (F,).
@@ -171,7 +192,7 @@ class Stretch:
         in_body = (velocity[:, None] @ rotation)[:, 0]
         by_error = np.zeros((len(rotation), len(CORE)))
         by_error[:, VELOCITY], by_error[:, ATTITUDE] = rotation @ beam_in_body, np.cross(beam_in_body, in_body)
-        return self._update(speed_mps - in_body @ beam_in_body, by_error, sigma_mps)
+        return self._update(SPEEDS, speed_mps - in_body @ beam_in_body, by_error, sigma_mps)
 
     def attitude(self, rotation_site_from_body: Array, sigmas_rad: Array) -> NDArray[np.bool_]:
         """Update by a measured attitude (3, 3); returns whether each flight accepted the attitude (F,).
@@ -185,7 +206,10 @@ class Stretch:
         turn = self._turn_to(rotation_site_from_body)
         # Rotation vectors are unreliable near half a turn. Refuse turns above 90 degrees: their trace is below 1.
         is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
-        accepted = is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
+        squared = (turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1)
+        squared = np.where(is_near, squared, np.inf)
+        accepted = squared <= gate(3)
+        self.checks.append(Check(ATTITUDES, self.time_s, squared, 3))
         for axis, sigma_rad in enumerate(sigmas_rad):
             by_error = np.zeros((len(turn), len(CORE)))
             by_error[:, ATTITUDE.start + axis] = 1
@@ -200,11 +224,18 @@ class Stretch:
         return rotation_vectors(np.swapaxes(self._moving.rotation_site_from_body, 1, 2) @ rotation_site_from_body)
 
     def _update(
-        self, innovation: Array, by_error: Array, sigma: float, is_possible: NDArray[np.bool_] | bool = True
+        self,
+        sensor: str,
+        innovation: Array,
+        by_error: Array,
+        sigma: float,
+        is_possible: NDArray[np.bool_] | bool = True,
     ) -> NDArray[np.bool_]:
         """Update the flights in which one number passes the gate; returns whether it passes (F,)."""
         spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
-        accepted = (innovation**2 / spread <= gate(1)) & is_possible
+        squared = np.where(is_possible, innovation**2 / spread, np.inf)
+        accepted = squared <= gate(1)
+        self.checks.append(Check(sensor, self.time_s, squared, 1))
         self._apply(innovation, by_error, sigma, accepted)
         self.n_refused += ~accepted
         return accepted
