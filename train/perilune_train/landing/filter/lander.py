@@ -46,7 +46,7 @@ _UNKNOWN_VELOCITY_MPS = 5.0
 contradicts."""
 _MIN_PROBABILITY = 0.8
 """Matches that are correct with a smaller probability are left out of the update."""
-_FIX_ALLOWANCE = 2.0
+_FIX_ALLOWANCE = 1.5
 """The squared normalised innovations of fixes are divided by this number in the check of consistency. Under a high Sun,
 fixes share errors that their covariance lacks: over 15 s, the mean in validation flights is up to 2.5."""
 _NEAREST = 10
