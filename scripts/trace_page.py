@@ -29,6 +29,19 @@ CONSTANTS = (
     (f"{_LANDING}.filter.state", "_LOW_SUN_SIGMAS_PX", "COMMON deviations under a low Sun, px"),
     (f"{_LANDING}.filter.state", "_HIGH_SUN_SIGMAS_PX", "COMMON deviations under a high Sun, px"),
     (f"{_LANDING}.filter.measurements", "_MIN_WEIGHT", "smallest weight of a match in an update"),
+    (f"{_LANDING}.filter.measurements", "_MIN_PROBABILITY", "smallest probability of a match in an update"),
+    (f"{_LANDING}.filter.lander", "_FIX_ALLOWANCE", "divisor of `fix_nis` in the check of consistency"),
+    (f"{_LANDING}.filter.consistency", "WINDOW_S", "window of the check of consistency, s"),
+    (f"{_LANDING}.filter.consistency", "_FALSE_ALARM_SHARE", "probability of a false alarm in a window"),
+    (f"{_LANDING}.filter.consistency", "_MIN_MEASUREMENTS", "smallest number of measurements that raise an alarm"),
+    (
+        f"{_LANDING}.craters.ambiguity",
+        "_REACH_SIGMAS",
+        "farthest alternative crater, deviations per axis",
+    ),
+    (f"{_LANDING}.craters.ambiguity", "_REACH_PX", "farthest alternative crater outside the image, px"),
+    (f"{_LANDING}.craters.ambiguity", "_MIN_SIZE_RATIO", "smallest alternative crater, share of the smallest sighting"),
+    (f"{_LANDING}.craters.ambiguity", "_SIZE_SPAN", "range of the log radii of false sightings"),
     (f"{_LANDING}.craters.sightings", "MAX_SIGHTINGS", "largest number of sightings"),
     (f"{_LANDING}.craters.sightings", "_FLOOR_PX", "floor of `noise_px`, px"),
     (f"{_LANDING}.craters.sightings", "_NOISE_SHARE", "share of the radius in `noise_px`"),
@@ -68,7 +81,7 @@ def constants() -> str:
     for module, name, meaning in CONSTANTS:
         short = module.removeprefix("perilune_train.landing.").removeprefix("perilune_shared.geometry.")
         rows.append(f"| `{short}.{name}` | {_text(getattr(importlib.import_module(module), name))} | {meaning} |")
-    for n in (1, 3, 6):
+    for n in (1, 2, 3, 6):
         rows.append(f"| gate({n}) | {gate(n)!r} | largest normalised innovation squared of {n} numbers |")
     rows += ["", "| Grade | " + " | ".join(f"`{name}`" for name in _UNIT) + " |", "|---" * (len(_UNIT) + 1) + "|"]
     rows += [

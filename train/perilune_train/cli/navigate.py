@@ -432,7 +432,7 @@ def fly(
     source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
     from perilune_train.landing.fly.detections import by_network, by_table
-    from perilune_train.landing.fly.run import DescentFiles, doubts_of, fly_descent, read_descent
+    from perilune_train.landing.fly.run import DescentFiles, disagreement_of, doubts_of, fly_descent, read_descent
 
     optional = ranges, truth, star_tracker, doppler_lidar
     descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, *optional))
@@ -447,6 +447,8 @@ def fly(
     say(f"{out}: {len(table)} frames ({counts}); {written}")
     if n_refused := int(table["n_refused"].sum()):
         say(f"refused {n_refused} ranges, speeds and attitudes that contradict the state: column n_refused by frame")
+    if disagreement := disagreement_of(table):
+        say(f"warning: {disagreement}")
     if (table["status"] == "lost").any():
         for doubt in doubts_of(descent, is_lost=True):
             say(f"a possible cause of the status lost: {imu}: {doubt}")

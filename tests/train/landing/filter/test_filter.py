@@ -185,6 +185,8 @@ def test_heights_of_the_catalogue_are_noise_where_they_are_seen(monkeypatch):
         return updated(state, innovation, crossed, spread)
 
     monkeypatch.setattr(measurements, "updated", catch)
+    # The state is far too certain for the errors of these sightings; keep all of them.
+    monkeypatch.setattr(measurements, "gate", lambda n_parts: np.inf)
     catalogue = replace(world(), position_sigma_m=3.0)
     true = Pose(np.array([20.0, -30, 700]), MOUNTING)
     seen = sighted(catalogue, true, rng, false_share=0.0)
@@ -210,6 +212,33 @@ def test_heights_of_the_catalogue_are_noise_where_they_are_seen(monkeypatch):
         np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-3)
 
 
+def test_a_sighting_that_contradicts_the_offset_of_its_crater_is_left_out():
+    rng = np.random.default_rng(5)
+    catalogue = replace(world(), position_sigma_m=1.0)
+    true = Pose(np.array([20.0, -30, 700]), MOUNTING)
+    sigmas = np.repeat([1.0, 0.1, np.radians(0.1), 1e-6, 1e-6], 3)
+    state = State.starting(true.position_m, np.zeros(3), np.eye(3), sigmas, 5.0)
+
+    def updated_by(state, seen, wrong=None):
+        fix = refine(seen, catalogue, CAMERA, nearby(true, np.zeros(3), np.zeros(3)), true)
+        chosen = np.flatnonzero(fix.weight > 0.5)
+        moved = seen.centre_px.copy()
+        if wrong is not None:
+            moved[fix.sighting[chosen[10]]] += wrong
+        kept = np.isin(np.arange(len(fix.weight)), chosen if wrong is None else np.delete(chosen, 10))
+        return fix.part(kept), fix.part(np.isin(np.arange(len(fix.weight)), chosen)), replace(seen, centre_px=moved)
+
+    for _ in range(3):
+        seen = sighted(catalogue, true, rng, static=False, false_share=0.0)
+        _, fix, seen = updated_by(state, seen)
+        state = measurements.craters_update(state, fix, seen, catalogue, CAMERA, MOUNTING)
+    without, fix, wrong = updated_by(state, sighted(catalogue, true, rng, static=False, false_share=0.0), 6.0)
+    expected = measurements.craters_update(state, without, wrong, catalogue, CAMERA, MOUNTING)
+    found = measurements.craters_update(state, fix, wrong, catalogue, CAMERA, MOUNTING)
+    np.testing.assert_allclose(found.position_m, expected.position_m, atol=1e-9)
+    np.testing.assert_allclose(found.covariance[:25, :25], expected.covariance[:25, :25], atol=1e-12)
+
+
 def test_craters_update_as_the_whole_filter(monkeypatch):
     """The blocks of the derivative give the update of the whole derivative."""
     rng, caught = np.random.default_rng(3), {}
@@ -225,6 +254,7 @@ def test_craters_update_as_the_whole_filter(monkeypatch):
     crossed_by = measurements._crossed
     monkeypatch.setattr(measurements, "updated", catch)
     monkeypatch.setattr(measurements, "_crossed", catch_blocks)
+    monkeypatch.setattr(measurements, "gate", lambda n_parts: np.inf)
     catalogue = replace(world(), position_sigma_m=1.0)
     true = Pose(np.array([20.0, -30, 700]), MOUNTING)
     state = State.starting(true.position_m + np.array([3.0, 2, 1]), np.zeros(3), np.eye(3), np.ones(15), 5.0)

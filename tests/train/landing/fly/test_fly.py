@@ -40,7 +40,7 @@ def test_a_line_for_each_frame_and_a_table(plain):
     lines = [line for line in shown.splitlines() if " deg " in line]
     assert [line.split()[0] for line in lines] == ["10.00", "11.00", "12.00"]
     assert "position error" in shown
-    text = pd.read_csv(folder.parent / "flight" / "estimates.csv").fillna({"fault": ""})
+    text = pd.read_csv(folder.parent / "flight" / "estimates.csv").fillna({"fault": "", "disagreeing": ""})
     pd.testing.assert_frame_equal(text, table, check_dtype=False)
     assert (folder.parent / "flight" / "flight.png").stat().st_size > 10_000
     assert (folder.parent / "live.png").is_file()
@@ -77,8 +77,14 @@ def test_a_star_tracker_and_a_doppler_lidar_make_it_more_certain(tmp_path, plain
     # An attitude that contradicts the state is refused, and counted.
     level |= {"rotation_w": 0.0, "rotation_x": 1.0}
     pd.DataFrame({"time_s": time_s, **level}).to_csv(folder / "star_tracker.csv", index=False)
-    table, _ = flown(folder, tmp_path / "other", *more)
+    done = in_process.call(main, "navigate", "fly", *options(folder), "--out", tmp_path / "other", *more)
+    assert done.returncode == 0, done.stderr
+    table = pd.read_parquet(tmp_path / "other" / "estimates.parquet")
     assert table["n_refused"].tolist() == [1, 2, 2]
+    assert table["disagreeing"].tolist() == ["", "star tracker", "star tracker"]
+    assert table["status"].tolist() == ["coasting", "lost", "lost"]
+    assert "warning: sensors that disagree with the state" in done.stdout + done.stderr
+    assert "star tracker (2 of 3 frames, from 11.00 s)" in done.stdout + done.stderr
 
 
 def test_without_an_inertial_unit_it_keeps_its_velocity(tmp_path, plain):

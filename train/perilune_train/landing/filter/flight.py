@@ -123,6 +123,8 @@ class Estimate:
     """The accepted fix, if there is one."""
     n_refused: int = 0
     """Number of ranges, speeds and attitudes that were refused since the previous frame."""
+    disagreeing: tuple[str, ...] = ()
+    """Sensors whose measurements of the last 15 s disagree with the state more than their stated errors allow."""
 
 
 def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
@@ -176,8 +178,10 @@ def fly_together(
             refused = stretch.n_refused
             for f, (lander, state, frame) in enumerate(zip(landers, stretch.states(), frame_sightings, strict=True)):
                 lander.state = state
+                lander.check(stretch.checks, f)
                 located = lander.sightings(frame)
-                estimates.append(Estimate(int(number[k]), lander.state, lander.status, located, int(refused[f])))
+                known = int(number[k]), lander.state, lander.status, located, int(refused[f])
+                estimates.append(Estimate(*known, lander.disagreeing))
             yield estimates
             stretch = _stretch(landers)
         elif kind[k] == _RANGE:

@@ -15,7 +15,7 @@ All methods but `sightings` update a part of the state first; stretch.py updates
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +26,27 @@ from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import Fix, PosePrior
 from perilune_train.landing.craters.locate import Located, locate
 from perilune_train.landing.craters.sightings import Sightings
-from perilune_train.landing.filter.measurements import camera_pose, craters_update, pose_fits
+from perilune_train.landing.filter.consistency import CRATER_FIXES, Consistency
+from perilune_train.landing.filter.measurements import camera_pose, craters_update, pose_squared
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
 from perilune_train.landing.filter.state import ATTITUDE, CAMERA, N_ERRORS, POSITION, VELOCITY, State
-from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Recorder, Stretch
-from perilune_train.landing.filter.update import passes_gate
+from perilune_train.landing.filter.stretch import DOWN, GROUND_S, Check, Stretch
+from perilune_train.landing.filter.stretch import Recorder as StepRecorder
+from perilune_train.landing.filter.update import gate, passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
 """tracking: the last frame was matched to the catalogue. coasting: the last frame was not matched. lost: no frame was
-matched for 15 s, or a fix since the last matched frame contradicts the state."""
+matched for 15 s, a fix since the last matched frame contradicts the state, or the measurements of the last 15 s
+disagree (see consistency.py)."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 """Default standard deviations, metres, of a range and of the ground's height relative to the nearest craters."""
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
 """Standard deviation on each axis, metres per second, that is added to the velocity when a fix replaces a state that it
 contradicts."""
+_FIX_ALLOWANCE = 1.5
+"""The squared normalised innovations of fixes are divided by this number in the check of consistency. Under a high Sun,
+fixes share errors that their covariance lacks: over 15 s, the mean in validation flights is up to 2.5."""
 _NEAREST = 10
 """The median height of this number of nearest craters is taken as the height of the ground below."""
 
@@ -147,6 +153,13 @@ class _Contradiction:
         return passes_gate(later.offset_m - self.offset_m, spread)
 
 
+class Recorder(StepRecorder, Protocol):
+    """Receives every step and every frame of a filter, for a trace."""
+
+    def frame(self, before: State, seen: Sightings, located: Located | None, lander: "Lander") -> None:
+        """Receive the state before a frame, its sightings, the fix if it was accepted, and the lander after it."""
+
+
 class Lander:
     """State and status of a lander; each method processes one kind of measurement.
 
@@ -166,12 +179,17 @@ class Lander:
         self._keep_poses = keep_poses
         self.noise, self._around = noise, around
         self._contradiction: _Contradiction | None = None
+        self._is_contradicted = False
         self._matched_s = state.time_s
+        self._consistency = Consistency(state)
+        self.disagreeing: tuple[str, ...] = ()
         self._state, self._since = state, None
 
     status: Status
     recorder: Recorder | None
     """Receives every step, for a trace; None without a trace."""
+    disagreeing: tuple[str, ...]
+    """Sensors whose measurements of the last 15 s disagree with the state more than their stated errors allow."""
     noise: InertialNoise
     """Noise of the inertial unit."""
     _since: Stretch | None
@@ -186,6 +204,7 @@ class Lander:
     def state(self) -> State:
         """The state at the current time."""
         if self._since is not None:
+            self.check(self._since.checks)
             (self.state,) = self._since.states()
         return self._state
 
@@ -225,12 +244,21 @@ class Lander:
         """
         return bool(self._stretch.attitude(rotation_site_from_body, sigmas_rad)[0])
 
+    def check(self, checks: Sequence[Check], number: int = 0) -> None:
+        """Record how well measurements before the next frame agree; the lander is flight `number` of the checks."""
+        for check in checks:
+            if not np.isnan(check.squared[number]):
+                self._consistency.add(check.sensor, check.time_s, float(check.squared[number]), check.n_parts)
+
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the current time; returns the fix if it was accepted."""
         before = self.state
         located = self._matched(seen)
+        self.disagreeing = self._consistency.disagreeing(self.state)
+        if self.disagreeing:
+            self.status = "lost"
         if self.recorder is not None:
-            self.recorder.frame(before, seen, located, self.state, self.status)
+            self.recorder.frame(before, seen, located, self)
         if self._keep_poses:
             self.state = self.state.keeping_pose()
         return located
@@ -241,8 +269,11 @@ class Lander:
             self._unmatched()
             return None
         fix, rotation_camera_from_body = located.fix, self._around.rotation_camera_from_body
-        if not pose_fits(self.state, fix.pose, fix.covariance, rotation_camera_from_body):
+        squared = pose_squared(self.state, fix.pose, fix.covariance, rotation_camera_from_body)
+        self._consistency.add(CRATER_FIXES, self.state.time_s, squared / _FIX_ALLOWANCE, 6)
+        if squared > gate(6):
             if not self._replaces(fix):
+                self._is_contradicted = True
                 self._unmatched()
                 return None
             self._restart(located)
@@ -251,7 +282,8 @@ class Lander:
             self.state = craters_update(
                 self.state, fix, sightings, local.catalogue, local.camera, rotation_camera_from_body
             )
-        self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
+        self._contradiction, self._is_contradicted = None, False
+        self._matched_s, self.status = self.state.time_s, "tracking"
         return located
 
     def _replaces(self, fix: Fix) -> bool:
@@ -274,7 +306,7 @@ class Lander:
         return self.state.time_s - self._matched_s > _LOST_S
 
     def _unmatched(self) -> None:
-        self.status = "lost" if self._late or self._contradiction is not None else "coasting"
+        self.status = "lost" if self._late or self._is_contradicted else "coasting"
 
     def _restart(self, located: Located) -> None:
         """Take position and attitude from a fix, and enlarge the uncertainty of the velocity."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.compiled import compiled
+from perilune_train.landing.craters.ambiguity import match_probability
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.fix import Fix
 from perilune_train.landing.craters.projection import Pose, in_view, projected
@@ -22,8 +23,10 @@ from perilune_train.landing.filter.state import (
     State,
     common_pattern,
 )
-from perilune_train.landing.filter.update import passes_gate, updated
+from perilune_train.landing.filter.update import gate, updated
 
+_MIN_PROBABILITY = 0.8
+"""Matches that are correct with a smaller probability are left out of the update."""
 _MIN_WEIGHT = 0.1
 """Matches with a smaller weight in the fix are ignored."""
 _ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON, MOUNTING, TIME_TAG]
@@ -32,14 +35,14 @@ _COMMON_SEEN = slice(6, 11)
 """The part COMMON within `_ALL_SEE`."""
 
 
-def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
-    """Whether a camera pose is close enough to the state to pass the gate.
+def pose_squared(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> float:
+    """Squared normalised innovation of a camera pose; the pose has six numbers.
 
     `covariance` (6, 6) is the covariance of the pose error, as in `PosePrior`.
     """
     innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
     spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
-    return passes_gate(innovation, spread)
+    return float(innovation @ np.linalg.solve(spread, innovation))
 
 
 def camera_pose(state: State, rotation_camera_from_body: Array) -> tuple[Pose, Array]:
@@ -84,7 +87,7 @@ def craters_update(
 
 @dataclass(frozen=True, slots=True)
 class CraterInnovations:
-    """The sightings of N matched craters, compared with the state."""
+    """The sightings of N matched craters that agree with the state."""
 
     state: State
     """The state with the offsets of these craters and of the unmatched craters that remain in view."""
@@ -111,10 +114,13 @@ def crater_innovations(
     Unmatched craters in view stay in the state. If a crater that the detector missed in one frame were removed, the
     next frame would treat the crater's catalogue error as a new, independent error.
 
+    Ambiguous matches are left out, and so is a sighting that contradicts the state and its crater's offset.
+
     The measurement is linearised about the fix, which is closer to the true pose than the state is (iterated filter,
     Bell & Cathey 1993, doi 10.1109/9.250476).
     """
-    used = np.flatnonzero(fix.weight > _MIN_WEIGHT)
+    is_likely = match_probability(sightings, catalogue, camera, fix) >= _MIN_PROBABILITY
+    used = np.flatnonzero(is_likely & (fix.weight > _MIN_WEIGHT))
     sighting, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
     unmatched = np.setdiff1d(state.craters, crater)
     unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]
@@ -145,7 +151,12 @@ def crater_innovations(
     crossed, spread = _crossed(state, seen.index, by_error, by_offset)
     number = np.arange(len(noise))
     spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
-    return CraterInnovations(state, used[seen.index], innovation_px, crossed, spread)
+    own = spread.reshape(len(noise), 2, len(noise), 2)[number, :, number]
+    squared = np.einsum("ni,ni->n", innovation_px, np.linalg.solve(own, innovation_px[:, :, None])[:, :, 0])
+    accepted = np.flatnonzero(squared <= gate(2))
+    part = np.flatnonzero(np.repeat(squared <= gate(2), 2))
+    match = used[seen.index[accepted]]
+    return CraterInnovations(state, match, innovation_px[accepted], crossed[part], spread[np.ix_(part, part)])
 
 
 def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:

@@ -19,14 +19,12 @@ All flights of a stretch have measurements at the same times, and every operatio
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array, rotation_vectors
-from perilune_train.landing.craters.locate import Located
-from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.propagate import Increments, InertialNoise, Moving, integrated
 from perilune_train.landing.filter.state import (
     ATTITUDE,
@@ -55,18 +53,34 @@ _GAP_S = 0.05
 """Shortest gap between inertial measurements that counts as missing measurements, seconds."""
 
 
+RANGES, SPEEDS, ATTITUDES = "ranges", "speeds", "star tracker"
+"""Kinds of measurements, as `Check` names them."""
+
+
+class Check(NamedTuple):
+    """How well a measurement agrees with the states of F flights."""
+
+    sensor: str
+    """Kind of the measurement."""
+    time_s: float
+    """Time of the measurement, seconds since the first frame."""
+    squared: Array
+    """Squared normalised innovations (F,); NaN without a measurement."""
+    n_parts: int
+    """Number of values of the measurement."""
+
+
 class Recorder(Protocol):
     """Receives every step of a filter, for a trace."""
 
-    def step(self, stretch: "Stretch", kind: str, innovation: Array, spread: Array, accepted: Array) -> None:
+    def step(
+        self, stretch: "Stretch", kind: str, innovation: Array, spread: Array, accepted: NDArray[np.bool_]
+    ) -> None:
         """Receive a propagation or an update of F flights by n numbers, after it was applied.
 
         `innovation` (F, n) is the measurement minus its prediction, `spread` (F, n, n) its covariance, and `accepted`
         (F,) says which flights accepted it. Propagations have n = 0.
         """
-
-    def frame(self, before: State, seen: Sightings, located: Located | None, after: State, status: str) -> None:
-        """Receive the states before and after a frame, its sightings, and the fix if it was accepted."""
 
 
 class Stretch:
@@ -96,11 +110,14 @@ class Stretch:
         self._rate_radps = np.stack([state.angular_rate_radps for state in states])
         self._kept_updates: list[tuple[Array, Array]] = []
         self.n_refused = np.zeros(len(states), int)
+        self.checks: list[Check] = []
 
     time_s: float
     """Current time, seconds since the first frame."""
     n_refused: NDArray[np.int_]
     """Number of ranges, speeds and attitudes that each flight refused (F,)."""
+    checks: list[Check]
+    """Innovations of all ranges, speeds and attitudes of the stretch."""
 
     @property
     def position_m(self) -> Array:
@@ -215,9 +232,10 @@ class Stretch:
         turn = innovation = self._turn_to(rotation_site_from_body)
         # Rotation vectors are unreliable near half a turn. Refuse turns above 90 degrees: their trace is below 1.
         is_near = (self._moving.rotation_site_from_body * rotation_site_from_body).sum(axis=(1, 2)) > 1
-        accepted = (
-            measured & is_near & ((turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1) <= gate(3))
-        )
+        squared = (turn * np.linalg.solve(spread, turn[:, :, None])[:, :, 0]).sum(axis=1)
+        squared = np.where(is_near, squared, np.inf)
+        accepted = measured & (squared <= gate(3))
+        self.checks.append(Check(ATTITUDES, self.time_s, np.where(measured, squared, np.nan), 3))
         for axis, sigma_rad in enumerate(sigmas_rad):
             by_error = np.zeros((len(turn), len(CORE)))
             by_error[:, ATTITUDE.start + axis] = 1
@@ -242,7 +260,10 @@ class Stretch:
         measured = np.isfinite(innovation)
         innovation = np.where(measured, innovation, 0.0)
         spread = (by_error * (self._covariance @ by_error[:, :, None])[:, :, 0]).sum(axis=1) + sigma**2
-        accepted = (innovation**2 / spread <= gate(1)) & measured & is_possible
+        squared = np.where(is_possible, innovation**2 / spread, np.inf)
+        accepted = measured & (squared <= gate(1))
+        sensor = SPEEDS if kind == "beam_speed" else RANGES
+        self.checks.append(Check(sensor, self.time_s, np.where(measured, squared, np.nan), 1))
         self._apply(innovation, by_error, sigma, accepted)
         self.n_refused += measured & ~accepted
         if measured.any():
@@ -250,7 +271,11 @@ class Stretch:
         return accepted
 
     def _record(
-        self, kind: str, innovation: Array | None = None, spread: Array | None = None, accepted: Array | None = None
+        self,
+        kind: str,
+        innovation: Array | None = None,
+        spread: Array | None = None,
+        accepted: NDArray[np.bool_] | None = None,
     ) -> None:
         """Report a step to the recorder, if there is one."""
         if self._recorder is not None:

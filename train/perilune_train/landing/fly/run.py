@@ -18,9 +18,8 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
-from perilune_train.landing.filter.lander import Lander, Surroundings
+from perilune_train.landing.filter.lander import Lander, Recorder, Surroundings
 from perilune_train.landing.filter.state import ATTITUDE, MOUNTING, N_ERRORS, POSITION, State
-from perilune_train.landing.filter.stretch import Recorder
 from perilune_train.landing.fly.catalogue import read_catalogue
 from perilune_train.landing.fly.clocks import check_clocks
 from perilune_train.landing.fly.detections import Detect, UnreadableFrame
@@ -220,6 +219,7 @@ def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Arra
         "n_matched": len(located.fix.crater) if located else 0,
         "rms_px": pixels,
         "n_refused": estimate.n_refused,
+        "disagreeing": ", ".join(estimate.disagreeing),
         "fault": fault,
     }
 
@@ -234,4 +234,19 @@ def _line(row: dict[str, object]) -> str:
     turn = max(float(str(row[f"sigma_attitude_{axis}_deg"])) for axis in "xyz")
     line = f"{row['time_s']:9.2f} s  {row['status']:8}  {place} m  sigma {sigma} m  {turn:.3f} deg"
     line += f"  {row['n_matched']:3} craters"
+    if row["disagreeing"]:
+        line += f"  disagreeing: {row['disagreeing']}"
     return f"{line}  {row['fault']}" if row["fault"] else line
+
+
+def disagreement_of(table: pd.DataFrame) -> str | None:
+    """One line that names the sensors that disagree with the state, from the table of `fly_descent`; None if none."""
+    frames = table[table["disagreeing"] != ""]
+    if not len(frames):
+        return None
+    sensors = sorted({sensor for names in frames["disagreeing"] for sensor in names.split(", ")})
+    return (
+        f"sensors that disagree with the state more than their stated errors allow: {', '.join(sensors)} "
+        f"({len(frames)} of {len(table)} frames, from {frames['time_s'].iloc[0]:.2f} s): check their units, axes and "
+        "stated errors, the mounting and the catalogue"
+    )

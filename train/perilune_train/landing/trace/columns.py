@@ -123,6 +123,7 @@ FRAMES = Table(
         ),
         Column(("searched",), "", EXACT, "1 if a search found the fix, 0 if not, -1 without a fix"),
         Column(("status",), "", EXACT, "status after the frame: tracking, coasting or lost", (), True),
+        Column(("disagreeing",), "", EXACT, "sensors that disagree, separated by commas; or none", (), True),
         *_pose("expected", "expected pose before the frame"),
         _covariance("expected_covariance", 6, "covariance of the expected pose"),
         Column(("expected_error_px",), "px", 1.0, "standard deviation of the expected pose in the image"),
@@ -169,6 +170,7 @@ MATCHES = Table(
     (
         Column(("crater",), "", EXACT, "row of the catalogue, from 0"),
         Column(("weight",), "", 1.0, "weight of the match in the fix"),
+        Column(("probability",), "", 1.0, "probability that the match is correct"),
         Column(
             ("innovation_x_px", "innovation_y_px"),
             "px",

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, rotation_vectors
+from perilune_train.landing.craters.ambiguity import match_probability
 from perilune_train.landing.craters.fix import PosePrior, refine
 from perilune_train.landing.craters.locate import (
     Located,
@@ -15,7 +17,7 @@ from perilune_train.landing.craters.locate import (
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.craters.vote import support
-from perilune_train.landing.filter.lander import Surroundings
+from perilune_train.landing.filter.lander import Lander, Surroundings
 from perilune_train.landing.filter.measurements import camera_pose, crater_innovations
 from perilune_train.landing.filter.state import N_ERRORS, State
 from perilune_train.landing.filter.stretch import CORE, Stretch
@@ -37,7 +39,7 @@ class TraceRecorder:
         """The tables of the trace by name."""
         return {table.name: _frame_of(self._rows[table.name], table) for table in TABLES}
 
-    def step(self, stretch: Stretch, kind: str, innovation: Array, spread: Array, accepted: Array) -> None:
+    def step(self, stretch: Stretch, kind: str, innovation: Array, spread: Array, accepted: NDArray[np.bool_]) -> None:
         """Record a propagation or an update."""
         (state,) = stretch.states()
         self._n_refused = int(stretch.n_refused[0])
@@ -62,9 +64,9 @@ class TraceRecorder:
             }
         )
 
-    def frame(self, before: State, seen: Sightings, located: Located | None, after: State, status: str) -> None:
+    def frame(self, before: State, seen: Sightings, located: Located | None, lander: Lander) -> None:
         """Record a frame. Fixes and innovations are computed again, from the state before the frame."""
-        number, around = self._n_frames, self._around
+        number, around, after = self._n_frames, self._around, lander.state
         self._rows["sightings"] += [
             {
                 "frame": number,
@@ -94,7 +96,8 @@ class TraceRecorder:
             "n_refused": self._n_refused,
             "outcome": outcome,
             "searched": -1 if located is None else int(located.searched),
-            "status": status,
+            "status": lander.status,
+            "disagreeing": ", ".join(lander.disagreeing) or "none",
             **_pose("expected", pose),
             **_triangle("expected_covariance", expected.covariance),
             "expected_error_px": error_px,
@@ -162,6 +165,7 @@ class TraceRecorder:
         if located is None:
             return
         fix, around = located.fix, self._around
+        probability = match_probability(seen, around.catalogue, around.camera, fix)
         innovation, blocks = np.full((len(fix.crater), 2), np.nan), np.full((len(fix.crater), 2, 2), np.nan)
         if is_used:
             measured = crater_innovations(
@@ -176,6 +180,7 @@ class TraceRecorder:
                 "sighting": int(fix.sighting[k]),
                 "crater": int(fix.crater[k]),
                 "weight": fix.weight[k],
+                "probability": probability[k],
                 "innovation_x_px": innovation[k, 0],
                 "innovation_y_px": innovation[k, 1],
                 **_block("innovation_covariance", blocks[k]),

@@ -1,0 +1,87 @@
+"""Check whether the measurements of the last seconds agree with the state within the stated errors.
+
+A wrong statement about a sensor (its mounting, its unit, its errors) makes innovations too large. The state then
+follows the sensors with the smallest stated errors, and its covariance does not show the error. The sum of squared
+normalised innovations over a window shows it: it has the chi-squared distribution if the stated errors are true (test
+on the normalised innovation squared, Bar-Shalom, Li & Kirubarajan 2001, section 5.4). Errors that the filter
+estimates, such as the mounting, absorb innovations. Their estimates are therefore compared with their stated
+deviations.
+"""
+
+from collections import deque
+from functools import cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from perilune_shared.geometry.frames import Array
+from perilune_train.landing.filter.state import COMMON, FORCE_BIAS, GYRO_BIAS, MOUNTING, TIME_TAG, State
+from perilune_train.landing.filter.update import gate
+
+WINDOW_S = 15.0
+"""Length of the window, seconds."""
+_FALSE_ALARM_SHARE = 1e-5
+"""Probability that a window of consistent, independent innovations raises an alarm."""
+_MIN_MEASUREMENTS = 3
+"""Smallest number of measurements of a sensor that raises an alarm."""
+CRATER_FIXES = "crater fixes"
+_ESTIMATED = {
+    "gyroscope": GYRO_BIAS,
+    "accelerometer": FORCE_BIAS,
+    "detector": COMMON,
+    "camera mounting": MOUNTING,
+    "frame times": TIME_TAG,
+}
+"""Parts of the error state that are constant during a flight, by the sensor to which they belong."""
+
+
+class Consistency:
+    """Squared normalised innovations of each sensor in a sliding window."""
+
+    def __init__(self, start: State):
+        """Begin at the first frame; the covariance of `start` holds the stated deviations."""
+        self._sigma = np.sqrt(np.diag(start.covariance))
+        self._squares: dict[str, deque[tuple[float, float, int]]] = {}
+
+    def add(self, sensor: str, time_s: float, squared: float, n_parts: int) -> None:
+        """Add the squared normalised innovation of a measurement of `n_parts` numbers.
+
+        It is limited to twice the value of the gate, so that no single wrong measurement raises an alarm.
+        """
+        window = self._squares.setdefault(sensor, deque())
+        window.append((time_s, min(squared, 2 * gate(n_parts)), n_parts))
+
+    def disagreeing(self, state: State) -> tuple[str, ...]:
+        """The sensors whose innovations in the window that ends now, or whose estimated errors, are too large."""
+        found = [sensor for sensor, part in _ESTIMATED.items() if self._is_implausible(state, part)]
+        for sensor, window in self._squares.items():
+            while window and window[0][0] <= state.time_s - WINDOW_S:
+                window.popleft()
+            squared, n_parts = sum(entry[1] for entry in window), sum(entry[2] for entry in window)
+            if len(window) >= _MIN_MEASUREMENTS and squared > _limit(n_parts):
+                found.append(sensor)
+        return tuple(sorted(found))
+
+    def _is_implausible(self, state: State, part: slice) -> bool:
+        """Whether estimated errors are larger than their stated deviations allow; errors stated as 0 stay 0."""
+        sigma = self._sigma[part]
+        known = sigma > 0
+        squared = np.square(_errors(state)[part][known] / sigma[known]).sum()
+        return bool(squared > _limit(int(known.sum())))
+
+
+def _errors(state: State) -> Array:
+    """Estimated errors (25,) of the sensors; 0 where the state is no error."""
+    values = np.zeros(TIME_TAG.stop)
+    values[GYRO_BIAS], values[FORCE_BIAS], values[COMMON] = (
+        state.gyro_bias_radps,
+        state.force_bias_mps2,
+        state.common_px,
+    )
+    values[MOUNTING], values[TIME_TAG] = state.mounting_rad, state.time_tag_s
+    return values
+
+
+@cache
+def _limit(n_parts: int) -> float:
+    return float(chi2.isf(_FALSE_ALARM_SHARE, n_parts)) if n_parts else np.inf
