@@ -145,7 +145,7 @@ def test_an_equal_trace_has_code_0(copied):
         ("steps", "kind", lambda old: "coast", "steps: step 4: kind: got coast, expected "),
         ("steps", "ground_m", lambda old: np.nan, "steps: step 4: ground_m: got nan, expected "),
         ("frames", "n_matched", lambda old: old + 1, "frames: frame 4: n_matched: got "),
-        ("matches", "crater", lambda old: old + 1, r"matches: frame 0, sighting \d+: crater: got "),
+        ("matches", "crater", lambda old: old + 1, r"matches: frame \d+, sighting \d+: crater: got "),
     ],
 )
 def test_a_difference_has_code_1_and_names_row_and_column(copied, table, name, value, expected):
