@@ -33,6 +33,8 @@ CONSTANTS = (
     (f"{_LANDING}.filter.lander", "_FIX_ALLOWANCE", "divisor of `fix_nis` in the check of consistency"),
     (f"{_LANDING}.filter.consistency", "WINDOW_S", "window of the check of consistency, s"),
     (f"{_LANDING}.filter.consistency", "_FALSE_ALARM_SHARE", "probability of a false alarm in a window"),
+    (f"{_LANDING}.filter.consistency", "_CAMERA_FALSE_ALARM_SHARE", "smallest probability of the camera's errors"),
+    (f"{_LANDING}.filter.consistency", "_START_SHARE", "factor of P0 in the check of the camera"),
     (f"{_LANDING}.filter.consistency", "_MIN_MEASUREMENTS", "smallest number of measurements that raise an alarm"),
     (
         f"{_LANDING}.craters.ambiguity",
