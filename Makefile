@@ -156,7 +156,7 @@ closed-loop: setup ## fly a descent in closed loop: guidance, filter, and images
 
 ##@ Explanation and report
 explain: ## compute attention masks and correlations of the trained networks
-	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
+	@test -f "$(STACK)/metrics.json" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
 	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
 
 # The navigator's poses need all frames of a descent, without its craters.
@@ -191,7 +191,7 @@ benchmark: setup ## score the installed detector, or a run (RUN=folder), on the 
 	@$(MAKE) --no-print-directory benchmark-frames KIND=detect
 	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
 
-benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder); writes runs/benchmark/<name>-navigate
+benchmark-nav: setup ## score direct alignment, or a run (RUN=folder); writes runs/benchmark/<name>-navigate
 	@$(if $(RUN),$(call checked_run,navigate))
 	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
 	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
