@@ -274,7 +274,7 @@ def methods(
     from perilune_train.records.provenance import EvaluatedSplit
 
     detector = detector or shipped_run("detect")
-    inputs = (dataset, detector, *(path for path in (run, maps) if path is not None))
+    inputs: tuple[str | Path, ...] = (dataset, detector, *(path for path in (run, maps) if path is not None))
     with replaceable(out, (PAGE, TABLE), overwrite=overwrite, inputs=inputs) as folder:
         fly_methods(EvaluatedSplit(dataset, split, allow_overlap), run, detector, folder, maps)
     say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")
