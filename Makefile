@@ -78,7 +78,7 @@ demo: setup ## run all steps on small data: frames, detection, navigation, expla
 	@echo
 	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
 	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"
-	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
+	@echo "Navigation  $(RUNS)/navigate/$(NAME)-stack        metrics.json, *.png, navigation.parquet"
 	@echo "Landing     $(RUNS)/navigate/$(NAME)-landing      monte_carlo.md, *.png: the filter over the test descents"
 	@echo "Explanation $(RUNS)/explain/$(NAME)               claims.json, metrics.json, *.png, *.parquet"
 	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
