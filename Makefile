@@ -78,7 +78,7 @@ demo: setup ## run all steps on small data: frames, detection, navigation, expla
 	@echo
 	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
 	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"
-	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
+	@echo "Navigation  $(RUNS)/navigate/$(NAME)-stack        metrics.json, *.png, navigation.parquet"
 	@echo "Landing     $(RUNS)/navigate/$(NAME)-landing      monte_carlo.md, *.png: the filter over the test descents"
 	@echo "Explanation $(RUNS)/explain/$(NAME)               claims.json, metrics.json, *.png, *.parquet"
 	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
@@ -156,7 +156,7 @@ closed-loop: setup ## fly a descent in closed loop: guidance, filter, and images
 
 ##@ Explanation and report
 explain: ## compute attention masks and correlations of the trained networks
-	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
+	@test -f "$(STACK)/metrics.json" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
 	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
 
 # The navigator's poses need all frames of a descent, without its craters.
@@ -191,7 +191,7 @@ benchmark: setup ## score the installed detector, or a run (RUN=folder), on the 
 	@$(MAKE) --no-print-directory benchmark-frames KIND=detect
 	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
 
-benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder); writes runs/benchmark/<name>-navigate
+benchmark-nav: setup ## score direct alignment, or a run (RUN=folder); writes runs/benchmark/<name>-navigate
 	@$(if $(RUN),$(call checked_run,navigate))
 	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
 	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)

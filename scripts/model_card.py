@@ -9,7 +9,7 @@ class Shipment:
     """The network, figures and notes that a card shows."""
 
     name: str
-    """crater-detector or lander-navigator."""
+    """Name of the installed network."""
     content: dict[str, Any]
     """Content of the checkpoint: architecture and weights."""
     metrics: dict[str, Any]
@@ -32,8 +32,7 @@ class Shipment:
 
 def model_card(shipment: Shipment) -> str:
     """The card as Markdown."""
-    lines = _detector(shipment) if shipment.name == "crater-detector" else _navigator(shipment)
-    return "\n".join([f"# {shipment.name}", "", *lines, *[f"- {note}" for note in shipment.notes], ""])
+    return "\n".join([f"# {shipment.name}", "", *_detector(shipment), *[f"- {note}" for note in shipment.notes], ""])
 
 
 def _facts(shipment: Shipment, network: str, threshold: str | None) -> list[str]:
@@ -132,47 +131,3 @@ def _bin_title(key: str) -> str:
     """Name of a bin: `radius 2-3 px` of `visible/radius_2_3_px/ap50_paper`."""
     kind, low, high, unit = key.split("/")[1].split("_")
     return f"{kind} {low}-{high} {unit}"
-
-
-def _navigator(shipment: Shipment) -> list[str]:
-    figures, shape = shipment.figures, shipment.content["architecture"]
-    method = str(figures["headline/method"])
-    network = (
-        f"Darknet53-LSTM, fusion `{method}`, width {shape['width']:g}, attention `{shape['attention']}`, frames of "
-        f"{shape['size_px']} pixels"
-    )
-    names = {
-        method: "this network",
-        "klt": "tracked corners (KLT)",
-        "klt_gyroscope": "tracked corners (KLT), with a gyroscope",
-        "alignment": "direct alignment",
-        "alignment_gyroscope": "direct alignment, with a gyroscope",
-        "nominal": "nominal motion",
-    }
-    keys = ("position_rmse_vector_m", "position_rmse_per_component_m", "orientation_rmse_angle_deg")
-    rows = [
-        f"| {title} | " + " | ".join(_figure(figures, f"{name}/{key}") for key in keys) + " |"
-        for name, title in names.items()
-        if f"{name}/{keys[0]}" in figures
-    ]
-    return [
-        "This network estimates the motion of a camera between two frames of a landing, from the frames and the "
-        "nominal motion. `perilune-train navigate evaluate` and `benchmark` use it if `--run` is not given.",
-        "",
-        *_facts(shipment, network, None),
-        "",
-        "## Locked benchmark",
-        "",
-        "| method | position RMSE of a step, vector (m) | per component (m) | orientation RMSE, angle (deg) |",
-        "|---|---|---|---|",
-        *rows,
-        "",
-        "In brackets: 95 % intervals over scenes. A step is about 36 m.",
-        "",
-        "## Limits",
-        "",
-        "- Methods without training are more accurate if their row shows a smaller error; use them in this case.",
-        "- It needs the nominal motion and altitude. It was trained only on deviations of rendered descents from the "
-        "nominal motion.",
-        "- The figures are of one training run.",
-    ]

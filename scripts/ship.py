@@ -28,7 +28,6 @@ from model_card import Shipment, model_card
 from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
-from perilune_train.motion.covariance import FILE as COVARIANCE
 from perilune_train.records.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.shipped.models import BENCHMARK, CARD, WEIGHTS
 from perilune_train.training.half_weights import precision_of, write_bytewise, write_half
@@ -36,12 +35,12 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED, PAGES = ROOT / "train/perilune_train/shipped", ROOT / "docs/reference/models"
-MAX_MB = {"crater-detector": 8.0, "lander-navigator": 1.0}
+MAX_MB = {"crater-detector": 8.0}
 """Largest size of the weights, MB. Every clone and every wheel contains the weights."""
-MANIFESTS = {"crater-detector": "shipped-detect", "lander-navigator": "shipped-nav"}
+MANIFESTS = {"crater-detector": "shipped-detect"}
 """Shared manifests of the training data."""
 
-Name = Annotated[str, typer.Option(help="crater-detector or lander-navigator.")]
+Name = Annotated[str, typer.Option(help="crater-detector.")]
 app = typer.Typer(pretty_exceptions_enable=False, add_completion=False, no_args_is_help=True)
 
 
@@ -67,9 +66,6 @@ def install(
     public_metrics = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
     write_text(folder / METRICS_FILE, json.dumps(public_metrics, indent=2) + "\n")
     shutil.copyfile(source.config, folder / "config.yaml")
-    (folder / COVARIANCE).unlink(missing_ok=True)
-    if (run / COVARIANCE).is_file():
-        shutil.copyfile(run / COVARIANCE, folder / COVARIANCE)
     print(f"{folder}: {size:.1f} MB; next: score it on the locked benchmark, then `ship.py card`")
 
 

@@ -1,6 +1,6 @@
-"""Relative motion under noise, blur and wrong prior knowledge: the installed navigator beside the classical methods.
+"""Relative motion under noise, blur and wrong prior knowledge: the classical methods, and a `warp` network.
 
-    python -m benchmarks.train.motion data/shipped/nav [--split val]
+    python -m benchmarks.train.motion data/shipped/nav [--split val] [--run runs/navigate/small]
 
 Frames and prior knowledge of all descents of a split are changed, one thing at a time, and every method estimates the
 motions again. Also the time of a pair on one thread. Writes runs/bench/motion.json and motion.png.
@@ -29,7 +29,6 @@ from perilune_train.motion.metrics.errors import motion_errors, summary
 from perilune_train.motion.network import load_navigator, predict
 from perilune_train.records.markdown import table
 from perilune_train.records.pictures import save_figure
-from perilune_train.shipped.models import shipped_run
 from perilune_train.training.runs import RunFolder
 
 Change = Callable[[Trajectory, np.random.Generator], Trajectory]
@@ -77,18 +76,20 @@ CHANGES: dict[str, Change] = {
 def main(
     dataset: Annotated[Path, typer.Argument(help="Dataset of descents.")],
     split: Annotated[str, typer.Option(help="train, val or test.")] = "val",
+    run: Annotated[Path | None, typer.Option(help="Folder of a warp run, to compare.")] = None,
     out: Path = Path("runs/bench"),
 ) -> None:
     """Estimate all motions under every change."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     trajectories = load_split(open_dataset(str(dataset)), split)
-    network, architecture = load_navigator(RunFolder(shipped_run("navigate")).best, "warp")
     methods: dict[str, Callable[[Trajectory], Motion]] = {
-        "warp": lambda one: predict(network, architecture, one),
         "klt": lambda one: klt_trajectory(one).motion,
         "alignment": lambda one: aligned_trajectory(one).motion,
     }
+    if run is not None:
+        network, architecture = load_navigator(RunFolder(run).best, "warp")
+        methods = {"warp": lambda one: predict(network, architecture, one), **methods}
     figures: dict[str, float] = {}
     seconds = dict.fromkeys(methods, 0.0)
     with progress_bar() as progress:

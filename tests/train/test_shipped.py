@@ -76,14 +76,13 @@ def test_evaluation_needs_no_run(shipped, picture, tmp_path):
 @pytest.mark.parametrize("model", models.shipped_models(), ids=lambda model: model.name)
 def test_the_installed_network_is_the_one_on_its_card(model):
     """Size, training data and figures; the same card is in the docs."""
-    assert model.megabytes <= {"detect": 8, "navigate": 1}[model.task]
+    assert model.megabytes <= 8
     card = (model.folder / models.CARD).read_text(encoding="utf-8")
     assert card == (ROOT / f"docs/reference/models/{model.name}.md").read_text(encoding="utf-8")
-    manifest = ROOT / f"data_manifests/shipped-{'detect' if model.task == 'detect' else 'nav'}/dataset.json"
+    manifest = ROOT / "data_manifests/shipped-detect/dataset.json"
     assert hashlib.sha256(manifest.read_bytes()).hexdigest()[:16] in card
     figures = json.loads((model.folder / models.BENCHMARK).read_text(encoding="utf-8"))
-    headline = "ap50_paper" if model.task == "detect" else "position_rmse_vector_m"
-    assert f"{figures[f'headline/{headline}']:.3f}" in card
+    assert f"{figures['headline/ap50_paper']:.3f}" in card
     scenes = set(open_dataset(manifest.parent).table("scenes", ["content_sha256"])["content_sha256"].to_pylist())
     record = load_weights(RunFolder(model.folder).best)["terrain"]
     assert record["known"] and {use[3] for use in record["uses"]} <= scenes
@@ -92,14 +91,12 @@ def test_the_installed_network_is_the_one_on_its_card(model):
 def test_their_weights_take_eight_mebibytes_of_a_clone():
     """Git and wheels compress files; so is measured here."""
     weights = [(model.folder / models.WEIGHTS).read_bytes() for model in models.shipped_models()]
-    assert len(weights) == 2 and sum(len(zlib.compress(content)) for content in weights) <= 8 * 2**20
+    assert len(weights) == 1 and sum(len(zlib.compress(content)) for content in weights) <= 8 * 2**20
 
 
 def test_without_an_installed_network_a_run_is_needed(picture, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "_FOLDER", tmp_path)
-    detect = [("detect", *command) for command in (("predict", picture), ("benchmark",), ("deploy",))]
-    navigate = [("navigate", "benchmark"), ("navigate", "evaluate", "--dataset", tmp_path)]
-    for command in (*detect, *navigate):
+    for command in [("detect", *command) for command in (("predict", picture), ("benchmark",), ("deploy",))]:
         done = in_process.call(main, *command, "--out", tmp_path / "out")
         assert done.returncode == 2 and "no network is installed" in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "out").exists()

@@ -50,6 +50,17 @@ def test_all_methods_are_scored_over_all_scenes(run, places, tmp_path):
     assert "| other camera |" in page and "klt" in page
 
 
+@pytest.mark.usefixtures("no_pictures")
+def test_without_a_run_alignment_is_the_headline(places, tmp_path):
+    done = call(places, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    figures = json.loads((tmp_path / "out/benchmark.json").read_text())
+    assert figures["headline/position_rmse_vector_m"] == figures["alignment/position_rmse_vector_m"]
+    assert (figures["headline/method"], figures["scored"]) == ("alignment", "alignment")
+    page = (tmp_path / "out/benchmark.md").read_text()
+    assert "direct alignment." in page and "this network" not in page and "| other camera |" in page
+
+
 def test_mistakes(run, places, dataset_detect, tmp_path):
     for arguments, message in (
         (("--run", tmp_path / "none"), "no such file"),

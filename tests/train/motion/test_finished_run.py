@@ -67,6 +67,21 @@ def test_a_run_is_evaluated_on_another_dataset(runs, elsewhere, tmp_path):
     assert metrics["terrain/status"] == "disjoint"
 
 
+@pytest.mark.usefixtures("no_pictures")
+def test_without_a_run_alignment_is_evaluated(elsewhere, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = call("evaluate", "--dataset", elsewhere)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "runs/evaluation/alignment"
+    table = pd.read_parquet(out / "navigation.parquet").set_index("method")
+    assert list(table.index) == ["klt", "klt_gyroscope", "alignment", "alignment_gyroscope", "nominal"]
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["test/position_rmse_vector_m"] == pytest.approx(table.loc["alignment", "position_rmse_vector_m"])
+    assert metrics["baseline/klt/position_rmse_vector_m"] == table.loc["klt", "position_rmse_vector_m"]
+    assert (metrics["evaluation/method"], metrics["test/pairs"]) == ("alignment", 10)
+    assert metrics["test/ms_per_single_pair"] > 0 and metrics["terrain/mark"] == ""
+
+
 @pytest.mark.slow
 def test_runs_and_evaluations_are_compared(runs, elsewhere, tmp_path):
     out = tmp_path / "out"

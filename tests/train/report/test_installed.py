@@ -71,7 +71,9 @@ def test_the_report_names_the_start_of_a_training(shown):
     path = runs / "detect" / "demo" / "metrics.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"train/start": "crater-detector", "train/epochs": 1}))
     path = runs / "navigate" / "demo-stack" / "metrics.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"network/backbone": "from lander-navigator"}))
+    path.write_text(
+        json.dumps(json.loads(path.read_text()) | {"network/backbone": "from runs/navigate/a/checkpoints/best.ckpt"})
+    )
     leads = [line for section in gather("demo", "demo", data, runs).sections for line in section.lead]
     assert "demo started from crater-detector; epochs of training on this dataset: 1." in leads
-    assert "demo-stack started from lander-navigator." in leads
+    assert "demo-stack started from runs/navigate/a/checkpoints/best.ckpt." in leads

@@ -64,16 +64,17 @@ def train(
 def evaluate(
     dataset: Annotated[str, typer.Option(help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix.")],
     run: Annotated[
-        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+        Path | None,
+        typer.Option(help="Folder of a finished navigate run. [default: direct alignment, which needs no training]"),
     ] = None,
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder to write into. [default: <run>/evaluation; runs/evaluation/<name> without --run]"),
+        typer.Option(help="Folder to write into. [default: <run>/evaluation; runs/evaluation/alignment without --run]"),
     ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Evaluate a run's best weights, and compare them with KLT tracks and the nominal motion.
+    """Evaluate a run's best weights or direct alignment, and compare them with KLT tracks and the nominal motion.
 
     Writes metrics.json, navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png and
     errors.png. A run that estimates poses (navigate.stack.target=pose) is evaluated over the landing area on which it
@@ -82,36 +83,43 @@ def evaluate(
     if split not in SPLITS:
         raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_train.motion.evaluate_runs import evaluate_navigator
+    from perilune_train.motion.evaluate_runs import evaluate_alignment, evaluate_navigator
     from perilune_train.records.provenance import EvaluatedSplit
 
-    default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
     evaluated = EvaluatedSplit(dataset, split, allow_overlap)
-    folder = evaluate_navigator(run or shipped_run("navigate"), evaluated, out or default)
+    if run is None:
+        folder = evaluate_alignment(evaluated, out or Path("runs/evaluation/alignment"))
+    else:
+        folder = evaluate_navigator(run, evaluated, out or run / "evaluation")
     say(f"{folder}: metrics.json, navigation.parquet, errors.parquet, errors.png")
 
 
 @app.command("benchmark")
 def benchmark(
     run: Annotated[
-        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+        Path | None,
+        typer.Option(help="Folder of a finished navigate run. [default: direct alignment, which needs no training]"),
     ] = None,
     data: Annotated[str, typer.Option(help="Folder or address of the rendered benchmark.")] = "data/benchmark",
     manifests: Annotated[str, typer.Option(help="Folder or address of the shared manifests.")] = "data_manifests",
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write into. [default: runs/benchmark/<name of the run>-navigate]")
+        Path | None,
+        typer.Option(
+            help="Folder to write into. [default: runs/benchmark/<name of the run>-navigate;"
+            " runs/benchmark/alignment-navigate without --run]"
+        ),
     ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Score a navigator on the locked benchmark.
+    """Score a navigator or direct alignment on the locked benchmark.
 
     Writes benchmark.md, benchmark.json, error tables and pictures.
     """
     # torch takes seconds to load.
     from perilune_train.motion.benchmark import FIGURES, HEADLINE, PAGE, score_navigator
 
-    run = run or shipped_run("navigate")
-    folder = out or Path("runs/benchmark", f"{run.resolve().name}-navigate")
+    name = run.resolve().name if run else "alignment"
+    folder = out or Path("runs/benchmark", f"{name}-navigate")
     figures = score_navigator(run, data, manifests, folder, allow_overlap)
     say(f"position RMSE {figures[f'headline/{HEADLINE}']:.3f} m; {folder}: {PAGE}, {FIGURES}")
 
@@ -203,9 +211,7 @@ def compare(
 @app.command("deploy")
 def deploy(
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
-    run: Annotated[
-        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
-    ] = None,
+    run: Annotated[Path | None, typer.Option(help="Folder of a finished navigate run; required.")] = None,
     dataset: Annotated[
         str | None,
         typer.Option(
@@ -221,10 +227,12 @@ def deploy(
     result with torch, which runs over the whole sequence at once. Both use validation frames, or noise if no dataset is
     given.
     """
+    if run is None:
+        expected = "the folder of a navigate run; direct alignment, the default method, has no network to deploy"
+        raise UserError("--run", "", "not given", expected)
     # torch takes seconds to load.
     from perilune_train.motion.deploy.export import export_navigator
 
-    run = run or shipped_run("navigate")
     inputs = (run,) if dataset is None else (run, dataset)
     with replaceable(out, ("navigator.json", "README.md"), overwrite=overwrite, inputs=inputs) as folder:
         largest = export_navigator(run, folder, dataset)
@@ -240,7 +248,8 @@ def methods(
         str, typer.Option(help="Dataset of descents: a folder, s3://bucket/prefix or gs://bucket/prefix.")
     ],
     run: Annotated[
-        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+        Path | None,
+        typer.Option(help="Folder of a finished navigate run, to compare. [default: only methods without training]"),
     ] = None,
     detector: Annotated[
         Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
@@ -253,7 +262,7 @@ def methods(
     allow_overlap: AllowOverlap = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
-    """Run all methods on a split: learned and classical motion, poses from craters (with and without a prior), filter.
+    """Run all methods on a split: relative motion, poses from craters (with and without a prior), filter.
 
     Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
     frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
@@ -265,10 +274,10 @@ def methods(
     from perilune_train.landing.methods.fly_methods import PAGE, TABLE, fly_methods
     from perilune_train.records.provenance import EvaluatedSplit
 
-    networks = run or shipped_run("navigate"), detector or shipped_run("detect")
-    inputs = (dataset, *networks) if maps is None else (dataset, *networks, maps)
+    detector = detector or shipped_run("detect")
+    inputs: tuple[str | Path, ...] = (dataset, detector, *(path for path in (run, maps) if path is not None))
     with replaceable(out, (PAGE, TABLE), overwrite=overwrite, inputs=inputs) as folder:
-        fly_methods(EvaluatedSplit(dataset, split, allow_overlap), *networks, folder, maps)
+        fly_methods(EvaluatedSplit(dataset, split, allow_overlap), run, detector, folder, maps)
     say(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet")
 
 

@@ -1,4 +1,4 @@
-"""Score a navigator and methods without training on the locked benchmark, by region, altitude and Sun elevation."""
+"""Score a network or alignment on the locked benchmark, by region, altitude and Sun elevation."""
 
 import itertools
 from dataclasses import replace
@@ -7,21 +7,19 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from perilune_shared.console.terminal import progress_bar
 from perilune_shared.export.foreign_text import code_span
 from perilune_shared.storage.store import Address
-from perilune_train.motion.covariance import stated_covariances
-from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.evaluate_runs import fusion_of
-from perilune_train.motion.metrics.baselines import MethodMotions, baselines
+from perilune_train.motion.data.trajectories import Trajectory, load_split
+from perilune_train.motion.evaluate_runs import fusion_of, learned_motions, network_ms_per_pair
+from perilune_train.motion.metrics.baselines import ALIGNMENT, MethodMotions, alignment_ms_per_pair, baselines
 from perilune_train.motion.metrics.errors import motion_errors, summary, summary_spreads
 from perilune_train.motion.metrics.report import write_evaluation
-from perilune_train.motion.network import check_motion, load_navigator, predict, predict_by_pairs
+from perilune_train.motion.network import check_motion
 from perilune_train.records.benchmark_parts import Part, open_parts, part_names
 from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics
-from perilune_train.records.provenance import check_terrain, read_provenance
+from perilune_train.records.provenance import Provenance, TerrainCheck, check_terrain, read_provenance
 from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
@@ -41,49 +39,52 @@ _ALTITUDES_M = (200, 500, 1000, 1600)
 _SUNS_DEG = (0, 15, 30, 45, 60, 90)
 
 
-def score_navigator(run: Path, data: Address, manifests: Address, out: Path, allow_overlap: bool = False) -> Metrics:
+def score_navigator(
+    run: Path | None, data: Address, manifests: Address, out: Path, allow_overlap: bool = False
+) -> Metrics:
     """Score a run's best weights, the classical methods and the nominal motion; return the figures.
 
-    Writes the page, figures, tables and pictures. Raises UserError if the benchmark is missing or was changed, or if
-    the network was trained on terrain of the benchmark. `allow_overlap` accepts this network and marks all output.
+    Without a run, the headline figure is the error of alignment. Writes the page, figures, tables and pictures. Raises
+    UserError if the benchmark is missing or was changed, or if the network was trained on terrain of the benchmark.
+    `allow_overlap` accepts this network and marks all output.
     """
     parts = open_parts("nav", data, manifests)
-    best = RunFolder(run).best
-    content = load_weights(best)
-    fusion = fusion_of(best, content["architecture"])
-    check_motion(best, content["architecture"])
-    provenance = read_provenance(content, best)
-    checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
-    network, architecture = load_navigator(best, fusion)
+    checks = _checked(run, parts, allow_overlap)
     trajectories, regions, suns = _load(parts)
-    motions: dict[str, list[Motion]] = {fusion: []}
-    with progress_bar() as progress:
-        bar = progress.add_task("navigate", total=len(trajectories), unit="trajectories", note="")
-        for trajectory in trajectories:
-            motions[fusion].append(predict(network, architecture, trajectory))
-            progress.advance(bar)
+    learned = MethodMotions({}, {}) if run is None else learned_motions(run, trajectories)
+    headline = next(iter(learned.motions), ALIGNMENT)
     classical = baselines([], trajectories)
-    motions |= classical.motions
-    covariances = classical.covariances
-    stated = stated_covariances(run, network, architecture, trajectories)
-    if stated is not None:
-        covariances = {fusion: stated, **covariances}
+    one = trajectories[0]
+    ms = alignment_ms_per_pair(one) if run is None else network_ms_per_pair(run, one)
+    motions, covariances = learned.motions | classical.motions, learned.covariances | classical.covariances
     errors = {
         method: motion_errors(trajectories, estimated, covariances.get(method)) for method, estimated in motions.items()
     }
     mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
     counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}
-    ms = round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2)
     details: Metrics = {"test/ms_per_single_pair": ms, "terrain/mark": mark, "dataset/name": "locked benchmark"}
-    write_evaluation(out, fusion, "test", trajectories, MethodMotions(motions, covariances), details)
-    figures = _figures(errors, regions, suns) | {"headline/method": fusion, f"headline/{HEADLINE}": None}
-    figures[f"headline/{HEADLINE}"] = figures[f"{fusion}/{HEADLINE}"]
+    write_evaluation(out, headline, "test", trajectories, MethodMotions(motions, covariances), details)
+    figures = _figures(errors, regions, suns) | {"headline/method": headline, f"headline/{HEADLINE}": None}
+    figures[f"headline/{HEADLINE}"] = figures[f"{headline}/{HEADLINE}"]
     for name, (n_frames, n_locked) in counts.items():
         figures |= {f"frames/{name}": n_frames, f"locked_frames/{name}": n_locked}
-    write_markdown(out / PAGE, _page(run, fusion, errors, figures, ms, counts))
+    scored = ALIGNMENT if run is None else f"run {run.resolve().name}"
+    write_markdown(out / PAGE, _page(run, headline, errors, figures, ms, counts))
     mark_files(out, [PAGE], mark)
-    write_metrics(out, figures | details | {"scored": f"run {run.resolve().name}"}, FIGURES)
+    write_metrics(out, figures | details | {"scored": scored}, FIGURES)
     return figures
+
+
+def _checked(run: Path | None, parts: list[Part], allow_overlap: bool) -> list[TerrainCheck]:
+    """The terrain check of each part. Raises UserError if the run has no navigator of motions, or overlaps a part."""
+    provenance = Provenance()
+    if run is not None:
+        best = RunFolder(run).best
+        content = load_weights(best)
+        fusion_of(best, content["architecture"])
+        check_motion(best, content["architecture"])
+        provenance = read_provenance(content, best)
+    return [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
 
 
 def _load(parts: list[Part]) -> tuple[list[Trajectory], dict[str, str], dict[str, float]]:
@@ -127,18 +128,20 @@ def _bins(values: pd.Series, edges: tuple[int, ...]) -> pd.Series:
 
 
 def _page(
-    run: Path,
-    fusion: str,
+    run: Path | None,
+    headline: str,
     errors: dict[str, pd.DataFrame],
     figures: Metrics,
     ms: float,
     counts: dict[str, tuple[int, int]],
 ) -> str:
     spreads = {method: summary_spreads(table_of_method) for method, table_of_method in errors.items()}
-    headline = spreads[fusion][HEADLINE].text(float(figures[f"{fusion}/{HEADLINE}"] or np.nan))
+    value = spreads[headline][HEADLINE].text(float(figures[f"{headline}/{HEADLINE}"] or np.nan))
+    scored = "direct alignment" if run is None else f"run {code_span(run.resolve().name)}"
+    network = "" if run is None else f"`{headline}`: this network. "
     lines = ["# Locked benchmark of navigation", ""]
     lines += [
-        f"**Position RMSE of a step: {headline} m** (length of the error vector), run {code_span(run.resolve().name)}.",
+        f"**Position RMSE of a step: {value} m** (length of the error vector), {scored}.",
         "",
         "A step is the motion between two consecutive frames.",
         "",
@@ -152,7 +155,7 @@ def _page(
         "",
         "## Methods",
         "",
-        f"`{fusion}`: this network. `klt`: tracked corners. `alignment`: direct alignment of both frames. "
+        f"{network}`klt`: tracked corners. `alignment`: direct alignment of both frames. "
         "`_gyroscope`: with the rotation that a gyroscope measured. `nominal`: the nominal motion, without images.",
         "",
     ]
@@ -168,7 +171,7 @@ def _page(
     lines += [*table(["method", *_COLUMNS.values()], rows), ""]
     lines += ["In brackets: 95 % intervals over scenes, or the value of each scene if there are fewer than five.", ""]
     for kind, title in (("region", "region"), ("altitude_m", "altitude (m)"), ("sun_deg", "Sun elevation (deg)")):
-        start = f"{fusion}/{kind}/"
+        start = f"{headline}/{kind}/"
         names = [
             key[len(start) : -len("/scenes")] for key in figures if key.startswith(start) and key.endswith("/scenes")
         ]

@@ -108,8 +108,8 @@ class NavigateConfig(Section):
     detector: Path | None = None
     """best.ckpt of the detector whose backbone initialises the stack network. None: the default run, if it exists."""
     init_from: str | None = None
-    """Weights from which warp starts: best.ckpt of a warp run with equal size_px, width, attention and hidden, or
-    lander-navigator (the installed navigator). None: random weights."""
+    """Weights from which warp starts: best.ckpt of a warp run with equal size_px, width, attention and hidden. None:
+    random weights."""
     precision: Precision = "auto"
     """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
@@ -124,8 +124,7 @@ class NavigateConfig(Section):
     """Training sequences that are rendered during training; requires `fusion=warp` and `workers=0`. null: sequences
     from the dataset only. (`detect.stream` is another setting: it reads a dataset in portions.)"""
     warp: FusionConfig
-    """Network with the later frame warped by the nominal motion and both frames stacked in channels; the default
-    navigator."""
+    """Network with the later frame warped by the nominal motion and both frames stacked in channels."""
     stack: FusionConfig
     """The paper's network, with the two frames stacked in height; used by the explanations."""
 

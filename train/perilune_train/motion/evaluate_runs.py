@@ -1,4 +1,4 @@
-"""Evaluate a finished navigation run on a split of any dataset, and compare evaluations in a table and a picture."""
+"""Evaluate a navigation run, or alignment, on a split of any dataset; compare evaluations in a table and a picture."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import for_markdown
 from perilune_train.motion.covariance import stated_covariances
 from perilune_train.motion.data.trajectories import Motion, Pose, Trajectory, load_split
-from perilune_train.motion.metrics.baselines import MethodMotions, baselines
+from perilune_train.motion.metrics.baselines import ALIGNMENT, MethodMotions, alignment_ms_per_pair, baselines
 from perilune_train.motion.metrics.floors import FLOORS, constant_pose
 from perilune_train.motion.metrics.pictures import draw_errors
 from perilune_train.motion.metrics.report import ERRORS_FILE, write_evaluation, write_pose_evaluation
@@ -88,6 +88,24 @@ def evaluate_navigator(run: Path, evaluated: EvaluatedSplit, out: Path) -> Path:
     return out
 
 
+def evaluate_alignment(evaluated: EvaluatedSplit, out: Path) -> Path:
+    """Evaluate direct alignment, and the other methods without training, on a split; returns `out`.
+
+    Writes the same files as `evaluate_navigator`, with the method `alignment` in place of a network.
+    """
+    dataset, split = open_single(evaluated.dataset), evaluated.split
+    trajectories = load_split(dataset, split)
+    details: Metrics = {
+        f"{split}/pairs": sum(trajectory.n_pairs for trajectory in trajectories),
+        f"{split}/ms_per_single_pair": alignment_ms_per_pair(trajectories[0]),
+        "dataset/name": dataset.info.name,
+        "dataset/protocol": protocol_of(dataset.info),
+        **check_terrain(Provenance(), dataset, split).metrics(),
+    }
+    write_evaluation(out, ALIGNMENT, split, trajectories, baselines([], trajectories), details)
+    return out
+
+
 def _check_area(path: Path, known: Provenance, dataset: Dataset, split: str) -> None:
     """Raise UserError unless a split is over the landing area that a pose network was trained on."""
     trained = {use.sha256 for use in known.uses if use.use == "trained"}
@@ -114,6 +132,23 @@ def _evaluate_pose(
     methods = {"stack": poses, "mean_pose": [constant_pose(*mean, trajectory.n_pairs) for trajectory in trajectories]}
     page = write_pose_evaluation(out, "stack", split, trajectories, methods, measured | details)
     say_page(page)
+
+
+def learned_motions(run: Path, trajectories: list[Trajectory]) -> MethodMotions:
+    """Motions that a run's best weights estimate, and their covariances if the run has calibrated them."""
+    best = RunFolder(run).best
+    fusion = fusion_of(best, load_weights(best)["architecture"])
+    network, architecture = load_navigator(best, fusion)
+    motions, _ = _timed(predict, network, architecture, trajectories)
+    stated = stated_covariances(run, network, architecture, trajectories)
+    return MethodMotions({fusion: motions}, {} if stated is None else {fusion: stated})
+
+
+def network_ms_per_pair(run: Path, trajectory: Trajectory) -> float:
+    """Time that a run's network takes for one pair of frames of a trajectory, milliseconds."""
+    best = RunFolder(run).best
+    network, architecture = load_navigator(best, fusion_of(best, load_weights(best)["architecture"]))
+    return round(1e3 * predict_by_pairs(network, architecture, trajectory)[1], 2)
 
 
 def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
@@ -167,7 +202,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         rows.append([for_markdown(f"{name} ({label})"), *where, *_cells(metrics, split)])
         run_errors = _read_errors(folder / ERRORS_FILE)
         errors[name] = run_errors[run_errors["method"] == method]
-        for other in ("klt", "nominal", "mean_at_step", "mean", *FLOORS):
+        for other in ("klt", ALIGNMENT, "nominal", "mean_at_step", "mean", *FLOORS):
             if (target, *where[:-1]) not in listed and f"baseline/{other}/position_rmse_vector_m" in metrics:
                 rows.append([other, *where[:-1], "-", *_cells(metrics, f"baseline/{other}")])
         listed.add((target, *where[:-1]))

@@ -22,7 +22,7 @@ _ERRORS = (
     "scene_id", "trajectory_id", "step", "altitude_m", "position_error_m", "orientation_error_deg", "drift_m",
     "drift_x_m", "drift_y_m", "drift_z_m", "method",
 )  # fmt: skip
-_DRAWN = ("warp", "stack", "klt", "klt_gyroscope", "nominal")
+_DRAWN = ("warp", "stack", "klt", "alignment", "nominal")
 """Methods that the figures show in addition to the methods of the runs. The table has all methods."""
 _POSE = {
     "position_rmse_vector_m": "position RMSE, vector (m)",

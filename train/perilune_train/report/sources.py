@@ -74,7 +74,8 @@ def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
         return Folders(
             both,
             (runs / "detect" / name, runs / "detect" / f"{name}{INSTALLED}"),
-            (navigate / name, navigate / f"{name}-stack"),
+            # The preset demo trains no warp network, so its absence is not worth a line in the report.
+            (*([navigate / name] if (navigate / name).is_dir() else []), navigate / f"{name}-stack"),
             (navigate / f"{name}-methods",),
             (runs / "explain" / name, runs / "explain" / f"{name}-causal"),
             landing=navigate / f"{name}-landing",

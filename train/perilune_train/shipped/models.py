@@ -1,4 +1,4 @@
-"""The trained networks that are installed with this package. Every `--run` option accepts their folders."""
+"""The trained networks that are installed with this package. `--run` options for their tasks accept their folders."""
 
 import json
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from typing import Literal
 
 from perilune_shared.errors import UserError
 
-Task = Literal["detect", "navigate"]
+Task = Literal["detect"]
 WEIGHTS = "weights.safetensors"
 BENCHMARK = "benchmark.json"
 CARD = "card.md"
 _FOLDER = Path(__file__).parent
-_TASKS: dict[str, Task] = {"crater-detector": "detect", "lander-navigator": "navigate"}
+_TASKS: dict[str, Task] = {"crater-detector": "detect"}
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class ShippedModel:
     name: str
     """Name of the network and of its folder."""
     task: Task
-    """Task of the network: detect (craters) or navigate."""
+    """Task of the network: detect (craters)."""
     folder: Path
     """Folder with config.yaml, metrics.json, weights.safetensors, benchmark.json and card.md."""
 
@@ -38,8 +38,6 @@ class ShippedModel:
         if not path.is_file():
             return "not scored on the locked benchmark"
         figures = json.loads(path.read_text(encoding="utf-8"))
-        if self.task == "navigate":
-            return f"position RMSE {figures['headline/position_rmse_vector_m']:.2f} m"
         return f"AP {figures['headline/ap50_paper']:.3f} ({figures['headline/ap50_paper_account']})"
 
 

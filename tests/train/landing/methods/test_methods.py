@@ -23,7 +23,6 @@ def test_a_page_with_every_method(quick, mapped, tmp_path):
     assert done.returncode == 0, done.stderr
     rows = pd.read_parquet(out / "navigation.parquet").set_index("method")
     expected = {
-        "warp",
         "klt",
         "klt_gyroscope",
         "alignment",
@@ -49,7 +48,7 @@ def test_a_page_with_every_method(quick, mapped, tmp_path):
         assert f"]({name})" in page
     record, inputs = (json.loads((out / name).read_text()) for name in ("metrics.json", "inputs.json"))
     assert record["split"] == "test" and "torch" in record["run/versions"] and record["run/commit"]
-    assert inputs["dataset"] == sha256_of(quick / "nav/dataset.json") and set(inputs) > {"navigator", "detector"}
+    assert inputs["dataset"] == sha256_of(quick / "nav/dataset.json") and "detector" in inputs
     again = methods("--dataset", quick / "nav", "--out", out)
     assert again.returncode == 2
     assert len(again.stderr.strip().splitlines()) == 1

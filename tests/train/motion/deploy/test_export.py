@@ -66,6 +66,12 @@ def exported(run_folder, dataset_nav, tmp_path_factory):
     return out
 
 
+def test_without_a_run_one_line_says_what_is_needed(tmp_path):
+    done = call("--out", tmp_path / "flight")
+    assert done.returncode == 2 and done.stderr.startswith("error: --run: got not given, expected the folder of a")
+    assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "flight").exists()
+
+
 def test_files_and_metadata(exported, run_folder, dataset_nav):
     assert sorted(path.name for path in exported.iterdir()) == ["README.md", "navigator.json", "navigator.onnx"]
     facts = json.loads((exported / "navigator.json").read_text())

@@ -1,21 +1,23 @@
-"""Training of `warp` from the weights of an earlier run, or from the installed navigator."""
+"""Training of `warp` from the weights of an earlier run."""
 
 import pytest
 import torch
 
-from perilune_shared.config.resolve import resolve
 from perilune_shared.errors import UserError
 from perilune_train.motion.config import NavigateConfig
 from perilune_train.motion.train.navigate_run import navigate_run
-from perilune_train.shipped.models import weights_file
-from perilune_train.training.runs import NamedRun, load_weights
+from perilune_train.shipped.models import WEIGHTS, shipped_run
+from perilune_train.training.runs import NamedRun, RunFolder, load_weights
 
-QUICK = ("navigate.fusion=warp", "navigate.warp.fine_epochs=1", "navigate.warp.sequence_pairs=2")
-SAME = ("navigate.warp.learning_rate=1e-9", "navigate.precision=float32", "navigate.device=cpu")
+NETWORK = {"size_px": 64, "width": 0.125, "hidden": 16, "sequence_pairs": 2, "batch_sequences": 2}
+"""The network of the fixture `navigated`."""
+# Almost no learning rate: the weights stay those of the start.
+NETWORK |= {"coarse_epochs": 0, "fine_epochs": 1, "learning_rate": 1e-9}
 
 
-def settings(preset: str, *changes: str) -> NavigateConfig:
-    return resolve(NavigateConfig, "navigate", "perilune_train", preset, None, (*QUICK, *changes))
+def settings(start: object) -> NavigateConfig:
+    network = dict(precision="float32", device="cpu", warp=NETWORK, stack=NETWORK)
+    return NavigateConfig(fusion="warp", init_from=str(start), **network)
 
 
 @pytest.fixture(autouse=True)
@@ -25,28 +27,26 @@ def no_tables(monkeypatch):
     monkeypatch.setattr("perilune_train.motion.train.navigate_run.calibrate", lambda *_: None)
 
 
-def test_a_run_starts_from_the_installed_navigator(dataset_nav, tmp_path):
-    (run,) = navigate_run(settings("demo", *SAME), dataset_nav, NamedRun(tmp_path, "a"), None)
-    installed = load_weights(weights_file("lander-navigator"))
-    trained = load_weights(run.best)
-    assert trained["architecture"]["scales"] == installed["architecture"]["scales"]
+def test_a_run_starts_from_an_earlier_run(navigated, make_dataset, tmp_path):
+    splits = {"train": 2, "val": 1, "test": 1}
+    other = make_dataset(tmp_path / "other", "nav", splits=splits, n_frames=4, seed=9)
+    start = RunFolder(navigated / "a").best
+    (run,) = navigate_run(settings(start), other, NamedRun(tmp_path, "b"), None)
+    before, trained = load_weights(start), load_weights(run.best)
+    assert trained["architecture"]["scales"] == before["architecture"]["scales"]
     weights = [
         name for name, value in trained["state_dict"].items() if value.is_floating_point() and "running" not in name
     ]
     assert len(weights) > 50
     for name in weights:
-        # Almost no learning rate: the weights of the start, rounded to half precision in the installed file.
-        assert torch.allclose(trained["state_dict"][name], installed["state_dict"][name], atol=1e-5), name
-    assert len(trained["terrain"]["uses"]) > len(installed["terrain"]["uses"])
+        assert torch.allclose(trained["state_dict"][name], before["state_dict"][name], atol=1e-5), name
+    assert len(trained["terrain"]["uses"]) > len(before["terrain"]["uses"])
 
 
-@pytest.mark.parametrize(
-    ("given", "field", "got"),
-    [("absent.ckpt", "checkpoint", "no such file"), ("crater-detector", "architecture", "crater-detector")],
-)
-def test_a_start_that_does_not_fit(dataset_nav, tmp_path, given, field, got):
-    config = settings("demo", f"navigate.init_from={given}")
+@pytest.mark.parametrize("given", ["absent.ckpt", "detector"])
+def test_a_start_that_does_not_fit(dataset_nav, tmp_path, given):
+    start = shipped_run("detect") / WEIGHTS if given == "detector" else given
     with pytest.raises(UserError) as error:
-        navigate_run(config, dataset_nav, NamedRun(tmp_path, "a"), None)
-    assert got in str(error.value)
+        navigate_run(settings(start), dataset_nav, NamedRun(tmp_path, "a"), None)
+    assert {"absent.ckpt": "no such file", "detector": "crater-detector"}[given] in str(error.value)
     assert not any(tmp_path.iterdir())

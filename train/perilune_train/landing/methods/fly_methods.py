@@ -8,7 +8,6 @@ import pandas as pd
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.export.foreign_text import code_span, for_markdown
-from perilune_shared.geometry.frames import Array
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import new_folder, write_text
 from perilune_train.landing.craters.catalogue import Catalogue
@@ -24,12 +23,11 @@ from perilune_train.landing.methods.absolute import (
 from perilune_train.landing.methods.page import page_of
 from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
-from perilune_train.motion.covariance import stated_covariances
-from perilune_train.motion.data.trajectories import Motion, Trajectory, load_split
-from perilune_train.motion.evaluate_runs import fusion_of
-from perilune_train.motion.metrics.baselines import baselines
+from perilune_train.motion.data.trajectories import Trajectory, load_split
+from perilune_train.motion.evaluate_runs import fusion_of, learned_motions
+from perilune_train.motion.metrics.baselines import MethodMotions, baselines
 from perilune_train.motion.metrics.errors import motion_errors, summary
-from perilune_train.motion.network import check_motion, load_navigator, predict
+from perilune_train.motion.network import check_motion
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import write_metrics
@@ -42,11 +40,12 @@ PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png"
 
 
 def fly_methods(
-    evaluated: EvaluatedSplit, navigator: Path, detector: Path, out: Path, maps: Path | None = None
+    evaluated: EvaluatedSplit, navigator: Path | None, detector: Path, out: Path, maps: Path | None = None
 ) -> pd.DataFrame:
-    """Fly all methods over a split with a navigator and a detector; returns one row per method.
+    """Fly all methods over a split; returns one row per method.
 
-    `navigator` and `detector` are folders of runs; `maps` is the folder of a map from `navigate map`. Writes
+    `navigator` and `detector` are folders of runs; without a navigator, all methods of relative motion are methods
+    without training. `maps` is the folder of a map from `navigate map`. Writes
     methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
     pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`; writes nothing if
     it fails. Raises UserError if a network was fitted to the terrain of the split (unless `evaluated` allows overlap),
@@ -56,10 +55,12 @@ def fly_methods(
     # Record the commit at the start: the checkout may change during the run.
     run_record()
     dataset = open_single(address)
-    best = {name: RunFolder(run).best for name, run in (("navigator", navigator), ("detector", detector))}
+    runs = {"navigator": navigator, "detector": detector}
+    best = {name: RunFolder(run).best for name, run in runs.items() if run is not None}
     contents = {name: load_weights(path) for name, path in best.items()}
-    fusion = fusion_of(best["navigator"], contents["navigator"]["architecture"])
-    check_motion(best["navigator"], contents["navigator"]["architecture"])
+    if navigator is not None:
+        fusion_of(best["navigator"], contents["navigator"]["architecture"])
+        check_motion(best["navigator"], contents["navigator"]["architecture"])
     checks = [
         check_terrain(read_provenance(contents[name], path), dataset, split, evaluated.allow_overlap)
         for name, path in best.items()
@@ -69,12 +70,8 @@ def fly_methods(
         trajectories = load_split(dataset, split)
         catalogues = catalogues_of(dataset, sorted({trajectory.ids[0] for trajectory in trajectories}), mapped)
         descents, detection_s = seen_descents(dataset, trajectories, detector)
-        network, architecture = load_navigator(best["navigator"], fusion)
-        learned: dict[str, list[Motion]] = {
-            fusion: [predict(network, architecture, trajectory) for trajectory in trajectories]
-        }
-        stated = stated_covariances(navigator, network, architecture, trajectories)
-        relative = _relative(trajectories, learned, {} if stated is None else {fusion: stated})
+        learned = MethodMotions({}, {}) if navigator is None else learned_motions(navigator, trajectories)
+        relative = _relative(trajectories, learned)
         errors = absolute_errors(dataset, descents, catalogues)
         absolute = pd.DataFrame([{"method": name, **absolute_summary(name, table)} for name, table in errors.items()])
         rows = pd.concat([relative, absolute.assign(kind="absolute")], ignore_index=True)
@@ -95,13 +92,11 @@ def fly_methods(
     return rows
 
 
-def _relative(
-    trajectories: list[Trajectory], learned: dict[str, list[Motion]], stated: dict[str, list[Array]]
-) -> pd.DataFrame:
+def _relative(trajectories: list[Trajectory], learned: MethodMotions) -> pd.DataFrame:
     """Errors of the motion between consecutive frames, one row per method."""
     classical = baselines([], trajectories)
-    rows, covariances = [], {**stated, **classical.covariances}
-    for method, motions in {**learned, **classical.motions}.items():
+    rows, covariances = [], learned.covariances | classical.covariances
+    for method, motions in (learned.motions | classical.motions).items():
         figures = summary(motion_errors(trajectories, motions, covariances.get(method)))
         rows.append(
             {

@@ -1,5 +1,6 @@
 """Methods without a network: KLT tracks, direct alignment, the nominal motion, mean motions of the training set."""
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,10 @@ from perilune_train.motion.geometry import mean_rotation
 GYROSCOPE: InertialGrade = "tactical"
 """Grade of the inertial unit that provides the rotations of `klt_gyroscope` and `alignment_gyroscope`."""
 
-CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
+ALIGNMENT = "alignment"
+"""The default method of relative motion, used if no run of a network is given."""
+
+CLASSICAL = ("klt", "klt_gyroscope", ALIGNMENT, "alignment_gyroscope")
 """Methods that read the images, in the order of the tables."""
 
 
@@ -41,7 +45,7 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotio
         estimated: dict[str, list[EstimatedMotion]] = {}
         for trajectory in test:
             gyroscope = trajectory.gyroscopes.get(GYROSCOPE)
-            for name, method in (("klt", klt_trajectory), ("alignment", aligned_trajectory)):
+            for name, method in (("klt", klt_trajectory), (ALIGNMENT, aligned_trajectory)):
                 estimated.setdefault(name, []).append(method(trajectory))
                 if gyroscope is not None:
                     estimated.setdefault(f"{name}_gyroscope", []).append(method(trajectory, gyroscope))
@@ -54,6 +58,13 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> MethodMotio
         motions["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
         motions["mean"] = [mean_motion(training, trajectory) for trajectory in test]
     return MethodMotions(motions, covariances)
+
+
+def alignment_ms_per_pair(trajectory: Trajectory) -> float:
+    """Time that alignment takes for one pair of frames of a trajectory, milliseconds."""
+    started = time.monotonic()
+    aligned_trajectory(trajectory)
+    return round(1e3 * (time.monotonic() - started) / trajectory.n_pairs, 2)
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:

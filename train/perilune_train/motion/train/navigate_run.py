@@ -31,7 +31,6 @@ from perilune_train.records.provenance import (
     read_provenance,
     training_provenance,
 )
-from perilune_train.shipped.models import weights_file
 from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.fit import Hardware, Schedule, Wording, fit, own_share
 from perilune_train.training.runs import (
@@ -94,7 +93,7 @@ def _run(
         check_one_area(opened)
     provenance = training_provenance(opened)
     start = _initial_checkpoint(settings) if "warp" in fusions else None
-    start_terrain = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
+    start_terrain = [] if start is None else [read_provenance(start, Path(str(settings.init_from)))]
     terrain = {"warp": provenance.joined(start_terrain), "stack": provenance.joined(inherited)}
     # Both runs share one check, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"].joined(start_terrain), opened, "test", allow_overlap)
@@ -175,7 +174,7 @@ def _initial_checkpoint(settings: NavigateConfig) -> dict[str, Any] | None:
     """Content of the checkpoint `navigate.init_from`. Raises UserError if its network has another architecture."""
     if settings.init_from is None:
         return None
-    path, warp = weights_file(settings.init_from), settings.warp
+    path, warp = Path(settings.init_from), settings.warp
     content = load_weights(path)
     expected = {"fusion": "warp", **{key: getattr(warp, key) for key in ("size_px", "width", "attention", "hidden")}}
     check_architecture(path, content["architecture"], expected)
@@ -196,7 +195,7 @@ def _warp_task(
         return NavigationTask(settings, "warp", trajectories, share, stream)
     scales = Scales(**start["architecture"]["scales"])
     task = NavigationTask(settings, "warp", trajectories, share, stream, Initial(scales=scales))
-    load_state(task.network, start["state_dict"], weights_file(str(settings.init_from)))
+    load_state(task.network, start["state_dict"], Path(str(settings.init_from)))
     return task
 
 
