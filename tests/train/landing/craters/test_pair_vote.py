@@ -49,6 +49,23 @@ def test_a_sure_pose_has_the_true_place_altitude_and_heading(catalogue, altitude
         assert abs(np.arctan2(turn[1, 0], turn[0, 0])) < 0.05
 
 
+def test_sightings_smaller_than_the_catalogue_do_not_hide_the_others():
+    """Near the ground most sightings are smaller than all craters of the catalogue, and lie between the others."""
+    dense = world(3, 400.0, 3.0, 0.1)
+    catalogue = dense.part(dense.radius_m > 3.0)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        true = pose(rng, 200.0, reach_m=50.0)
+        seen = sighted(dense, true, rng, most=500)
+        large = seen.part(seen.radius_px > 0.7 * 3.0 * CAMERA.fx_px / 200)
+        assert len(large) < 0.6 * len(seen)
+        limits = SearchRange(catalogue.ground_m(true.position_m, 30), 5.0, 20.0, (-0.06, 0.06), 0.05)
+        (found, *_), _ = pair_candidates(seen, catalogue, CAMERA, true, limits, 4_000_000)
+        (expected, *_), _ = pair_candidates(large, catalogue, CAMERA, true, limits, 4_000_000)
+        assert off_px(found.pose, true) < 4
+        assert found.significance > 0.8 * expected.significance
+
+
 def test_no_pose_is_sure_at_another_place_and_time_is_limited():
     for seed in range(4):
         rng = np.random.default_rng(seed)

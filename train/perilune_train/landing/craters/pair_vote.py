@@ -30,6 +30,9 @@ _ROUNDS = (40, 70, 100, 140, 200, 300, 450, 700, 1000, 1500, 2400)
 """Numbers of pairs that have voted at the ends of the rounds."""
 _SIZE_TOLERANCE = 0.27
 """Largest difference of the logarithms of the radii of a sighting and its crater."""
+_SMALL_SHARE = 0.01
+"""Share of the craters of a catalogue that may be smaller than the sightings that vote. Near the ground, most sightings
+are smaller than the smallest crater of a catalogue."""
 _BIN_PX, _LAYER = 3.0, 0.03
 """Side of a bin, pixels at the expected altitude, and its height, as a share of the altitude. Votes are summed over
 three by three by three bins."""
@@ -96,8 +99,12 @@ def pair_candidates(
     All poses have the tilt of `expected`. Only the first pose is returned if it is sure. No round begins after
     `max_tried` trials of a crater for the first sighting of a pair, which limits the time.
     """
+    if not len(catalogue):
+        return [], False
     altitude_m = float(expected.position_m[2]) - limits.ground_m
     bins = _bins(limits, altitude_m, camera)
+    least_px = np.quantile(catalogue.radius_m, _SMALL_SHARE) * camera.fx_px / bins.high_m * np.exp(-_SIZE_TOLERANCE)
+    sightings = sightings.part(sightings.radius_px >= least_px)
     middle_px = np.array([[camera.width_px / 2, camera.height_px / 2]])
     rays = camera.rays(np.concatenate([sightings.centre_px, middle_px])) @ expected.rotation_camera_from_site
     if not (rays[:, 2] < 0).all():

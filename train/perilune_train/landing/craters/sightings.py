@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array
 
@@ -46,8 +47,11 @@ class Sightings:
         """The `count` sightings with the highest scores, sorted by decreasing radius."""
         if len(self) <= count:
             return self
-        best = np.sort(np.argsort(-self.score, kind="stable")[:count])
-        return Sightings(self.centre_px[best], self.radius_px[best], self.score[best])
+        return self.part(np.sort(np.argsort(-self.score, kind="stable")[:count]))
+
+    def part(self, chosen: NDArray[np.bool_] | NDArray[np.integer]) -> "Sightings":
+        """The sightings with the given indices or mask."""
+        return Sightings(self.centre_px[chosen], self.radius_px[chosen], self.score[chosen])
 
     def __len__(self) -> int:
         return len(self.radius_px)
