@@ -1,6 +1,8 @@
 """Local contrast of frames, image pyramids, and bilinear sampling."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,25 +22,31 @@ class Level:
 
     camera: Camera
     """Intrinsics of this level."""
-    contrast: Array
-    """Local contrast (height, width)."""
+    contrast: Any
+    """Local contrast (height, width), or what another function computed from the image (see `pyramid`)."""
 
 
-def local_contrast(image: np.ndarray) -> Array:
+def local_contrast(image: np.ndarray, fine_px: float = _FINE_PX, coarse_px: float = _COARSE_PX) -> Array:
     """Contrast (height, width) of an 8-bit image with its surroundings: (G_fine - G_coarse) / G_coarse.
 
-    A brightness factor that varies slowly, over many pixels, does not change this contrast. Aligning grey values
-    instead gave errors of metres (docs/notebook/2026-11-23-alignment.md).
+    `fine_px` and `coarse_px` are the standard deviations of the two blurs, pixels. A brightness factor that varies
+    slowly, over many pixels, does not change this contrast. Aligning grey values instead gave errors of metres
+    (docs/notebook/2026-11-23-alignment.md).
     """
     grey = image.astype(np.float32)
     fine, coarse = (
-        cv2.GaussianBlur(grey, (0, 0), sigma, borderType=cv2.BORDER_REFLECT) for sigma in (_FINE_PX, _COARSE_PX)
+        cv2.GaussianBlur(grey, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT) for sigma_px in (fine_px, coarse_px)
     )
     return (fine - coarse) / (coarse + _MIN_BACKGROUND)
 
 
-def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:
-    """Levels of an image, coarsest first. Each is half as large as the next one, reduced by area averaging."""
+def pyramid(
+    image: np.ndarray, camera: Camera, n_levels: int, contrast: Callable[[np.ndarray], Any] = local_contrast
+) -> list[Level]:
+    """Levels of an image, coarsest first. Each is half as large as the next one, reduced by area averaging.
+
+    `contrast` computes what a level stores from its 8-bit image.
+    """
     levels = []
     for number in range(n_levels):
         if number:
@@ -48,7 +56,7 @@ def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:
             camera = Camera(
                 width, height, camera.fx_px * across, camera.fy_px * down, camera.cx_px * across, camera.cy_px * down
             )
-        levels.append(Level(camera, local_contrast(image)))
+        levels.append(Level(camera, contrast(image)))
     return levels[::-1]
 
 
