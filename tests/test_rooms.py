@@ -41,7 +41,7 @@ ROOMS = {
     "train/perilune_train/motion": (
         "config geometry data network pose classical metrics covariance train evaluate_runs benchmark deploy"
     ),
-    "train/perilune_train/landing": "craters filter fly map methods monte_carlo",
+    "train/perilune_train/landing": "craters filter fly map methods monte_carlo trace",
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""
 
