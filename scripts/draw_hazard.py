@@ -1,4 +1,4 @@
-"""Draw docs/pictures/hazard.png: a frame, its scene's hazard map, and its flash lidar image.
+"""Draw docs/pictures/hazard.jpg: a frame, its scene's hazard map, and its flash lidar image.
 
 python scripts/draw_hazard.py data/hazard/nav scene-0000/trajectory-0000/000004
 """
@@ -25,7 +25,7 @@ from perilune_shared.dataset.manifest import open_dataset
 
 
 def main(folder: Path, frame_id: str) -> None:
-    """Write docs/pictures/hazard.png from a frame of a dataset with hazard maps and flash lidar."""
+    """Write docs/pictures/hazard.jpg from a frame of a dataset with hazard maps and flash lidar."""
     dataset = open_dataset(folder)
     row = next(row for row in dataset.table("frames").to_pylist() if row["frame_id"] == frame_id)
     scene = next(row_of for row_of in dataset.table("scenes").to_pylist() if row_of["scene_id"] == row["scene_id"])
@@ -55,7 +55,7 @@ def main(folder: Path, frame_id: str) -> None:
         ax.set_xlabel("east, m")
         figure.colorbar(shown, ax=ax, shrink=0.8)
     axes[2].set_ylabel("north, m")
-    figure.savefig(Path(__file__).parent.parent / "docs/pictures/hazard.png", dpi=65)
+    figure.savefig(Path(__file__).parent.parent / "docs/pictures/hazard.jpg", dpi=65, pil_kwargs={"quality": 86})
 
 
 if __name__ == "__main__":
