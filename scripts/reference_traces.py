@@ -10,9 +10,18 @@ is needed after each change of the filter.
 
 import argparse
 import shutil
+import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from perilune_shared.console.interrupts import end_at_interrupt
+
+if __name__ == "__main__":
+    # An import by another module must not change how Ctrl-C works.
+    end_at_interrupt()
+    # Found as a file, too: `python scripts/reference_traces.py`.
+    sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import numpy as np
 from scripts.trace_page import write_page

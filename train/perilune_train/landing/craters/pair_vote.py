@@ -47,6 +47,10 @@ _HEADING_RAD = 0.02
 """Votes of a peak whose headings differ by less than this are averaged."""
 _MAX_VOTES = 3_000_000
 """Largest number of kept votes, which limits the memory."""
+_MAX_VISITED = 20_000_000
+"""Largest number of visits of a second crater in a round, which limits the time if a catalogue is unusually dense. No
+round follows."""
+_LIMITS = _SIZE_TOLERANCE, _MAX_VISITED
 
 
 class _Ground(NamedTuple):
@@ -125,7 +129,9 @@ def pair_candidates(
     peaks: list[tuple[float, int]] = []
     is_sure = False
     for last in _ROUNDS:
-        new, cell, crossing, tried = _vote(ray, radius, pairs[first:last], ground, bins, _SIZE_TOLERANCE, votes)
+        new, cell, crossing, tried = _vote(
+            ray, radius, pairs[first:last], ground, bins, (_SIZE_TOLERANCE, _MAX_VISITED), votes
+        )
         kept = np.concatenate([kept[0], new]), np.concatenate([kept[1], cell])
         hot, n_tried, first = np.concatenate([hot, crossing]), n_tried + tried, last
         peaks = _peaks(votes, hot, len(kept[0]), bins)
@@ -207,22 +213,25 @@ def _vote(
     pairs: NDArray[np.int64],
     ground: _Ground,
     bins: _Bins,
-    size_tolerance: float,
+    limits: tuple[float, int],
     votes: NDArray[np.uint16],
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64], int]:
     """Let pairs (P, 2) vote; add their votes to `votes`.
 
     `ray` (M, 2) are the sightings on the plane at depth 1 in the axes of O_L, relative to the middle of the image, and
     `radius` (M,) their radii there. Returns the votes (V, 4) as place (x, y), altitude and heading, the bins of the
-    votes (V,), the bins whose number of votes has reached two, and the number of craters tried.
+    votes (V,), the bins whose number of votes has reached two, and the number of craters tried, or a very large number
+    if too many second craters were visited. `limits` are the largest difference of the logarithms of two radii, and the
+    number of visited second craters at which voting ends.
     """
+    size_tolerance, max_visited = limits
     factor, tangent = np.exp(size_tolerance), np.tan(min(bins.heading_rad, 1.5))
     cos, sin = np.cos(bins.heading_rad), np.sin(bins.heading_rad)
     width = 2 * bins.n_sides + 1
     xy, begin, corner, side, n = ground.xy_m, ground.begin, ground.corner, ground.side, ground.n
     sizes = ground.radius_m[ground.by_radius]
     kept, cell, count = np.empty((4096, 4), np.float32), np.empty(4096, np.int64), 0
-    hot, n_hot, tried = np.empty(4096, np.int64), 0, 0
+    hot, n_hot, tried, visited = np.empty(4096, np.int64), 0, 0, 0
     for p in range(len(pairs)):
         i, j = pairs[p]
         across, up = ray[j, 0] - ray[i, 0], ray[j, 1] - ray[i, 1]
@@ -234,7 +243,11 @@ def _vote(
         far = abs(ray[i, 0]) + abs(ray[i, 1])
         first = np.searchsorted(sizes, radius[i] * bins.low_m / factor)
         last = np.searchsorted(sizes, radius[i] * bins.high_m * factor)
+        if visited > max_visited:
+            break
         for k in range(first, last):
+            if visited > max_visited:
+                break
             a = ground.by_radius[k]
             x, y = xy[a]
             # The size of the crater limits the altitude.
@@ -252,6 +265,7 @@ def _vote(
             west, east = _clipped(x + least_x, corner[0], side[0], n), _clipped(x + most_x, corner[0], side[0], n)
             south, north = _clipped(y + least_y, corner[1], side[1], n), _clipped(y + most_y, corner[1], side[1], n)
             for row in range(south, north + 1):
+                visited += begin[row * n + east + 1] - begin[row * n + west]
                 for b in range(begin[row * n + west], begin[row * n + east + 1]):
                     step_x, step_y = xy[b, 0] - x, xy[b, 1] - y
                     # The quotient of both separations, as complex numbers: altitude and heading.
@@ -288,7 +302,7 @@ def _vote(
                             hot = np.append(hot, hot)
                         hot[n_hot] = place
                         n_hot += 1
-    return kept[:count], cell[:count], hot[:n_hot], tried
+    return kept[:count], cell[:count], hot[:n_hot], tried if visited <= max_visited else 1 << 60
 
 
 def _peaks(votes: NDArray[np.uint16], hot: NDArray[np.int64], n_votes: int, bins: _Bins) -> list[tuple[float, int]]:
