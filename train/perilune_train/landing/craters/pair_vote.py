@@ -47,7 +47,7 @@ _HEADING_RAD = 0.02
 """Votes of a peak whose headings differ by less than this are averaged."""
 _MAX_VOTES = 3_000_000
 """Largest number of kept votes, which limits the memory."""
-_MAX_VISITED = 20_000_000
+_MAX_VISITED = 5_000_000
 """Largest number of visits of a second crater in a round, which limits the time if a catalogue is unusually dense. No
 round follows."""
 _LIMITS = _SIZE_TOLERANCE, _MAX_VISITED
