@@ -371,7 +371,7 @@ traces: ## fly the landing filter over the inputs of the reference traces again,
 # The same settings as in docs/notebook/2026-11-28-landing.md; takes an hour on two cores.
 TRACE_DATA := --set dataset.nav.n_frames=40 --set dataset.nav.split_by=scene --set dataset.nav.val_share=0 \
   --set dataset.nav.test_share=1 --set 'dataset.nav.flight.azimuth_deg={low: 0, high: 360}' --set 'dataset.nav.sun.elevation_deg={low: 8, high: 65}'
-trace-inputs: setup # render the descents of the reference traces from their seeds and make inputs and tables anew
+trace-inputs: setup # render the descents of the reference traces from their seeds; write their inputs and tables again
 	@$(BIN)/perilune-render dataset --preset large --kind nav --config configs/highland.yaml --set dataset.name=sensors-a --set dataset.nav.n_scenes=2 \
 	  --set dataset.nav.trajectories_per_scene=2 $(TRACE_DATA) --set dataset.render.engine=heightfield \
 	  --set 'dataset.nav.instruments.inertial_grades=[cubesat,tactical,navigation]' --set dataset.nav.instruments.star_tracker_rate_hz=1 \

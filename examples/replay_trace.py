@@ -1,4 +1,4 @@
-"""Replay a propagation and an update by a range of a reference trace of the landing filter, with NumPy only.
+"""Replay a propagation and an update by a range of a reference trace of the landing filter, by its equations.
 
 python examples/replay_trace.py examples/traces/nominal
 """

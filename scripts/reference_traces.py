@@ -49,7 +49,8 @@ TRACES = Path(__file__).parent.parent / "examples" / "traces"
 _MARGIN_PX, _LEAST_PX = 48.0, 1.2
 """Craters of the catalogue that are never in view with this margin and at least this radius are left out."""
 _MOUNTING_DEG = 30.0
-"""Rotation of the body's axes about Z_B in the descent with all sensors, so that no mounting matrix is symmetric."""
+"""Rotation of the body's axes about Z_B in the descent with all sensors. A symmetric mounting matrix would not show a
+transposed one."""
 _RATE_BITS, _FORCE_BITS = 22, 16
 """Inertial measurements are rounded to multiples of 2^-bits of their unit."""
 _NO_CRATERS = 5

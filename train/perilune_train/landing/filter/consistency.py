@@ -50,7 +50,7 @@ class Consistency:
     def add(self, sensor: str, time_s: float, squared: float, n_parts: int) -> None:
         """Add the squared normalised innovation of a measurement of `n_parts` numbers.
 
-        It is limited to twice the value of the gate, so that no single wrong measurement raises an alarm.
+        The value is limited to twice the gate. A single wrong measurement therefore raises no alarm.
         """
         window = self._squares.setdefault(sensor, deque())
         window.append((time_s, min(squared, 2 * gate(n_parts)), n_parts))
