@@ -11,7 +11,7 @@ from perilune_train.training.runs import NamedRun, RunFolder, load_weights
 
 NETWORK = {"size_px": 64, "width": 0.125, "hidden": 16, "sequence_pairs": 2, "batch_sequences": 2}
 """The network of the fixture `navigated`."""
-# Almost no learning rate: the weights stay those of the start.
+# The learning rate is almost zero, so the weights hardly change.
 NETWORK |= {"coarse_epochs": 0, "fine_epochs": 1, "learning_rate": 1e-9}
 
 

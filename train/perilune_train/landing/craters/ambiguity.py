@@ -12,7 +12,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_train.compiled import compiled
 from perilune_train.landing.craters.catalogue import Catalogue
-from perilune_train.landing.craters.fix import Fix
+from perilune_train.landing.craters.fix import MIN_SIZE_RATIO, SIZE_SPAN, Fix
 from perilune_train.landing.craters.matching import Circles
 from perilune_train.landing.craters.neighbours import within_reach
 from perilune_train.landing.craters.projection import projected
@@ -22,10 +22,6 @@ _REACH_SIGMAS = 4.0
 """Largest distance of a crater from a sighting along each axis, standard deviations."""
 _REACH_PX = 10.0
 """Largest distance from the image of the craters that are considered, pixels."""
-_MIN_SIZE_RATIO = 0.7
-"""Radius of the smallest crater that is considered, as a share of the radius of the smallest sighting."""
-_SIZE_SPAN = 2.0
-"""Range of the logarithms of the radii of false sightings."""
 
 
 def match_probability(sightings: Sightings, catalogue: Catalogue, camera: Camera, fix: Fix) -> Array:
@@ -34,7 +30,7 @@ def match_probability(sightings: Sightings, catalogue: Catalogue, camera: Camera
     The alternatives are the other craters of the catalogue near the sighting, and a false sighting. Half of all
     sightings are assumed to be false.
     """
-    least_px = _MIN_SIZE_RATIO * float(sightings.radius_px.min())
+    least_px = MIN_SIZE_RATIO * float(sightings.radius_px.min())
     expected = projected(catalogue, camera, fix.pose, _REACH_PX, least_px)
     placed_px = camera.fx_px / expected.depth_m * catalogue.position_sigma_m
     matched = fix.sighting
@@ -44,7 +40,7 @@ def match_probability(sightings: Sightings, catalogue: Catalogue, camera: Camera
     reach_px = _REACH_SIGMAS * np.hypot(noise_px, np.max(placed_px, initial=0.0))
     first, crater = within_reach(seen.centre_px, reach_px, craters.centre_px)
     size_sigma = float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
-    clutter = len(expected.index) / (camera.width_px * camera.height_px * _SIZE_SPAN)
+    clutter = len(expected.index) / (camera.width_px * camera.height_px * SIZE_SPAN)
     return _probability(
         seen,
         craters,

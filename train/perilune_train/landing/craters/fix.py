@@ -27,7 +27,7 @@ _SOFT_PX = (6.0, 4.0, 2.5, 1.5, 1.0)
 """Error of the pose that each soft round assumes, pixels, in addition to the noise of the sightings."""
 _SOFT_SIGMAS = 2.5
 """Largest distance of a crater from a sighting in a soft round, standard deviations."""
-_CLUTTER_SHARE, _SIZE_SPAN = 0.5, 2.0
+_CLUTTER_SHARE, SIZE_SPAN = 0.5, 2.0
 """Assumed share of false sightings, and the range of the logarithms of their radii."""
 _N_HARD = 3
 """Number of one-to-one rounds at the end."""
@@ -39,7 +39,7 @@ smallest radius to match. No match is lost: the start is correct to a few pixels
 _TUKEY = 4.685
 COMMON_PX = 0.08
 """Standard deviation, pixels, of the error that all centres in a frame share."""
-_MIN_SIZE_RATIO = 0.7
+MIN_SIZE_RATIO = 0.7
 """Radius of the smallest crater to match, as a share of the radius of the smallest sighting."""
 MIN_MATCHES = 6
 """Smallest number of sightings with which a fix is possible."""
@@ -95,10 +95,10 @@ def refine(
     precision = np.linalg.inv(prior.covariance)
     pose, noise_px = start, np.hypot(sightings.noise_px, sightings.static_px)
     size, size_sigma = np.log(sightings.radius_px), float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
-    least_px = _MIN_SIZE_RATIO * float(sightings.radius_px.min())
+    least_px = MIN_SIZE_RATIO * float(sightings.radius_px.min())
     in_field = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
     catalogue = catalogue.part(in_field)
-    clutter = _CLUTTER_SHARE / (1 - _CLUTTER_SHARE) / (camera.width_px * camera.height_px * _SIZE_SPAN)
+    clutter = _CLUTTER_SHARE / (1 - _CLUTTER_SHARE) / (camera.width_px * camera.height_px * SIZE_SPAN)
     for soft_px in _SOFT_PX[_first_round(start_px) :]:
         expected = projected(catalogue, camera, pose, 3 * soft_px, least_px)
         placed_px = camera.fx_px / expected.depth_m * catalogue.position_sigma_m
