@@ -94,6 +94,8 @@ class LossSettings(Section):
     """Weight of L_obj."""
     lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
+    lambda_ellipse: Weight = 0.1
+    """Weight of the loss of ellipses and of their standard deviations, used with `ellipses`."""
     lambda_teacher: Weight = 1.0
     """Weight of the distillation loss, used with `teacher`. lambda_iou and lambda_obj weight the two terms of the
     loss."""
@@ -143,6 +145,9 @@ class DetectConfig(Section):
     """Input channels. 3: the grey frame three times, as in the paper's RGB network."""
     strides: tuple[_Stride, _Stride, _Stride] = (8, 16, 32)
     """Strides of the detection heads: 8 16 32 (the paper) or 4 8 16 (better for tiny craters)."""
+    ellipses: bool = False
+    """Predict the rim as an ellipse with standard deviations of centre and semi-axes, in addition to its box. False:
+    boxes only (the paper)."""
     epochs: Count = 20
     """Passes over the training frames."""
     frozen_epochs: Epochs = 0

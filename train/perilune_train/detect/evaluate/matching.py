@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.boxes import coverage_matrix, iou_matrix
+from perilune_train.detect.evaluate.ellipses import ellipses_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -72,6 +73,51 @@ class Detections:
     """x0, y0, x1, y1 in pixels (D, 4)."""
     scores: Array
     """Scores (D,), in (0, 1)."""
+    shapes: Array | None = None
+    """Correlation of the ellipse in each box (ellipses.py), and the standard deviations of the ellipse: of the centre's
+    x and y, of the semi-major and of the semi-minor axis, pixels (D, 5). None if the detector predicts only boxes."""
+
+    @property
+    def ellipses(self) -> Array:
+        """Centre x, y, semi-major and semi-minor axis in pixels, direction in radians, in [0, pi) (D, 5).
+
+        Without shapes, the axis-aligned ellipses in the boxes.
+        """
+        return ellipses_of(self.boxes, np.zeros(len(self.boxes)) if self.shapes is None else self.shapes[:, 0])
+
+    def take(self, chosen: NDArray) -> "Detections":
+        """The detections with the given rows, or those for which a mask (D,) is True."""
+        shapes = None if self.shapes is None else self.shapes[chosen]
+        return Detections(self.boxes[chosen], self.scores[chosen], shapes)
+
+    def moved(self, x_px: float, y_px: float) -> "Detections":
+        """The detections with other coordinates: `x_px` and `y_px` are added."""
+        return replace(self, boxes=self.boxes + np.array([x_px, y_px, x_px, y_px]))
+
+    def divided(self, ratio_x: float, ratio_y: float) -> "Detections":
+        """The detections in the coordinates of an image that was resized by these factors before detection."""
+        shapes = None if self.shapes is None else self.shapes / shape_divisors(ratio_x, ratio_y)
+        return Detections(self.boxes / np.array([ratio_x, ratio_y] * 2), self.scores, shapes)
+
+
+def shape_divisors(ratio_x: float, ratio_y: float) -> Array:
+    """Divisors (5,) of shapes if an image was resized by these factors; correlations do not change.
+
+    The factors of a resized image differ by less than one pixel in its size, so their geometric mean is used for the
+    standard deviations of the semi-axes.
+    """
+    mean = float(np.sqrt(ratio_x * ratio_y))
+    return np.array([1.0, ratio_x, ratio_y, mean, mean])
+
+
+def joined_detections(parts: Sequence[Detections]) -> Detections:
+    """The detections of all parts (at least one) as one list, in the order of the parts."""
+    shapes = [part.shapes for part in parts if part.shapes is not None]
+    return Detections(
+        np.concatenate([part.boxes for part in parts]),
+        np.concatenate([part.scores for part in parts]),
+        np.concatenate(shapes) if shapes else None,
+    )
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ without labels.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import overload
 
@@ -160,8 +160,7 @@ def evaluate_detections_in_images(
     if image_set.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)
         detections = [
-            Detections(np.clip(part.boxes, 0, limit), part.scores)
-            for part, limit in zip(detections, limits, strict=True)
+            replace(part, boxes=np.clip(part.boxes, 0, limit)) for part, limit in zip(detections, limits, strict=True)
         ]
     return evaluate_detections(
         detections,

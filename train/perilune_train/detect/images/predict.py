@@ -126,22 +126,20 @@ def _reference(path: Path) -> Georeference | None:
 
 def above(detections: Detections, threshold: float) -> Detections:
     """The detections with at least this score."""
-    strong = detections.scores >= threshold
-    return Detections(detections.boxes[strong], detections.scores[strong])
+    return detections.take(detections.scores >= threshold)
 
 
 def of_size(detections: Detections, min_size_px: float) -> Detections:
     """The detections of at least this size, sqrt(w h), pixels."""
     large = np.sqrt(np.prod(detections.boxes[:, 2:] - detections.boxes[:, :2], axis=1)) >= min_size_px
-    return Detections(detections.boxes[large], detections.scores[large])
+    return detections.take(large)
 
 
 def strongest(detections: Detections, top: int | None) -> Detections:
     """The `top` detections with the highest scores, in the given order; all if None."""
     if top is None or len(detections.scores) <= top:
         return detections
-    best = np.sort(np.argsort(-detections.scores, kind="stable")[:top])
-    return Detections(detections.boxes[best], detections.scores[best])
+    return detections.take(np.sort(np.argsort(-detections.scores, kind="stable")[:top]))
 
 
 def expanded(sources: list[Path], frames: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from perilune_shared.console.terminal import progress_bar
 from perilune_train.detect.config import COARSEST_STRIDE, DetectConfig
 from perilune_train.detect.data.split import DetectSplit
-from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.matching import Detections, shape_divisors
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.models.size import multiply_adds
@@ -76,14 +76,18 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
     The network runs once for each of `detect.evaluation.scales`; one suppression merges the detections of all scales.
     """
     height, width = frames.shape[1:]
-    boxes, scores = [], []
+    boxes, scores, shapes = [], [], []
     for factor in detector.config.evaluation.scales:
         to_height, to_width = scaled_size(height, width, factor)
         predicted = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
-        ratio = torch.tensor([to_width / width, to_height / height] * 2, device=detector.device)
-        boxes.append(predicted[0] / ratio)
+        ratios = to_width / width, to_height / height
+        boxes.append(predicted[0] / torch.tensor(ratios * 2, device=detector.device))
         scores.append(predicted[1])
-    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation)
+        if predicted[2] is not None:
+            divisors = torch.as_tensor(shape_divisors(*ratios), dtype=torch.float32, device=detector.device)
+            shapes.append(predicted[2] / divisors)
+    every_shape = torch.cat(shapes, 1) if shapes else None
+    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
 
 
 def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:
