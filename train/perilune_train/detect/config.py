@@ -94,8 +94,10 @@ class LossSettings(Section):
     """Weight of L_obj."""
     lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
-    lambda_ellipse: Weight = 0.1
-    """Weight of the loss of ellipses and of their standard deviations, used with `ellipses`."""
+    lambda_ellipse: Weight = 0.5
+    """Weight of the loss of the ellipses' correlations, used with `ellipses`."""
+    lambda_sigma: Weight = 0.05
+    """Weight of the loss of the ellipses' standard deviations, used with `ellipses`."""
     lambda_teacher: Weight = 1.0
     """Weight of the distillation loss, used with `teacher`. lambda_iou and lambda_obj weight the two terms of the
     loss."""

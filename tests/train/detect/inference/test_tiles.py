@@ -24,7 +24,7 @@ from perilune_train.detect.inference.tiles import (
 class Blobs(torch.nn.Module):
     """Finds bright patches as far as the tile shows them: at a border, only the part that is seen."""
 
-    def detect(self, images):
+    def detect_ellipses(self, images):
         boxes, scores = [], []
         for image in images[:, 0].numpy():
             bright = (image > (image.max() + image.min()) / 2).astype(np.uint8)
@@ -35,7 +35,8 @@ class Blobs(torch.nn.Module):
             scores.append(1 - area / 1e5)
         most = max(len(part) for part in scores)
         fill = [np.pad(b, [(0, most - len(b)), (0, 0)]) for b in boxes]
-        return torch.tensor(np.stack(fill)), torch.tensor(np.stack([np.pad(s, (0, most - len(s))) for s in scores]))
+        every = np.stack([np.pad(s, (0, most - len(s))) for s in scores])
+        return torch.tensor(np.stack(fill)), torch.tensor(every), None
 
 
 @pytest.fixture(scope="module")

@@ -180,6 +180,12 @@ class Overlaps:
     is first, as in COCO."""
     pair_iou: Array
     """IoU of each pair; for a crowd, the fraction of the detection inside the crowd (P,)."""
+    ellipses: Array
+    """Ellipses of the detections (D, 5), as in `Detections.ellipses`."""
+    sigmas_px: Array
+    """Standard deviations of the ellipses' centre x, y and semi-axes, pixels (D, 4); NaN if they are not predicted."""
+    label_ellipses: Array
+    """Ellipses of the labels (L, 5), as in `FrameLabels.ellipses`."""
 
     def radius_px(self) -> Array:
         """Radius sqrt(w h) / 2 of every detection, pixels (D,)."""
@@ -217,10 +223,13 @@ def find_overlaps(
     `sizes_px` (N, 2) are the widths and heights of the frames.
     """
     boxes, scores, pair_detections, pair_labels, pair_ious, n_found, n_labels = [], [], [], [], [], 0, 0
-    for ours, truth in zip(detections, labels, strict=True):
-        order = np.argsort(-ours.scores, kind="stable")
-        boxes.append(ours.boxes[order].reshape(-1, 4))
-        scores.append(ours.scores[order])
+    ellipses, sigmas_px = [], []
+    for found, truth in zip(detections, labels, strict=True):
+        ours = found.take(np.argsort(-found.scores, kind="stable"))
+        boxes.append(ours.boxes.reshape(-1, 4))
+        scores.append(ours.scores)
+        ellipses.append(replace(ours, boxes=boxes[-1]).ellipses)
+        sigmas_px.append(np.full((len(ours.scores), 4), np.nan) if ours.shapes is None else ours.shapes[:, 1:])
         overlap = iou_matrix(boxes[-1], truth.boxes)
         if truth.crowd is not None:
             overlap[:, truth.crowd] = coverage_matrix(boxes[-1], truth.boxes[truth.crowd])
@@ -248,6 +257,9 @@ def find_overlaps(
         _joined(pair_detections).astype(np.intp),
         _joined(pair_labels).astype(np.intp),
         _joined(pair_ious),
+        np.concatenate(ellipses) if ellipses else np.empty((0, 5)),
+        np.concatenate(sigmas_px) if sigmas_px else np.empty((0, 4)),
+        np.concatenate([part.ellipses.reshape(-1, 5) for part in labels]) if labels else np.empty((0, 5)),
     )
 
 

@@ -15,6 +15,7 @@ from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.split_evaluation import ellipse_columns
 from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.detect.images.georeference import (
     Georeference,
@@ -163,7 +164,10 @@ def expanded(sources: list[Path], frames: Path) -> list[Path]:
 
 
 def table_of(name: str, detections: Detections) -> pd.DataFrame:
-    """Detections as table rows: image name, box, centre, radius sqrt(w h) / 2 (all in pixels) and score."""
+    """Detections as table rows: image name, box, centre, radius sqrt(w h) / 2 (all in pixels), score and ellipse.
+
+    The columns of the ellipse are those of `ellipse_columns`; unknown standard deviations are null.
+    """
     x0, y0, x1, y1 = detections.boxes.T
     columns: dict[str, Any] = {
         "image": pd.Series([name] * len(detections.scores), dtype="str"),
@@ -175,5 +179,6 @@ def table_of(name: str, detections: Detections) -> pd.DataFrame:
         "centre_y_px": (y0 + y1) / 2,
         "radius_px": np.sqrt((x1 - x0) * (y1 - y0)) / 2,
         "score": detections.scores,
+        **ellipse_columns(detections),
     }
     return pd.DataFrame(columns)

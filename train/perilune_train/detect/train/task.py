@@ -209,12 +209,12 @@ class DetectTask(lightning.LightningModule):
         return loss
 
     def losses(self, outputs: list[Tensor], targets: Targets) -> tuple[Tensor, ...]:
-        """The losses L_ciou and L_obj of the network's outputs and, with ellipses, the ellipse loss."""
+        """L_ciou and L_obj of the network's outputs; with ellipses also L_ellipse and L_sigma."""
         network, settings = self.network, self.config.loss
         losses = detection_loss(outputs, targets, network.anchors, network.strides, settings)
         if not network.ellipses:
             return losses
-        return *losses, ellipse_loss(outputs, targets, network.anchors, network.strides, settings)
+        return *losses, *ellipse_loss(outputs, targets, network.anchors, network.strides, settings)
 
     def weighted(self, losses: tuple[Tensor, ...], batch_size: int | None = None) -> Tensor:
         """Weighted sum of the result of `losses`; logs each loss if `batch_size` is given."""
@@ -223,6 +223,7 @@ class DetectTask(lightning.LightningModule):
             "train/ciou": settings.lambda_iou,
             "train/objectness": settings.lambda_obj,
             "train/ellipse": settings.lambda_ellipse,
+            "train/sigma": settings.lambda_sigma,
         }
         if batch_size is not None:
             self.log_dict(dict(zip(weights, losses, strict=False)), batch_size=batch_size)

@@ -64,8 +64,8 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill the network with weights of an earlier detect run or of a Darknet file.
 
     A run with equal strides gives all weights and the anchors; a run with other strides gives only the backbone. If the
-    attention differs, the network's gates keep their initial weights; so do ellipse outputs that the run lacks. With `detect.init_layers=from_second`, the first
-    convolution and its norm keep theirs.
+    attention differs, the network's gates keep their initial weights; ellipse outputs keep theirs if the run has none.
+    With `detect.init_layers=from_second`, the first convolution and its norm keep theirs.
 
     Raises UserError if width or in_channels differ, or if a frozen backbone would have plain gates with random weights.
     """
@@ -154,8 +154,8 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
 def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: Path, whole: bool) -> DarknetFile:
     """Darknet file of a network's backbone, or of the `whole` network with 15 output filters.
 
-    Changes the network's stem. Darknet files cannot hold attention gates or ellipse outputs. Raises UserError if the network does not have
-    the shape of the file.
+    Changes the network's stem. Darknet files cannot hold attention gates or ellipse outputs. Raises UserError if the
+    network does not have the shape of the file.
     """
     expected: dict[str, Any] = dict(DARKNET_SHAPE)
     if whole:
