@@ -36,6 +36,15 @@ def decode_sigmas(raw: Tensor, boxes: Tensor) -> Tensor:
     return scale[..., None] * (raw[..., 1:].clamp(-_MAX_LOG_SIGMA, _MAX_LOG_SIGMA) + _TYPICAL_LOG_SIGMA).exp()
 
 
+def resized_shapes(shapes: Tensor, boxes: Tensor, new_boxes: Tensor, ratios: Tensor) -> Tensor:
+    """Shapes (..., 5) in the coordinates of an image that was resized by the factors `ratios` (2,) before detection.
+
+    `new_boxes` (..., 4) are `boxes` in these coordinates. As `Detections.divided` (detect/evaluate/matching.py).
+    """
+    factors = semi_axes(new_boxes, shapes[..., 0]) / semi_axes(boxes, shapes[..., 0])
+    return torch.cat([shapes[..., :1], shapes[..., 1:3] / ratios, shapes[..., 3:] * factors], dim=-1)
+
+
 def semi_axes(boxes: Tensor, correlations: Tensor) -> Tensor:
     """Semi-major and semi-minor axes (..., 2), pixels, of ellipses with boxes (..., 4) and correlations (...)."""
     half = (boxes[..., 2:] - boxes[..., :2]).clamp(min=_MIN_SIDE_PX) / 2

@@ -95,19 +95,18 @@ class Detections:
         return replace(self, boxes=self.boxes + np.array([x_px, y_px, x_px, y_px]))
 
     def divided(self, ratio_x: float, ratio_y: float) -> "Detections":
-        """The detections in the coordinates of an image that was resized by these factors before detection."""
-        shapes = None if self.shapes is None else self.shapes / shape_divisors(ratio_x, ratio_y)
-        return Detections(self.boxes / np.array([ratio_x, ratio_y] * 2), self.scores, shapes)
+        """The detections in the coordinates of an image that was resized by these factors before detection.
 
-
-def shape_divisors(ratio_x: float, ratio_y: float) -> Array:
-    """Divisors (5,) of shapes if an image was resized by these factors; correlations do not change.
-
-    The factors of a resized image differ by less than one pixel in its size, so their geometric mean is used for the
-    standard deviations of the semi-axes.
-    """
-    mean = float(np.sqrt(ratio_x * ratio_y))
-    return np.array([1.0, ratio_x, ratio_y, mean, mean])
+        A correlation does not change; the standard deviation of a semi-axis changes as the semi-axis.
+        """
+        ratios = np.array([ratio_x, ratio_y])
+        boxes = self.boxes / np.tile(ratios, 2)
+        if self.shapes is None:
+            return Detections(boxes, self.scores)
+        axes, new_axes = (ellipses_of(part, self.shapes[:, 0])[:, 2:4] for part in (self.boxes, boxes))
+        factors = np.divide(new_axes, axes, out=np.ones_like(axes), where=axes > 0)
+        sigmas_px = self.shapes[:, 1:] * np.hstack([np.tile(1 / ratios, (len(boxes), 1)), factors])
+        return Detections(boxes, self.scores, np.column_stack([self.shapes[:, 0], sigmas_px]))
 
 
 def joined_detections(parts: Sequence[Detections]) -> Detections:

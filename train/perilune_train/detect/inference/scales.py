@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from perilune_shared.console.terminal import progress_bar
 from perilune_train.detect.config import COARSEST_STRIDE, DetectConfig
 from perilune_train.detect.data.split import DetectSplit
-from perilune_train.detect.evaluate.matching import Detections, shape_divisors
+from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.models.ellipse import resized_shapes
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
@@ -79,13 +80,12 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
     boxes, scores, shapes = [], [], []
     for factor in detector.config.evaluation.scales:
         to_height, to_width = scaled_size(height, width, factor)
-        predicted = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
-        ratios = to_width / width, to_height / height
-        boxes.append(predicted[0] / torch.tensor(ratios * 2, device=detector.device))
-        scores.append(predicted[1])
-        if predicted[2] is not None:
-            divisors = torch.as_tensor(shape_divisors(*ratios), dtype=torch.float32, device=detector.device)
-            shapes.append(predicted[2] / divisors)
+        found, confidence, shape = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
+        ratios = torch.tensor([to_width / width, to_height / height], device=detector.device)
+        boxes.append(found / ratios.repeat(2))
+        scores.append(confidence)
+        if shape is not None:
+            shapes.append(resized_shapes(shape, found, boxes[-1], ratios))
     every_shape = torch.cat(shapes, 1) if shapes else None
     return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
 

@@ -27,6 +27,12 @@ def detections_of(
     if boxes.device.type == "cpu":
         every = [None] * len(boxes) if shapes is None else shapes
         return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, every, strict=True)]
+    return _of_batch(boxes, scores, strong, shapes, settings)
+
+
+def _of_batch(
+    boxes: Tensor, scores: Tensor, strong: Tensor, shapes: Tensor | None, settings: EvaluationSettings
+) -> list[Detections]:
     kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
     # Transfer the whole batch at once.
     boxes, scores, kept = (part.cpu() for part in (boxes, scores, kept))
