@@ -102,10 +102,12 @@ class YOLOv3(nn.Module):
             x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
             if stride in self.branches:
                 x = self.branches[stride](x)
-                head = self.heads[stride][0](x)  # type: ignore[index]
-                raw = _per_anchor(self.heads[stride][1](head))  # type: ignore[index]
                 if stride in self.ellipse_heads:
-                    raw = torch.cat([raw, _per_anchor(self.ellipse_heads[stride](head))], dim=-1)
+                    head = self.heads[stride][0](x)  # type: ignore[index]
+                    both = self.heads[stride][1](head), self.ellipse_heads[stride](head)  # type: ignore[index]
+                    raw = torch.cat([_per_anchor(part) for part in both], dim=-1)
+                else:
+                    raw = _per_anchor(self.heads[stride](x))
                 outputs.insert(0, raw.float())
             if stride in self.laterals:
                 above = self.laterals[stride](x)

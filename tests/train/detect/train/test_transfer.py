@@ -244,7 +244,7 @@ def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(few, tmp_path
 
     for name in ("on_train_start", "on_train_epoch_end"):
         monkeypatch.setattr(DetectTask, name, recorded(getattr(DetectTask, name)))
-    settings = (*QUICK, f"detect.init_from={tmp_path / 'best.ckpt'}")
+    settings = (*QUICK, "detect.ellipses=false", f"detect.init_from={tmp_path / 'best.ckpt'}")
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
     run_detect(config, few, tmp_path / "runs", "a")
     (before, _), (frozen, frozen_average), (after, after_average) = states

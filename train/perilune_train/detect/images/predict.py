@@ -80,6 +80,10 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             progress.advance(check)
         threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
         detector = open_detector(runs.RunFolder(run).best, config)
+        if not detector.network.ellipses:
+            say(
+                f"{run.name}: this detector predicts only boxes: ellipses are axis-aligned, without standard deviations"
+            )
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):
