@@ -24,6 +24,7 @@ from perilune_train.detect.data.batches import (
 )
 from perilune_train.detect.data.ignored import Craters, unlabelled_craters
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.ellipses import ellipses_of
 
 PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
 ANCHORS = torch.tensor([[[8.0, 8.0], [12.0, 12.0], [16.0, 16.0]], [[20.0, 20.0]] * 3, [[32.0, 32.0]] * 3])
@@ -143,6 +144,18 @@ def test_turns_move_boxes_with_the_pixels(kind, x, y, size):
 def test_the_eight_turns_differ():
     image = np.arange(9, dtype=np.uint8).reshape(3, 3)
     assert len({turn(image, np.zeros((0, 5)), kind)[0].tobytes() for kind in range(8)}) == 8
+
+
+def test_outlines_are_those_of_the_labelled_ellipses(split):
+    """A box and a correlation give back the ellipse of each label, also of craters that are ignored."""
+    outlines, ellipses = (np.concatenate([getattr(p, name) for p in split.labels]) for name in ("outlines", "ellipses"))
+    assert len(outlines) > 100 and (outlines[:, 4] != 0).all()
+    found = ellipses_of(outlines[:, :4], outlines[:, 4])
+    np.testing.assert_allclose(found[:, :4], ellipses[:, :4], atol=1e-3)
+    long = ellipses[:, 2] - ellipses[:, 3] > 0.05
+    turn = (found[:, 4] - ellipses[:, 4] + np.pi / 2) % np.pi - np.pi / 2
+    np.testing.assert_allclose(turn[long], 0, atol=0.02)
+    assert long.any()
 
 
 def changed(split, settings, seed=0, index=0):
