@@ -85,7 +85,7 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
         boxes.append(found / ratios.repeat(2))
         scores.append(confidence)
         if shape is not None:
-            shapes.append(resized_shapes(shape, found, boxes[-1], ratios))
+            shapes.append(shape if factor == 1 else resized_shapes(shape, found, boxes[-1], ratios))
     every_shape = torch.cat(shapes, 1) if shapes else None
     return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
 
