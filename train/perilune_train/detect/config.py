@@ -80,7 +80,10 @@ class AugmentSettings(Section):
 
 
 class LossSettings(Section):
-    """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss")."""
+    """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss").
+
+    With `ellipses`, lambda_ellipse L_ellipse + lambda_sigma L_sigma is added (detect/train/ellipse_loss.py).
+    """
 
     aspect: Literal["circular", "standard"] = "circular"
     """Aspect ratio to which the aspect term of CIoU pulls a box. circular: 1 (the paper). standard: the label's."""
@@ -157,8 +160,9 @@ class DetectConfig(Section):
     `init_from`; otherwise training starts unfrozen, because freezing random weights does not help."""
     init_from: str | None = None
     """Initial weights. best.ckpt of a detect run of equal width and in_channels, or crater-detector (the installed
-    detector, width 0.40625), sets all weights if the strides are equal, otherwise the backbone only. A Darknet file
-    needs width 1 and in_channels 3; darknet53.conv.74 sets the backbone, yolov3.weights also sets neck and heads."""
+    detector, width 0.40625), sets all weights if the strides are equal, otherwise the backbone only; ellipse outputs
+    that it lacks keep their initial weights. A Darknet file needs width 1 and in_channels 3; darknet53.conv.74 sets the
+    backbone, yolov3.weights also sets neck and heads."""
     init_layers: Literal["all", "from_second"] = "all"
     """Layers that `init_from` initialises: all, or all but the first convolution (the paper)."""
     plain_gates_before_frozen_layers: bool = False
