@@ -22,8 +22,8 @@ def store_run(root: Path, *more: str) -> Path:
     run = runs.RunFolder(root / "detect" / "stored")
     start_run(run, "detect", config, {}, "new")
     network = build_network(config, np.random.default_rng(0).uniform(4, 40, (500, 2)), root)
-    architecture = {"in_channels": config.in_channels, "width": config.width, "attention": config.attention}
-    runs.save_weights(run.best, {**architecture, "strides": list(config.strides)}, network)
+    names = ("in_channels", "width", "attention", "strides", "ellipses")
+    runs.save_weights(run.best, config.model_dump(mode="json", include=set(names)), network)
     write_metrics(run.root, {"test/threshold": THRESHOLD})
     return run.root
 

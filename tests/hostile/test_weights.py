@@ -48,6 +48,13 @@ def state(kind: str = "detector") -> dict:
     return dict(build(NAVIGATOR if kind == "warp" else STACK).state_dict())
 
 
+def elliptic(numbers: int, value: float = 0.0) -> dict:
+    """Weights of ellipse outputs, `numbers` for each cell."""
+    layers = {8: 32, 16: 64, 32: 128}
+    weights = {f"ellipse_heads.{stride}.weight": torch.full((numbers, n, 1, 1), value) for stride, n in layers.items()}
+    return weights | {f"ellipse_heads.{stride}.bias": torch.full((numbers,), value) for stride in layers}
+
+
 def saved(architecture: object = DETECTOR, weights: object = None, **more: object) -> bytes:
     content = io.BytesIO()
     torch.save({"architecture": architecture, "state_dict": state() if weights is None else weights, **more}, content)
@@ -194,6 +201,25 @@ CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
     "channels of 10^12": (lambda: saved(DETECTOR | {"in_channels": HUGE}), "architecture.in_channels"),
     "strides of nothing": (lambda: saved(DETECTOR | {"strides": []}), "architecture.strides"),
     "strides of 2": (lambda: saved(DETECTOR | {"strides": [2, 4, 8]}), "strides [8, 16, 32] or [4, 8, 16]"),
+    "ellipses are text": (lambda: saved(DETECTOR | {"ellipses": "\x1b[31myes"}), "architecture.ellipses"),
+    "ellipses of 2": (lambda: saved(DETECTOR | {"ellipses": 2}), "architecture.ellipses"),
+    "ellipses without weights": (lambda: saved(DETECTOR | {"ellipses": True}), "ellipse_heads.16.bias: got nothing"),
+    "weights of ellipses without the setting": (
+        lambda: saved(weights=state() | {"ellipse_heads.8.bias": torch.zeros(15)}),
+        "ellipse_heads.8.bias: got (15,), expected no such tensor",
+    ),
+    "weights of other ellipses": (
+        lambda: saved(DETECTOR | {"ellipses": True}, state() | elliptic(5)),
+        "ellipse_heads.16.bias: got (5,), expected (15,)",
+    ),
+    "deviations that are NaN": (
+        lambda: saved(DETECTOR | {"ellipses": True}, state() | elliptic(15, float("nan"))),
+        "numbers are not finite",
+    ),
+    "no ellipses in a setting of the wrong name": (
+        lambda: saved(DETECTOR | {"elipses": False}),
+        "a detect run's checkpoint",
+    ),
     "unknown attention": (lambda: saved(DETECTOR | {"attention": "\x1b[31mred"}), "architecture.attention"),
     "a network of 1 GB in 2 kB": (lambda: saved(DETECTOR | {"width": 2.0}, {}), "another architecture"),
     "weights of another width": (lambda: saved(DETECTOR | {"width": 0.25}), "another architecture"),
@@ -367,3 +393,8 @@ def test_good_weights_pass(tmp_path: Path) -> None:
     loaded = detector.load_detector(tmp_path / "best.ckpt")
     assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in network.state_dict().items())
     assert isinstance(network.state_dict(), OrderedDict)
+    # Weights that state no `ellipses`, as of 0.1.0, have none; others say that they have them.
+    assert not loaded.ellipses and loaded.detect_ellipses(torch.zeros(1, 3, 32, 32))[2] is None
+    content = saved(DETECTOR | {"ellipses": True}, state() | elliptic(15))
+    (tmp_path / "ellipses.ckpt").write_bytes(content)
+    assert detector.load_detector(tmp_path / "ellipses.ckpt").ellipses

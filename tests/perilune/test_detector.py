@@ -76,13 +76,27 @@ def test_deep_pixels_are_stretched_as_in_a_file(detector, tmp_path):
     assert detector(deep.astype(np.float64)).image.max() == 255
 
 
-def test_the_ellipse_is_the_axis_aligned_one_inside_the_box(detector, pixels):
-    craters = detector(pixels, threshold=0.0)
+def test_the_ellipse_of_an_old_detector_is_the_axis_aligned_one_inside_the_box(pixels, tmp_path):
+    craters = perilune.load_detector(store_run(tmp_path, "ellipses=false"))(pixels, threshold=0.0)
+    assert len(craters) > 20 and np.isnan(craters["sigma_x_px"]).all()
     theta = craters["ellipse_theta_rad"]
     assert set(theta) <= {0.0, np.pi / 2} and (craters["ellipse_a_px"] >= craters["ellipse_b_px"]).all()
     half_width = np.where(theta == 0, craters["ellipse_a_px"], craters["ellipse_b_px"])
     np.testing.assert_allclose(craters["ellipse_cx_px"] + half_width, craters["x1_px"])
     np.testing.assert_allclose(np.sqrt(craters["ellipse_a_px"] * craters["ellipse_b_px"]), craters["radius_px"])
+
+
+def test_the_ellipse_is_the_one_in_the_box(detector, pixels):
+    craters = detector(pixels, threshold=0.0)
+    a, b, theta = (craters[f"ellipse_{name}"] for name in ("a_px", "b_px", "theta_rad"))
+    assert len(craters) > 20 and ((theta >= 0) & (theta < np.pi)).all() and len(np.unique(theta)) > 10
+    for low, high, half in (
+        ("x0_px", "x1_px", np.hypot(a * np.cos(theta), b * np.sin(theta))),
+        ("y0_px", "y1_px", np.hypot(a * np.sin(theta), b * np.cos(theta))),
+    ):
+        np.testing.assert_allclose(craters[high] - craters[low], 2 * half, rtol=1e-6)
+    np.testing.assert_allclose(craters["angle_deg"], np.degrees(theta))
+    assert (craters["sigma_semi_minor_px"] > 0).all()
 
 
 def test_craters_can_be_drawn_and_printed(detector, pixels, monkeypatch):

@@ -49,3 +49,24 @@ def test_objectness_starts_at_its_prior_and_boxes_at_their_anchors():
 def test_other_strides_are_refused():
     with pytest.raises(ValueError, match="strides are"):
         YOLOv3(strides=(2, 4, 8))
+
+
+def test_ellipse_outputs_leave_the_others_as_they_are():
+    """Equal seeds give equal weights and outputs, with and without ellipses."""
+    networks = []
+    for ellipses in (False, True):
+        torch.manual_seed(4)
+        networks.append(YOLOv3(None, 1, 0.125, "cbam_identity", (4, 8, 16), ellipses).eval())
+    plain, elliptic = networks
+    images = torch.randn(2, 1, 64, 96, generator=torch.Generator().manual_seed(5))
+    for own, other in zip(plain(images), elliptic(images), strict=True):
+        assert other.shape == (*own.shape[:4], 10) and torch.equal(other[..., :5], own)
+    boxes, scores, shapes = elliptic.detect_ellipses(images)
+    torch.testing.assert_close((boxes, scores), plain.detect(images))
+    assert plain.detect_ellipses(images)[2] is None
+    assert shapes.shape == (*scores.shape, 5)
+    # Nearly circles at first, with deviations of about exp(-2) sqrt(d) pixels.
+    side = (boxes[..., 2:] - boxes[..., :2]).prod(-1).sqrt()
+    assert shapes[..., 0].abs().max() < 0.3
+    typical = math.exp(-2) * side.sqrt()[..., None].expand(-1, -1, 4)
+    torch.testing.assert_close(shapes[..., 1:], typical, rtol=0.3, atol=0)

@@ -80,7 +80,10 @@ class AugmentSettings(Section):
 
 
 class LossSettings(Section):
-    """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss")."""
+    """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss").
+
+    With `ellipses`, lambda_ellipse L_ellipse + lambda_sigma L_sigma is added (detect/train/ellipse_loss.py).
+    """
 
     aspect: Literal["circular", "standard"] = "circular"
     """Aspect ratio to which the aspect term of CIoU pulls a box. circular: 1 (the paper). standard: the label's."""
@@ -94,6 +97,10 @@ class LossSettings(Section):
     """Weight of L_obj."""
     lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
+    lambda_ellipse: Weight = 0.5
+    """Weight of the loss of the ellipses' correlations, used with `ellipses`."""
+    lambda_sigma: Weight = 0.05
+    """Weight of the loss of the ellipses' standard deviations, used with `ellipses`."""
     lambda_teacher: Weight = 1.0
     """Weight of the distillation loss, used with `teacher`. lambda_iou and lambda_obj weight the two terms of the
     loss."""
@@ -143,6 +150,9 @@ class DetectConfig(Section):
     """Input channels. 3: the grey frame three times, as in the paper's RGB network."""
     strides: tuple[_Stride, _Stride, _Stride] = (8, 16, 32)
     """Strides of the detection heads: 8 16 32 (the paper) or 4 8 16 (better for tiny craters)."""
+    ellipses: bool = False
+    """Predict the rim as an ellipse with standard deviations of centre and semi-axes, in addition to its box. False:
+    boxes only (the paper)."""
     epochs: Count = 20
     """Passes over the training frames."""
     frozen_epochs: Epochs = 0
@@ -150,8 +160,9 @@ class DetectConfig(Section):
     `init_from`; otherwise training starts unfrozen, because freezing random weights does not help."""
     init_from: str | None = None
     """Initial weights. best.ckpt of a detect run of equal width and in_channels, or crater-detector (the installed
-    detector, width 0.40625), sets all weights if the strides are equal, otherwise the backbone only. A Darknet file
-    needs width 1 and in_channels 3; darknet53.conv.74 sets the backbone, yolov3.weights also sets neck and heads."""
+    detector, width 0.40625), sets all weights if the strides are equal, otherwise the backbone only; ellipse outputs
+    that it lacks keep their initial weights. A Darknet file needs width 1 and in_channels 3; darknet53.conv.74 sets the
+    backbone, yolov3.weights also sets neck and heads."""
     init_layers: Literal["all", "from_second"] = "all"
     """Layers that `init_from` initialises: all, or all but the first convolution (the paper)."""
     plain_gates_before_frozen_layers: bool = False

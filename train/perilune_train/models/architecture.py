@@ -22,12 +22,13 @@ _Row = tuple[_Cosine, _Cosine, _Cosine]
 
 
 class DetectorArchitecture(Section):
-    """Architecture of a detector."""
+    """Architecture of a detector. Settings with a default are missing from weights of older versions."""
 
     in_channels: Literal[1, 3]
     width: Annotated[float, Field(ge=0.125, le=2)]
     attention: Attention
     strides: tuple[_Stride, _Stride, _Stride]
+    ellipses: bool = False
 
     @model_validator(mode="after")
     def _known_strides(self) -> "DetectorArchitecture":

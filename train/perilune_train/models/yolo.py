@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from perilune_train.config import Attention
 from perilune_train.models.darknet import AttentionDarknet53, conv_block, scaled
+from perilune_train.models.ellipse import ELLIPSE_OUTPUTS, decode_correlation, decode_sigmas
 
 ANCHORS_PER_SCALE = 3
 OUTPUTS = 5
@@ -26,6 +27,9 @@ class YOLOv3(nn.Module):
     Deviations from the original: There are no class outputs, because craters are the only class; the score is the
     objectness. The heads may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than
     6 px. The neck then still starts at stride 32, with one 1 x 1 convolution. `width` scales backbone and neck.
+
+    With `ellipses`, a second output layer of each head predicts 5 further numbers per anchor: the shape of the ellipse
+    in the box, and standard deviations (models/ellipse.py). The first 5 numbers and their weights do not change.
     """
 
     anchors: Tensor
@@ -37,6 +41,7 @@ class YOLOv3(nn.Module):
         width: float = 1.0,
         attention: Attention = "none",
         strides: Sequence[int] = (8, 16, 32),
+        ellipses: bool = False,
     ):
         """`anchors` (3, 3, 2) are widths and heights in pixels, finest stride first; None if they are loaded later."""
         super().__init__()
@@ -65,11 +70,22 @@ class YOLOv3(nn.Module):
             if stride > self.strides[0]:
                 above = channels // 2
                 self.laterals[str(stride)] = nn.Sequential(conv_block(inputs, above, 1), nn.Upsample(scale_factor=2))
+        # Create these layers last, so that all other initial weights are the same with and without ellipses.
+        self.ellipse_heads = nn.ModuleDict()
+        if ellipses:
+            for stride in self.strides:
+                self.ellipse_heads[str(stride)] = _ellipse_output(2 * scaled(16 * stride, width))
+
+    @property
+    def ellipses(self) -> bool:
+        """Whether the network predicts ellipses with standard deviations."""
+        return len(self.ellipse_heads) > 0
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """Convert images (N, in_channels, H, W) to raw outputs (N, 3 anchors, h, w, 5) in float32, finest stride first.
+        """Convert images (N, in_channels, H, W) to raw outputs in float32, finest stride first.
 
-        H and W must be multiples of 32.
+        The outputs of a scale are (N, 3 anchors, h, w, 5), or (N, 3, h, w, 10) with ellipses. H and W must be multiples
+        of 32.
         """
         return self._outputs(self.backbone(images))
 
@@ -86,9 +102,12 @@ class YOLOv3(nn.Module):
             x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
             if stride in self.branches:
                 x = self.branches[stride](x)
-                raw = self.heads[stride](x)
-                n, _, h, w = raw.shape
-                raw = raw.view(n, ANCHORS_PER_SCALE, OUTPUTS, h, w).permute(0, 1, 3, 4, 2)
+                if stride in self.ellipse_heads:
+                    head = self.heads[stride][0](x)  # type: ignore[index]
+                    both = self.heads[stride][1](head), self.ellipse_heads[stride](head)  # type: ignore[index]
+                    raw = torch.cat([_per_anchor(part) for part in both], dim=-1)
+                else:
+                    raw = _per_anchor(self.heads[stride](x))
                 outputs.insert(0, raw.float())
             if stride in self.laterals:
                 above = self.laterals[stride](x)
@@ -100,11 +119,37 @@ class YOLOv3(nn.Module):
 
         A box is x0, y0, x1, y1 in pixels.
         """
-        boxes, scores = [], []
+        boxes, scores, _ = self.detect_ellipses(images)
+        return boxes, scores
+
+    @torch.no_grad()
+    def detect_ellipses(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Boxes (N, K, 4), scores (N, K) and shapes (N, K, 5) as from `detect`.
+
+        A shape is the correlation of the ellipse in the box and four standard deviations: of the centre's x and y and
+        of the semi-major and the semi-minor axis, pixels. None if the network predicts no ellipses.
+        """
+        boxes, scores, shapes = [], [], []
         for raw, anchors, stride in zip(self(images), self.anchors, self.strides, strict=True):
             boxes.append(decode_grid(raw, anchors, stride).flatten(1, 3))
             scores.append(raw[..., 4].sigmoid().flatten(1))
-        return torch.cat(boxes, 1), torch.cat(scores, 1)
+            if self.ellipses:
+                shapes.append(decode_shapes(raw[..., OUTPUTS:].flatten(1, 3), boxes[-1]))
+        return torch.cat(boxes, 1), torch.cat(scores, 1), torch.cat(shapes, 1) if shapes else None
+
+
+def _per_anchor(output: Tensor) -> Tensor:
+    """Convert the output (N, 3 x numbers, h, w) of a layer to (N, 3, h, w, numbers)."""
+    n, channels, h, w = output.shape
+    return output.view(n, ANCHORS_PER_SCALE, channels // ANCHORS_PER_SCALE, h, w).permute(0, 1, 3, 4, 2)
+
+
+def _ellipse_output(channels: int) -> nn.Conv2d:
+    """Layer of the ellipse outputs of a head. Its initial ellipses are axis-aligned with typical deviations."""
+    layer = nn.Conv2d(channels, ANCHORS_PER_SCALE * ELLIPSE_OUTPUTS, 1)
+    nn.init.normal_(layer.weight, std=0.01)
+    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return layer
 
 
 def _output(channels: int) -> nn.Conv2d:
@@ -130,8 +175,13 @@ def decode(raw: Tensor, cells: Tensor, anchors: Tensor, stride: int) -> Tensor:
     return torch.cat([centre - half, centre + half], dim=-1)
 
 
+def decode_shapes(raw: Tensor, boxes: Tensor) -> Tensor:
+    """Convert ellipse outputs (..., 5) with boxes (..., 4) to correlations and standard deviations (..., 5)."""
+    return torch.cat([decode_correlation(raw)[..., None], decode_sigmas(raw, boxes)], dim=-1)
+
+
 def decode_grid(raw: Tensor, anchors: Tensor, stride: int) -> Tensor:
-    """Convert the raw outputs (N, 3, h, w, 5) of one scale, with anchors (3, 2), to boxes (N, 3, h, w, 4)."""
+    """Convert the raw outputs (N, 3, h, w, 5 or more) of one scale, with anchors (3, 2), to boxes (N, 3, h, w, 4)."""
     h, w = raw.shape[2:4]
     rows, columns = torch.meshgrid(
         torch.arange(h, device=raw.device), torch.arange(w, device=raw.device), indexing="ij"

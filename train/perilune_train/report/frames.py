@@ -206,7 +206,7 @@ def _stacks(content: dict[str, NDArray[Any]], names: Sequence[str]) -> list[Mask
 
 def _best_first(detections: Detections) -> Detections:
     order = np.argsort(-detections.scores, kind="stable")
-    return Detections(detections.boxes[order], detections.scores[order])
+    return detections.take(order)
 
 
 def _png(picture: Image.Image) -> str:

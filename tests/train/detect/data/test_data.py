@@ -24,6 +24,7 @@ from perilune_train.detect.data.batches import (
 )
 from perilune_train.detect.data.ignored import Craters, unlabelled_craters
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.ellipses import ellipses_of
 
 PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
 ANCHORS = torch.tensor([[[8.0, 8.0], [12.0, 12.0], [16.0, 16.0]], [[20.0, 20.0]] * 3, [[32.0, 32.0]] * 3])
@@ -135,22 +136,34 @@ SIDE = st.integers(1, 3)
 def test_turns_move_boxes_with_the_pixels(kind, x, y, size):
     image = np.zeros((9, 9), np.uint8)
     image[y : y + size[1], x : x + size[0]] = 255
-    turned, boxes = turn(image, np.array([[x, y, x + size[0], y + size[1]]], float), kind)
+    turned, boxes = turn(image, np.array([[x, y, x + size[0], y + size[1], 0.0]], float), kind)
     rows, columns = np.nonzero(turned)
-    assert boxes.tolist() == [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
+    assert boxes[:, :4].tolist() == [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
 
 
 def test_the_eight_turns_differ():
     image = np.arange(9, dtype=np.uint8).reshape(3, 3)
-    assert len({turn(image, np.zeros((0, 4)), kind)[0].tobytes() for kind in range(8)}) == 8
+    assert len({turn(image, np.zeros((0, 5)), kind)[0].tobytes() for kind in range(8)}) == 8
+
+
+def test_outlines_are_those_of_the_labelled_ellipses(split):
+    """A box and a correlation give back the ellipse of each label, also of craters that are ignored."""
+    outlines, ellipses = (np.concatenate([getattr(p, name) for p in split.labels]) for name in ("outlines", "ellipses"))
+    assert len(outlines) > 100 and (outlines[:, 4] != 0).all()
+    found = ellipses_of(outlines[:, :4], outlines[:, 4])
+    np.testing.assert_allclose(found[:, :4], ellipses[:, :4], atol=1e-3)
+    long = ellipses[:, 2] - ellipses[:, 3] > 0.05
+    turn = (found[:, 4] - ellipses[:, 4] + np.pi / 2) % np.pi - np.pi / 2
+    np.testing.assert_allclose(turn[long], 0, atol=0.02)
+    assert long.any()
 
 
 def changed(split, settings, seed=0, index=0):
     image, labels = split.frames.images[index], split.labels[index]
     pixels, boxes, selected = augment(
-        image, labels.boxes, labels.selected, split.radius_px, settings, np.random.default_rng(seed)
+        image, labels.outlines, labels.selected, split.radius_px, settings, np.random.default_rng(seed)
     )
-    return image, labels, pixels, boxes, selected
+    return image, labels, pixels, boxes[:, :4], selected
 
 
 def test_augmentation_off_changes_nothing(split):
@@ -173,9 +186,9 @@ def test_each_augmentation_changes_the_pixels_alone(split, setting):
 def test_rescaling_moves_boxes_with_the_pixels(factor, place):
     image = np.zeros((96, 128), np.float32)
     image[40:52, 30:46] = 200
-    scaled, boxes = rescale(image, np.array([[30.0, 40.0, 46.0, 52.0]]), factor, place)
+    scaled, boxes = rescale(image, np.array([[30.0, 40.0, 46.0, 52.0, 0.0]]), factor, place)
     # The bright rectangle, its mass and its middle, in pixels counted from the image's edge.
-    x0, y0, x1, y1 = boxes[0].clip(0, [128, 96, 128, 96])
+    x0, y0, x1, y1 = boxes[0, :4].clip(0, [128, 96, 128, 96])
     bright = np.clip(scaled - image.mean() * (factor < 1), 0, None)
     rows, columns = np.indices(scaled.shape) + 0.5
     inside = (columns > x0 - 2) & (columns < x1 + 2) & (rows > y0 - 2) & (rows < y1 + 2)

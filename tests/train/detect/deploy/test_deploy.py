@@ -18,7 +18,7 @@ from perilune_train.cli.main import app
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
-from perilune_train.detect.deploy.files import FlightDetector
+from perilune_train.detect.deploy.files import FlightDetector, write_onnx, write_openvino
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.records.metrics_file import write_metrics
@@ -28,10 +28,10 @@ onnx = pytest.importorskip("onnx", reason="the extra `export` is not installed")
 SIZE = 96
 
 
-def lively(attention="cbam_identity", strides=(4, 8, 16), in_channels=1):
+def lively(attention="cbam_identity", strides=(4, 8, 16), in_channels=1, ellipses=False):
     """A network whose every weight and statistic matters, in evaluation mode."""
     torch.manual_seed(3)
-    network = YOLOv3(3 + 20 * torch.rand(3, 3, 2), in_channels, 0.125, attention, strides).eval()
+    network = YOLOv3(3 + 20 * torch.rand(3, 3, 2), in_channels, 0.125, attention, strides, ellipses).eval()
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = 0.8
@@ -43,6 +43,8 @@ def lively(attention="cbam_identity", strides=(4, 8, 16), in_channels=1):
     for head in network.heads.values():
         nn.init.normal_(head[1].weight, std=0.5)
         nn.init.constant_(head[1].bias, -1.0)
+    for layer in network.ellipse_heads.values():
+        nn.init.normal_(layer.weight, std=0.3)
     with torch.no_grad():
         network.train()(torch.randn(4, in_channels, SIZE, SIZE))
     return network.eval()
@@ -69,6 +71,32 @@ def test_folding_changes_nothing(attention, strides, images):
     assert scores.max() - scores.min() > 0.2
     np.testing.assert_allclose(found_boxes, boxes, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(found_scores, scores, atol=1e-4)
+
+
+def test_files_give_torchs_ellipses(images, tmp_path):
+    network = lively(ellipses=True)
+    boxes, scores, shapes = (part.numpy() for part in network.detect_ellipses(torch.as_tensor(images)))
+    assert np.ptp(shapes[..., 0]) > 1 and np.ptp(np.log(shapes[..., 1:]), axis=(0, 1)).min() > 1
+    path = tmp_path / "detector.onnx"
+    write_onnx(FlightDetector(network, SIZE), path, {}, 1, SIZE)
+    write_openvino(path, tmp_path / "detector.xml")
+    for engine in (
+        torch_engine(FlightDetector(network, SIZE)),
+        onnxruntime_engine(path, 1),
+        openvino_engine(tmp_path / "detector.xml", threads=1),
+    ):
+        found = engine(images)
+        assert len(found) == 3
+        for part, expected in zip(found, (boxes, scores, shapes), strict=True):
+            np.testing.assert_allclose(part, expected, rtol=1e-3, atol=1e-3)
+        px, score = export.difference(network, engine, images, 0.1)
+        assert px < 1e-3 and score < 1e-3
+        # A difference of the ellipses alone is seen.
+        assert export.difference(network, lambda given, e=engine: (*e(given)[:2], e(given)[2] + 0.01), images, 0.1) == (
+            pytest.approx((0.01, 0.01), abs=2e-3)
+        )
+        plain = lively()
+        assert export.difference(plain, engine, images, 0.1) == (np.inf, np.inf)
 
 
 def test_a_size_that_no_stride_divides():

@@ -139,6 +139,49 @@ def random_matches(seed, n_frames, n_detections, n_wanted):
     return Matches(scores, outcome, np.zeros(n_detections, np.intp), frame, rng.integers(0, n_frames, n_wanted))
 
 
+def test_errors_of_ellipses():
+    """A crater of 4 px, and one of 10 px that is found with semi-axes of 12 and 8 px."""
+    truth = [labels((20, 20, 4), (60, 60, 10), (120, 120, 5))]
+    boxes = np.array([[16.3, 16.4, 24.3, 24.4], [48, 52, 72, 68], [150, 20, 170, 40]])
+    shapes = np.array([[0, 0.3, 0.4, 0.5, 0.5], [0, 1.0, 2.0, 1.0, 4.0], [0, 1.0, 1.0, 1.0, 1.0]])
+    ours = [Detections(boxes, np.array([0.9, 0.8, 0.4]), shapes)]
+    criteria = Criteria(0.5, (2.0, 50.0))
+    figures = evaluate_detections(ours, truth, facts("a"), criteria).figures()
+    assert figures["centre_error_px_rms"] == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 2))
+    assert figures["centre_error_px_rms_above_5_px"] == figures["centre_error_px_median_above_5_px"] == 0
+    # Semi-axes of 4 and 4, and of 12 and 8 in place of 10 and 10.
+    assert figures["semi_major_error_px_median"] == figures["semi_minor_error_px_median"] == pytest.approx(1)
+    assert figures["semi_major_error_px_rms"] == pytest.approx(np.sqrt(2))
+    # Errors over deviations: 1 and 1 in the centre of the first, 0 in the second; 0, 0 and 2, -1/2 in the semi-axes.
+    assert figures["centre_normalised_error_squared"] == pytest.approx(0.5)
+    assert figures["axes_normalised_error_squared"] == pytest.approx((4 + 0.25) / 4)
+    assert figures["axes_normalised_error_squared_above_5_px"] == pytest.approx((4 + 0.25) / 2)
+    plain = evaluate_detections([replace(ours[0], shapes=None)], truth, facts("a"), criteria).figures()
+    assert np.isnan(plain["axes_normalised_error_squared"]) and plain["semi_major_error_px_median"] == pytest.approx(1)
+
+
+def test_ellipses_are_compared_with_those_of_the_labels_not_with_their_boxes():
+    """The label is an ellipse at 45 degrees. It is found as itself, and as a circle in the same box."""
+    plain = labels((60, 60, 10))
+    a, b = np.sqrt(150.0), np.sqrt(50.0)
+    truth = [replace(plain, ellipses=np.array([[60, 60, a, b, np.pi / 4]]))]
+    for correlation, errors, score in ((0.5, (0, 0), 100), (0.0, (a - 10, 10 - b), 0)):
+        ours = [Detections(plain.boxes, np.array([0.9]), np.array([[correlation, 1, 1, 1, 1]]))]
+        figures = evaluate_detections(ours, truth, facts("a"), Criteria(0.5, (2.0, 50.0))).figures()
+        found_errors = figures["semi_major_error_px_median"], figures["semi_minor_error_px_median"]
+        assert found_errors == pytest.approx(errors, abs=1e-9)
+        # A circle differs by more than 7 % of the rim.
+        assert figures["ellipse_score"] == pytest.approx(score)
+
+
+def test_the_score_of_ellipses_ignores_what_the_scoring_rule_ignores():
+    """Two labels, one of them not selected; both are found. The second frame has no labels and no detections."""
+    truth = [labels((20, 20, 4), (60, 60, 10), selected=[True, False]), labels()]
+    ours = [found((20, 20, 4, 0.9), (60, 60, 10, 0.8), (100, 20, 5, 0.4)), found()]
+    figures = evaluate_detections(ours, truth, facts("ab"), Criteria(0.5, (2.0, 50.0))).figures()
+    assert (figures["ellipse_score"], figures["strict/ellipse_score"]) == pytest.approx((100, 75))
+
+
 @pytest.mark.parametrize(
     ("n_detections", "decimals", "tolerance"), [(1500, 16, 1e-12), (30_000, 2, 1e-12), (30_000, 16, 5e-4)]
 )

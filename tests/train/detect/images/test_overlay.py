@@ -37,3 +37,16 @@ def test_an_image_without_craters_and_a_narrow_one(tmp_path):
     none = Detections(np.zeros((0, 4)), np.zeros(0))
     write_overlay(tmp_path / "a.png", np.zeros((900, 3), np.uint8), none, 1.0)
     assert cv2.imread(str(tmp_path / "a.png")).shape == (924, 3, 3)
+
+
+def test_a_tilted_ellipse_is_drawn_tilted(tmp_path):
+    """Semi-axes of 60 and 20 px at 30 degrees from x towards y, about (100, 100)."""
+    theta = np.radians(30)
+    half = np.hypot([60 * np.cos(theta), 60 * np.sin(theta)], [20 * np.sin(theta), 20 * np.cos(theta)])
+    correlation = (60**2 - 20**2) * np.sin(theta) * np.cos(theta) / half.prod()
+    found = Detections(np.array([[*(100 - half), *(100 + half)]]), np.ones(1), np.array([[correlation, 1, 1, 1, 1]]))
+    write_overlay(tmp_path / "a.png", np.zeros((1600, 1600), np.uint8), found, 0.5)
+    rows, columns = np.nonzero(cv2.imread(str(tmp_path / "a.png"))[:1600].max(axis=2) > 100)
+    x, y = columns + 0.5 - 100, rows + 0.5 - 100
+    along, across = x * np.cos(theta) + y * np.sin(theta), y * np.cos(theta) - x * np.sin(theta)
+    assert len(x) > 200 and np.abs(np.hypot(along / 60, across / 20) - 1).max() < 0.08

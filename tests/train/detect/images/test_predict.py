@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+from pyproj import Transformer
 from rasterio.crs import CRS
 from rasterio.transform import from_origin
 from tests.helpers.stored_run import THRESHOLD, settings_of, store_run
@@ -15,7 +16,9 @@ from typer.testing import CliRunner
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M
 from perilune_train.cli.main import app
+from perilune_train.detect.evaluate.ellipses import correlations_of
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.split_evaluation import ELLIPSE_COLUMNS
 from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference
 from perilune_train.detect.images.predict import PredictSettings, predict_images
 from perilune_train.detect.inference.tiling import Tiling
@@ -24,6 +27,7 @@ EARTH = CRS.from_epsg(4326)
 POLAR = CRS.from_proj4(f"+proj=stere +lat_0=-90 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
 LONGITUDES = CRS.from_proj4(f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs")
 COLUMNS = ["image", "x0_px", "y0_px", "x1_px", "y1_px", "centre_x_px", "centre_y_px", "radius_px", "score"]
+COLUMNS += ELLIPSE_COLUMNS
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +98,31 @@ def test_places_and_diameters_on_the_moon(tmp_path, crs, transform, place, diame
     assert np.ptp(ring[:, 0]) < 5.0, "torn at 180 degrees"
     x, y = ring.T - ring[0][:, None]
     assert (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() > 0, "clockwise"
+
+
+def test_an_ellipse_is_turned_on_the_map(tmp_path):
+    """A polar map is true to scale at the pole; rows run south along 90 E to the pole, columns towards 0 E."""
+    reference = read_georeference(geotiff(tmp_path / "g.tif", POLAR, from_origin(560, 40, 2, 2)))
+    ellipse = np.array([[20.0, 20.0, 12.0, 6.0, np.radians(30)]])
+    half = np.sqrt([[144 * 0.75 + 36 * 0.25, 144 * 0.25 + 36 * 0.75]])
+    boxes = np.hstack([20 - half, 20 + half])
+    shapes = np.column_stack([correlations_of(ellipse), [[0.5, 0.6, 0.7, 0.8]]])
+    ((with_ellipse,), (plain,)) = (
+        features("g.tif", Detections(boxes, np.array([0.5]), given), reference) for given in (shapes, None)
+    )
+    reported = with_ellipse["properties"]
+    assert [reported[name] for name in ELLIPSE_COLUMNS] == pytest.approx([12, 6, 30, 0.5, 0.6, 0.7, 0.8])
+    assert [reported[name] for name in ("semi_major_m", "semi_minor_m", "diameter_m", "diameter_px")] == pytest.approx(
+        [24, 12, 2 * np.sqrt(24 * 12), 2 * np.sqrt(72)], rel=1e-4
+    )
+    # The polygon in pixels: map x = 560 + 2 column, map y = 40 - 2 row.
+    to_map = Transformer.from_crs(f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs", POLAR.to_wkt(), always_xy=True)
+    x, y = to_map.transform(*np.array(with_ellipse["geometry"]["coordinates"][0][:-1]).T)
+    points = np.column_stack([(np.array(x) - 560) / 2, (40 - np.array(y)) / 2]) - 20
+    along = points @ [np.cos(np.radians(30)), np.sin(np.radians(30))]
+    across = points @ [-np.sin(np.radians(30)), np.cos(np.radians(30))]
+    np.testing.assert_allclose((along / 12) ** 2 + (across / 6) ** 2, 1, atol=1e-3)
+    assert plain["properties"]["sigma_x_px"] is None and plain["properties"]["angle_deg"] == 0
 
 
 def test_a_world_file_needs_its_projection(tmp_path):
@@ -222,6 +251,20 @@ def test_a_broken_projection_or_a_place_off_the_map_leaves_pixels(run, tmp_path,
     text = " ".join(capsys.readouterr().err.split())
     assert "sky.tif: not in detections.geojson" in text and "w.png: not in detections.geojson" in text
     assert not (tmp_path / "out" / "detections.geojson").exists()
+
+
+def test_an_old_detector_says_what_it_lacks(tmp_path, capsys):
+    """Its ellipses lie in the boxes and are axis-aligned; it knows no standard deviations."""
+    old = store_run(tmp_path / "runs", "ellipses=false")
+    assert cv2.imwrite(str(tmp_path / "a.png"), noise(64, 96))
+    assert predict_images([tmp_path / "a.png"], old, settings_of(old), tmp_path / "out", PredictSettings(Tiling())) > 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.count("stored: this detector predicts only boxes") == 1
+    table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
+    assert list(table.columns) == COLUMNS and set(table["angle_deg"]) <= {0, 90}
+    width, height = table["x1_px"] - table["x0_px"], table["y1_px"] - table["y0_px"]
+    np.testing.assert_allclose(2 * table["semi_major_px"], np.maximum(width, height))
+    assert table[list(ELLIPSE_COLUMNS[3:])].isna().all(axis=None)
 
 
 def test_a_folder_and_a_least_size(run, tmp_path):

@@ -12,6 +12,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.scales import detect_at_scales, multiply_adds_of_a_frame, resized, scaled_size
+from perilune_train.models.ellipse import semi_axes
 from perilune_train.models.size import multiply_adds
 
 
@@ -26,14 +27,25 @@ class OneSpot(torch.nn.Module):
         super().__init__()
         self.shapes = []
 
-    def detect(self, images):
+    def detect_ellipses(self, images):
         self.shapes.append(tuple(images.shape))
         boxes = []
         for image in images[:, 0].numpy():
             y, x = np.nonzero(image > (image.max() + image.min()) / 2)
             boxes.append([[x.min(), y.min(), x.max() + 1, y.max() + 1]])
         wide = torch.tensor(boxes, dtype=torch.float32)
-        return wide, ((wide[..., 2] - wide[..., 0]) >= 8).float() * 0.9
+        return wide, ((wide[..., 2] - wide[..., 0]) >= 8).float() * 0.9, None
+
+
+class OneEllipse(OneSpot):
+    """As OneSpot; standard deviations are a tenth of the sides of the box and of the semi-axes."""
+
+    def detect_ellipses(self, images):
+        boxes, scores, _ = super().detect_ellipses(images)
+        sides = (boxes[..., 2:] - boxes[..., :2]) / 10
+        correlations = torch.full_like(scores, 0.3)
+        axes = semi_axes(boxes, correlations) / 10
+        return boxes, scores, torch.cat([correlations[..., None], sides, axes], dim=-1)
 
 
 def cpu(network, *settings):
@@ -56,6 +68,19 @@ def test_boxes_come_back_in_pixels_of_the_frame(factor, size):
     assert network.shapes == [(2, 1, *scaled_size(*size, factor))]
     for part, box in zip(found, boxes, strict=True):
         assert part.boxes == pytest.approx(box[None], abs=1 / factor)
+
+
+@pytest.mark.parametrize("size", [(256, 256), (96, 160)])
+def test_ellipses_come_back_in_pixels_of_the_frame(size):
+    """At all scales; (96, 160) at 1.3 becomes 128 x 224, which is 1.333 by 1.4 times the frame."""
+    frames = np.stack([spot(*size, (40, 20, 72, 60))])
+    for factor in (0.5, 1.0, 1.3, 2.0):
+        (found,) = detect_at_scales(cpu(OneEllipse(), f"detect.evaluation.scales=[{factor}]"), frames)
+        sides = found.boxes[0, 2:] - found.boxes[0, :2]
+        assert found.shapes[0, 0] == pytest.approx(0.3)
+        np.testing.assert_allclose(found.shapes[0, 1:], [*sides / 10, *found.ellipses[0, 2:4] / 10], rtol=1e-5)
+    (both,) = detect_at_scales(cpu(OneEllipse(), "detect.evaluation.scales=[1,2]"), frames)
+    assert both.shapes.shape == (1, 5)
 
 
 def test_a_small_crater_is_seen_at_the_scale_that_enlarges_it_and_a_large_one_once():

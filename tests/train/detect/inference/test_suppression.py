@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from perilune_train.detect.config import EvaluationSettings
 from perilune_train.detect.evaluate.boxes import suppress
-from perilune_train.detect.inference.suppression import suppress_batch
+from perilune_train.detect.inference import suppression
+from perilune_train.detect.inference.suppression import detections_of, suppress_batch
 
 
 def crowd(rng: np.random.Generator, count: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -62,3 +64,21 @@ def test_nothing_to_suppress():
     none = torch.zeros(2, 0)
     assert suppress_batch(torch.zeros(2, 0, 4), none, none.bool(), 0.5).shape == (2, 0)
     assert suppress_batch(torch.zeros(2, 3, 4), torch.ones(2, 3), torch.zeros(2, 3).bool(), 0.5).shape == (2, 0)
+
+
+def test_shapes_stay_with_their_boxes_on_a_cpu_and_in_a_batch():
+    boxes, scores = (torch.stack(parts) for parts in zip(*(crowd(np.random.default_rng(8), 300),) * 2, strict=True))
+    shapes = torch.cat([scores[..., None] - 0.5, boxes], dim=-1)
+    settings = EvaluationSettings(min_score=0.2, max_detections=30)
+    strong = scores >= settings.min_score
+    frames, batch = (
+        detections_of(boxes, scores, settings, shapes),
+        suppression._of_batch(boxes, scores, strong, shapes, settings),
+    )
+    for found in (*frames, *batch):
+        assert len(found.boxes) > 5 and found.shapes.shape == (len(found.boxes), 5)
+        np.testing.assert_array_equal(found.shapes[:, 1:], found.boxes)
+        np.testing.assert_allclose(found.shapes[:, 0], found.scores - 0.5, atol=1e-6)
+    for one, other in zip(frames, batch, strict=True):
+        np.testing.assert_array_equal(one.boxes, other.boxes)
+    assert all(part.shapes is None for part in detections_of(boxes, scores, settings))

@@ -19,12 +19,13 @@ from perilune_train.detect.inference.tiles import (
     suppress_in_blocks,
     tile_starts,
 )
+from perilune_train.models.ellipse import semi_axes
 
 
 class Blobs(torch.nn.Module):
     """Finds bright patches as far as the tile shows them: at a border, only the part that is seen."""
 
-    def detect(self, images):
+    def detect_ellipses(self, images):
         boxes, scores = [], []
         for image in images[:, 0].numpy():
             bright = (image > (image.max() + image.min()) / 2).astype(np.uint8)
@@ -35,7 +36,18 @@ class Blobs(torch.nn.Module):
             scores.append(1 - area / 1e5)
         most = max(len(part) for part in scores)
         fill = [np.pad(b, [(0, most - len(b)), (0, 0)]) for b in boxes]
-        return torch.tensor(np.stack(fill)), torch.tensor(np.stack([np.pad(s, (0, most - len(s))) for s in scores]))
+        every = np.stack([np.pad(s, (0, most - len(s))) for s in scores])
+        return torch.tensor(np.stack(fill)), torch.tensor(every), None
+
+
+class EllipticBlobs(Blobs):
+    """As Blobs; the correlation depends on the score, and the deviations are a tenth of sides and semi-axes."""
+
+    def detect_ellipses(self, images):
+        boxes, scores, _ = super().detect_ellipses(images)
+        sides = (boxes[..., 2:] - boxes[..., :2]) / 10
+        axes = semi_axes(boxes, scores - 0.5) / 10
+        return boxes, scores, torch.cat([scores[..., None] - 0.5, sides, axes], dim=-1)
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +84,17 @@ def test_each_crater_is_found_once_and_whole(detector, scales, least, size, radi
     assert len(found.boxes) == len(truth)
     assert (overlap.max(axis=0) >= least).all()
     assert (np.diff(found.scores) <= 0).all()
+
+
+@pytest.mark.parametrize("scales", [(1.0,), (2.0,), (1.0, 0.5)])
+def test_shapes_stay_with_their_boxes(detector, scales):
+    image, truth = discs(700, 900, 40, 12)
+    tiling = Tiling(scales=scales, overlap_px=96)
+    found = detect_image(Detector(EllipticBlobs(), detector.config, "cpu", False), image, tiling)
+    assert len(found.boxes) == len(truth)
+    np.testing.assert_allclose(found.shapes[:, 0], found.scores - 0.5, rtol=1e-6)
+    sides = found.boxes[:, 2:] - found.boxes[:, :2]
+    np.testing.assert_allclose(found.shapes[:, 1:], np.hstack([sides, found.ellipses[:, 2:4]]) / 10, rtol=1e-6)
 
 
 def test_large_images_are_enlarged_tile_by_tile(detector, monkeypatch):

@@ -154,3 +154,13 @@ def test_a_teacher_of_other_strides_is_refused(teacher_path):
         load_teacher(teacher_path, settings("detect.strides=[8, 16, 32]"))
     with pytest.raises(UserError, match=r"best.ckpt: in_channels: got 1, expected 3"):
         load_teacher(teacher_path, settings("detect.in_channels=3"))
+
+
+def test_ellipse_outputs_take_no_part():
+    """Student or teacher may predict ellipses; only boxes and scores are compared."""
+    random = torch.Generator().manual_seed(6)
+    student, teacher = ([torch.randn(1, 3, 4, 4, 10, generator=random)] for _ in range(2))
+    anchors = torch.tensor([[[8.0, 8.0]] * 3])
+    expected = distill_loss([student[0][..., :5]], [teacher[0][..., :5]], anchors, (8,))
+    for own, other in ((student, teacher), (student, [teacher[0][..., :5]]), ([student[0][..., :5]], teacher)):
+        torch.testing.assert_close(distill_loss(own, other, anchors, (8,)), expected)

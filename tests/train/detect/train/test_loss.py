@@ -119,12 +119,13 @@ def test_no_step_of_the_loss_needs_a_value(objectness):
     assert targets[0].predictors.shape[1] > 3 and targets[0].ignored.any()
     with FakeTensorMode() as fake:
         raw = torch.zeros(2, 3, 4, 4, 5, requires_grad=True)
-        given = [Assignment(*(fake.from_tensor(part) for part in vars(targets[0]).values() if part is not None))]
+        parts = {name: fake.from_tensor(part) for name, part in vars(targets[0]).items() if part is not None}
+        given = [Assignment(**parts)]
         loss = sum(detection_loss([raw], given, fake.from_tensor(anchors), (8,), LossSettings(objectness=objectness)))
         loss.backward()
         assert raw.grad.shape == raw.shape
         # The assignment itself depends on values, so the loader does it.
-        fake_labels = BatchLabels(*(fake.from_tensor(part) for part in vars(labels).values()))
+        fake_labels = BatchLabels(*(fake.from_tensor(part) for part in (labels.boxes, labels.frame, labels.selected)))
         with pytest.raises(DynamicOutputShapeException):
             assign(fake_labels, fake.from_tensor(anchors), (8,), [(2, 4, 4)], 1.5)
 

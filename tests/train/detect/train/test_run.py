@@ -3,6 +3,8 @@
 import json
 import shutil
 
+import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -14,6 +16,8 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.evaluate.ellipses import correlations_of, ellipses_of
+from perilune_train.detect.evaluate.split_evaluation import ELLIPSE_COLUMNS
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.train.detect_run import build_network, run_detect
@@ -51,6 +55,28 @@ def test_a_run_leaves_all_its_files(finished):
     assert metrics["train/epochs"] == 2
     assert 0 < metrics["anchors/mean_best_iou"] <= 1 and 0 < metrics["anchors/best_possible_recall"] <= 1
     assert parse_yaml(finished.config.read_text(), "")["detect"]["strides"] == [4, 8, 16]
+
+
+def test_a_run_predicts_ellipses_with_deviations(finished):
+    assert runs.load_weights(finished.best)["architecture"]["ellipses"] is True
+    table = pd.read_parquet(finished.root / "detections.parquet")
+    assert len(table) > 100
+    boxes = table[["x0_px", "y0_px", "x1_px", "y1_px"]].to_numpy()
+    ellipses = np.column_stack(
+        [
+            (boxes[:, :2] + boxes[:, 2:]) / 2,
+            table["semi_major_px"],
+            table["semi_minor_px"],
+            np.radians(table["angle_deg"]),
+        ]
+    )
+    np.testing.assert_allclose(ellipses_of(boxes, correlations_of(ellipses)), ellipses, atol=1e-6)
+    assert (correlations_of(ellipses) != 0).mean() > 0.9 and (table[list(ELLIPSE_COLUMNS[3:])] > 0).all(axis=None)
+    metrics = json.loads(finished.metrics.read_text())
+    assert 0 <= metrics["test/strict/ellipse_score"] <= 100 and 0 <= metrics["test/ellipse_score"] <= 100
+    for name in ("centre_error_px_rms", "semi_major_error_px_median", "axes_normalised_error_squared"):
+        assert f"test/{name}" in metrics
+    assert "## Ellipses of detected craters" in finished.root.joinpath("report.md").read_text()
 
 
 def test_a_run_stores_the_selection_that_it_used(finished):
@@ -97,7 +123,7 @@ def test_an_unknown_selection_is_refused_in_one_line(setting, message):
 
 def test_the_table_of_detections(finished, dataset_detect):
     table = pq.read_table(finished.root / "detections.parquet").to_pandas()
-    assert list(table.columns) == ["frame_id", "x0_px", "y0_px", "x1_px", "y1_px", "score"]
+    assert list(table.columns) == ["frame_id", "x0_px", "y0_px", "x1_px", "y1_px", "score", *ELLIPSE_COLUMNS]
     assert set(table["frame_id"]) <= {f"s004/t004/{k:06d}" for k in range(8)}
     assert (table["x1_px"] > table["x0_px"]).all()
     assert table["score"].between(0.01, 1).all()
@@ -228,7 +254,7 @@ def test_a_detector_comes_back_as_it_was_saved(finished):
         ([], ()),
         (["detect.attention=cbam"], ("backbone.attentions.",)),
         (["detect.attention=none"], ()),
-        (["detect.strides=[8,16,32]"], ("branches.", "heads.", "laterals.", "anchors")),
+        (["detect.strides=[8,16,32]"], ("branches.", "heads.", "ellipse_heads.", "laterals.", "anchors")),
     ],
 )
 def test_a_run_starts_from_what_an_earlier_one_has_for_it(finished, tmp_path, changes, stays):

@@ -244,7 +244,7 @@ def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(few, tmp_path
 
     for name in ("on_train_start", "on_train_epoch_end"):
         monkeypatch.setattr(DetectTask, name, recorded(getattr(DetectTask, name)))
-    settings = (*QUICK, f"detect.init_from={tmp_path / 'best.ckpt'}")
+    settings = (*QUICK, "detect.ellipses=false", f"detect.init_from={tmp_path / 'best.ckpt'}")
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
     run_detect(config, few, tmp_path / "runs", "a")
     (before, _), (frozen, frozen_average), (after, after_average) = states
@@ -314,3 +314,31 @@ def test_the_first_layer_can_be_left_out(tmp_path):
     assert torch.equal(network.backbone.stem.conv.weight, stem)
     rest = [key for key in given.state_dict() if not key.startswith("backbone.stem.")]
     assert all(torch.equal(given.state_dict()[key], network.state_dict()[key]) for key in rest)
+
+
+@pytest.mark.parametrize("given, wanted", [(False, True), (True, False), (True, True)])
+def test_ellipse_outputs_come_from_a_file_that_has_them(tmp_path, given, wanted):
+    """All other weights and the anchors come from the file in every case."""
+    shape = {"in_channels": 1, "width": 0.125, "attention": "none", "strides": (4, 8, 16)}
+    source = YOLOv3(torch.rand(3, 3, 2) + 4, **shape, ellipses=given)
+    architecture = shape | {"strides": [4, 8, 16]} | ({"ellipses": True} if given else {})
+    runs.save_weights(tmp_path / "a.ckpt", architecture, source)
+    network = YOLOv3(None, **shape, ellipses=wanted)
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    start_from(network, tmp_path / "a.ckpt", DetectConfig(**shape, ellipses=wanted))
+    after, saved = network.state_dict(), source.state_dict()
+    assert any(key.startswith("ellipse_heads.") for key in after) == wanted
+    for key, value in after.items():
+        kept = key.startswith("ellipse_heads.") and not given
+        assert torch.equal(value, before[key] if kept else saved[key]), key
+    images = torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    source.eval(), network.eval()
+    torch.testing.assert_close(network.detect(images), source.detect(images))
+
+
+def test_ellipse_outputs_have_no_place_in_a_darknet_file(tmp_path):
+    with torch.device("meta"):
+        network = YOLOv3(None, 3, 1.0, "none", ellipses=True)
+    shape = {"in_channels": 3, "width": 1.0, "attention": "none", "strides": [8, 16, 32], "ellipses": True}
+    with pytest.raises(UserError, match="ellipses: got True, expected False; the checkpoint has another architecture"):
+        darknet_content(network, shape, Path("best.ckpt"), whole=True)

@@ -30,6 +30,8 @@ class BatchLabels:
     """Index in the batch of each label's frame (T,)."""
     selected: Tensor
     """False for a label to ignore, such as a hardly visible crater (T,)."""
+    correlations: Tensor | None = None
+    """Correlation of the ellipse in each box (T,), see detect/evaluate/ellipses.py; None if only boxes are learned."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Assignment:
     """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
     counted: Tensor | None = None
     """False for rows that only pad the other arrays to a constant length (P,); None: no row is padding."""
+    correlations: Tensor | None = None
+    """Correlation of the ellipse in the label box of each positive predictor (P,); None if only boxes are learned."""
 
     @property
     def positive(self) -> Tensor:
@@ -148,7 +152,8 @@ def assign(
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
         predictors = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
-        assignment = Assignment(predictors, labels.boxes[label], ignored)
+        correlations = None if labels.correlations is None else labels.correlations[label]
+        assignment = Assignment(predictors, labels.boxes[label], ignored, correlations=correlations)
         result.append(replace(assignment, ignored=ignored & ~assignment.positive))
     return result
 

@@ -1,4 +1,7 @@
-"""Random augmentation of training frames and their boxes."""
+"""Random augmentation of training frames and their outlines.
+
+An outline is a box x0, y0, x1, y1 in pixels and the correlation of the ellipse in it (detect/evaluate/ellipses.py).
+"""
 
 import cv2
 import numpy as np
@@ -10,24 +13,24 @@ from perilune_train.detect.data.ignored import MARGIN
 Array = NDArray[np.float64]
 
 
-def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
-    """Apply one of the eight symmetries to a frame (height, width) and its boxes (M, 4).
+def turn(image: NDArray, outlines: Array, kind: int) -> tuple[NDArray, Array]:
+    """Apply one of the eight symmetries to a frame (height, width) and its outlines (M, 5).
 
     Bit 0 of `kind` mirrors left and right, bit 1 top and bottom, bit 2 (applied last) exchanges x and y.
     """
     height, width = image.shape
-    x0, y0, x1, y1 = boxes.T
+    x0, y0, x1, y1, correlation = outlines.T
     if kind & 1:
-        image, x0, x1 = image[:, ::-1], width - x1, width - x0
+        image, x0, x1, correlation = image[:, ::-1], width - x1, width - x0, -correlation
     if kind & 2:
-        image, y0, y1 = image[::-1], height - y1, height - y0
+        image, y0, y1, correlation = image[::-1], height - y1, height - y0, -correlation
     if kind & 4:
         image, x0, y0, x1, y1 = image.T, y0, x0, y1, x1
-    return image, np.stack([x0, y0, x1, y1], axis=1)
+    return image, np.stack([x0, y0, x1, y1, correlation], axis=1)
 
 
-def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, float]) -> tuple[NDArray, Array]:
-    """Enlarge or shrink a frame (height, width) and its boxes (M, 4); the image size is kept.
+def rescale(image: NDArray, outlines: Array, factor: float, offset: tuple[float, float]) -> tuple[NDArray, Array]:
+    """Enlarge or shrink a frame (height, width) and its outlines (M, 5); the image size is kept.
 
     `offset` (x and y, each 0 to 1) selects which part of an enlarged frame is kept, or where a shrunk frame is placed.
     A shrunk frame is surrounded by its mean grey.
@@ -41,7 +44,7 @@ def rescale(image: NDArray, boxes: Array, factor: float, offset: tuple[float, fl
     matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     scaled = cv2.warpAffine(image, matrix, (width, height), flags=flags, borderValue=float(image.mean()))
-    return scaled, (boxes - np.tile(shift, 2)) * factor
+    return scaled, np.column_stack([(outlines[:, :4] - np.tile(shift, 2)) * factor, outlines[:, 4:]])
 
 
 def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -58,30 +61,30 @@ def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.ran
 
 def augment(
     image: NDArray[np.uint8],
-    boxes: Array,
+    outlines: Array,
     selected: NDArray[np.bool_],
     radius_px: tuple[float, float],
     settings: AugmentSettings,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-    """Augment a frame and its boxes at random.
+    """Augment a frame and its outlines (M, 5) at random.
 
-    Returns grey levels (height, width) float32, boxes (M, 4) in pixels, and whether each box is selected (M,). A crater
-    is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is removed
-    if it becomes much smaller than that range or leaves the image.
+    Returns grey levels (height, width) float32, outlines (M, 5), and whether each crater is selected (M,). A crater is
+    deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is removed if
+    it becomes much smaller than that range or leaves the image.
     """
     turned: NDArray = image
     if settings.flips_and_turns:
         square = image.shape[0] == image.shape[1]
-        turned, boxes = turn(image, boxes, int(rng.integers(8 if square else 4)))
+        turned, outlines = turn(image, outlines, int(rng.integers(8 if square else 4)))
     low, high = settings.scale
     if (low, high) != (1, 1):
         factor = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-        turned, boxes = rescale(np.ascontiguousarray(turned), boxes, factor, (rng.random(), rng.random()))
-        size = np.array(turned.shape[::-1])
+        turned, outlines = rescale(np.ascontiguousarray(turned), outlines, factor, (rng.random(), rng.random()))
+        size, boxes = np.array(turned.shape[::-1]), outlines[:, :4]
         centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
         seen = ((boxes[:, 2:] > 0) & (boxes[:, :2] < size)).all(1) & (radius >= radius_px[0] * MARGIN)
-        boxes, selected, centre, radius = boxes[seen], selected[seen], centre[seen], radius[seen]
+        outlines, selected, centre, radius = outlines[seen], selected[seen], centre[seen], radius[seen]
         inside = ((centre >= 0) & (centre < size)).all(1)
         selected = selected & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
     pixels = grey_levels(turned, settings, rng)[turned]
@@ -91,4 +94,4 @@ def augment(
     noise = rng.uniform(0, settings.noise)
     if noise > 0:
         pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
-    return pixels, boxes, selected
+    return pixels, outlines, selected

@@ -1,5 +1,6 @@
 """Make batches of frames and labels: order of an epoch, augmentation, assignment, network input."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from perilune_train.training.runs import choose_device
 
 Array = NDArray[np.float64]
 Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
-"""A normalised frame (H, W), its boxes (M, 4) in pixels, and whether each box is selected (M,)."""
+"""A normalised frame (H, W), its outlines (M, 5, see augment.py), and whether each crater is selected (M,)."""
 Batch = tuple[Tensor, Targets]
 """Normalised frames (N, H, W) and the assignments of their labels; outside training the assignments are empty."""
 Key = tuple[int, int]
@@ -46,8 +47,9 @@ class TrainingFrames(torch_data.Dataset):
         in_split = split.share.of(split.n_frames)[number]
         rng = np.random.default_rng([self.seed, epoch, in_split])
         image = split.frames.images[number]
-        pixels, boxes, selected = augment(image, labels.boxes, labels.selected, split.radius_px, self.settings, rng)
-        return normalised(pixels), boxes, selected
+        outlines = labels.outlines
+        pixels, outlines, selected = augment(image, outlines, labels.selected, split.radius_px, self.settings, rng)
+        return normalised(pixels), outlines, selected
 
 
 class EvaluationFrames(torch_data.Dataset):
@@ -61,13 +63,20 @@ class EvaluationFrames(torch_data.Dataset):
 
     def __getitem__(self, number: int) -> Sample:
         labels = self.split.labels[number]
-        return normalised(self.split.frames.images[number]), labels.boxes, labels.selected
+        return normalised(self.split.frames.images[number]), labels.outlines, labels.selected
 
 
 def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
     """Convert normalised frames (N, H, W) to the network's input (N, in_channels, H, W), channels last."""
     stacked = torch.as_tensor(images)[:, None].expand(-1, in_channels, -1, -1)
     return stacked.contiguous(memory_format=torch.channels_last)
+
+
+def batch_labels(outlines: Sequence[Array], selected: Sequence[NDArray[np.bool_]]) -> BatchLabels:
+    """Labels of a batch from the outlines (M, 5) and the selection (M,) of each frame."""
+    joined = torch.as_tensor(np.concatenate(outlines), dtype=torch.float32)
+    frame = torch.repeat_interleave(torch.arange(len(outlines)), torch.tensor([len(part) for part in outlines]))
+    return BatchLabels(joined[:, :4], frame, torch.as_tensor(np.concatenate(selected)), joined[:, 4])
 
 
 @dataclass(frozen=True)
@@ -82,15 +91,11 @@ class Collate:
     """Factor within which an anchor fits a label; None assigns one predictor to each label."""
 
     def __call__(self, samples: list[Sample]) -> Batch:
-        images, boxes, selected = zip(*samples, strict=True)
+        images, outlines, selected = zip(*samples, strict=True)
         frames = torch.as_tensor(np.stack(images))
         if self.anchors is None:
             return frames, []
-        labels = BatchLabels(
-            torch.as_tensor(np.concatenate(boxes), dtype=torch.float32),
-            torch.repeat_interleave(torch.arange(len(samples)), torch.tensor([len(part) for part in boxes])),
-            torch.as_tensor(np.concatenate(selected)),
-        )
+        labels = batch_labels(outlines, selected)
         count, height, width = frames.shape
         shapes = [(count, height // stride, width // stride) for stride in self.strides]
         return frames, assign(labels, self.anchors, self.strides, shapes, self.ratio)

@@ -17,6 +17,7 @@ from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import Selection
 from perilune_train.data.shares import Share
 from perilune_train.detect.data.ignored import Craters, read_craters, unlabelled_craters
+from perilune_train.detect.evaluate.ellipses import correlations_of
 
 Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
@@ -35,7 +36,7 @@ class FrameLabels:
     radius_px: Array
     """Radius of the circle of equal area, pixels (M,)."""
     ellipses: Array
-    """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
+    """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5)."""
     selected: NDArray[np.bool_]
     """False for a crater to ignore: hardly visible, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
@@ -45,6 +46,11 @@ class FrameLabels:
     crowd: NDArray[np.bool_] | None = None
     """Whether a label is a region of many craters (M,), as COCO's `iscrowd`. Such a label is never selected. None if
     there are no such labels."""
+
+    @property
+    def outlines(self) -> Array:
+        """Boxes with the correlations of their ellipses (M, 5), see detect/evaluate/ellipses.py."""
+        return np.column_stack([self.boxes, correlations_of(self.ellipses)])
 
 
 @dataclass(frozen=True, slots=True)

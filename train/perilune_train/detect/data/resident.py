@@ -14,8 +14,8 @@ from torch.utils import data as torch_data
 
 from perilune_train.data.epochs import EpochBatches, batch_loader
 from perilune_train.detect.config import AugmentSettings, DetectConfig
-from perilune_train.detect.data.assign import Assignment, BatchLabels, Targets, assign
-from perilune_train.detect.data.batches import TrainingFrames
+from perilune_train.detect.data.assign import Assignment, Targets, assign
+from perilune_train.detect.data.batches import TrainingFrames, batch_labels
 from perilune_train.detect.data.split import DetectSplit
 
 _UNCHANGED = AugmentSettings(
@@ -42,13 +42,16 @@ class ResidentScale:
     """False for rows of padding (F, K)."""
     ignored: Tensor
     """Predictors that are neither positive nor negative (F, 3, h, w), bool."""
+    correlations: Tensor
+    """Correlation of the ellipse in each label box (F, K)."""
 
     def batch(self, numbers: Tensor) -> Assignment:
         """The assignment of a batch of frames (B,)."""
-        predictors, boxes = self.predictors[numbers], self.boxes[numbers]
+        predictors, boxes, correlations = self.predictors[numbers], self.boxes[numbers], self.correlations[numbers]
         frame = torch.arange(len(numbers), device=numbers.device)[:, None].expand(predictors.shape[:2])
         rows = torch.cat([frame[..., None], predictors], -1).flatten(0, 1).T
-        return Assignment(rows, boxes.flatten(0, 1), self.ignored[numbers], self.counted[numbers].flatten())
+        counted = self.counted[numbers].flatten()
+        return Assignment(rows, boxes.flatten(0, 1), self.ignored[numbers], counted, correlations.flatten())
 
 
 @dataclass(frozen=True)
@@ -68,13 +71,7 @@ class ResidentFrames:
         parts: list[Targets] = []
         for start in range(0, len(split), _PORTION):
             labels = split.labels[start : start + _PORTION]
-            rows = BatchLabels(
-                torch.cat([torch.as_tensor(frame.boxes, dtype=torch.float32) for frame in labels]),
-                torch.repeat_interleave(
-                    torch.arange(len(labels)), torch.tensor([len(frame.boxes) for frame in labels])
-                ),
-                torch.cat([torch.as_tensor(frame.selected) for frame in labels]),
-            )
+            rows = batch_labels([frame.outlines for frame in labels], [frame.selected for frame in labels])
             shapes = [(len(labels), height // stride, width // stride) for stride in config.strides]
             parts.append(assign(rows, anchors.cpu(), config.strides, shapes, ratio))
         scales = [_padded([targets[k] for targets in parts], device) for k in range(len(config.strides))]
@@ -93,12 +90,14 @@ class ResidentFrames:
 
 def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
     """Join the assignments of all portions, and pad the rows of each frame to one length."""
-    predictors, boxes = [], []
+    predictors, boxes, correlations = [], [], []
     for part in parts:
+        assert part.correlations is not None
         order = torch.argsort(part.predictors[0], stable=True)
         counts = torch.bincount(part.predictors[0], minlength=len(part.ignored)).tolist()
         predictors += list(part.predictors[1:, order].T.split(counts))
         boxes += list(part.boxes[order].split(counts))
+        correlations += list(part.correlations[order].split(counts))
     counted = pad_sequence([torch.ones(len(part_boxes), dtype=torch.bool) for part_boxes in boxes], batch_first=True)
     # Pad with the box 0, 0, 1, 1: the loss is computed for all rows, so the padding needs an area.
     filled = pad_sequence([part_boxes - part_boxes.new_tensor([0, 0, 1, 1]) for part_boxes in boxes], batch_first=True)
@@ -107,6 +106,7 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
         (filled + filled.new_tensor([0, 0, 1, 1])).to(device),
         counted.to(device),
         torch.cat([part.ignored for part in parts]).to(device),
+        pad_sequence(correlations, batch_first=True).to(device),
     )
 
 

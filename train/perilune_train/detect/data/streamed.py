@@ -109,7 +109,7 @@ class _Batches:
         name, size = frame.row["frame_id"], frame.row["png_bytes"]
         image = decode(frame.png, f"{self.labels.dataset.store}/{name}", camera.height_px, camera.width_px, size)
         rng = np.random.default_rng([config.seed, epoch, frame.number])
-        pixels, boxes, selected = augment(
-            image, labels.boxes, labels.selected, self.labels.radius_px, config.augment, rng
+        pixels, outlines, selected = augment(
+            image, labels.outlines, labels.selected, self.labels.radius_px, config.augment, rng
         )
-        return normalised(pixels), boxes, selected
+        return normalised(pixels), outlines, selected

@@ -1,4 +1,4 @@
-"""Inference engines: functions that map images to boxes and scores."""
+"""Inference engines: functions that map images to boxes, scores and, if the network predicts ellipses, shapes."""
 
 import contextlib
 import functools
@@ -19,8 +19,11 @@ from perilune_shared.threads import cores_in_affinity, usable_cores
 from perilune_train.training.checkpoint_file import MAX_WEIGHT_BYTES
 
 Array = NDArray[np.float32]
-Engine = Callable[[Array], tuple[Array, Array]]
-"""Maps normalised images (N, C, H, W), float32, to boxes (N, K, 4) in pixels and scores (N, K)."""
+Engine = Callable[[Array], tuple[Array, ...]]
+"""Maps normalised images (N, C, H, W), float32, to the outputs of `YOLOv3.detect_ellipses`: boxes (N, K, 4) in pixels,
+scores (N, K) and, if the network predicts ellipses, shapes (N, K, 5)."""
+OUTPUT_NAMES = ("boxes", "scores", "shapes")
+"""Outputs of a file. `shapes` is missing if the network predicts no ellipses."""
 EnginePrecision = Literal["f32", "bf16"]
 _EXPECTED = "a file written by `perilune-train detect deploy`"
 
@@ -39,15 +42,15 @@ def package(name: str) -> Any:
 
 
 def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engine:
-    """Engine of a torch network that returns boxes and scores, with torch's number of threads."""
+    """Engine of a torch network that returns boxes, scores and perhaps shapes, with torch's number of threads."""
     network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
     @torch.inference_mode()
-    def run(images: Array) -> tuple[Array, Array]:
+    def run(images: Array) -> tuple[Array, ...]:
         inputs = torch.as_tensor(images).contiguous(memory_format=torch.channels_last)
         with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
-            boxes, scores = network(inputs)
-        return boxes.float().numpy(), scores.float().numpy()
+            outputs = network(inputs)
+        return tuple(part.float().numpy() for part in outputs)
 
     return run
 
@@ -61,7 +64,13 @@ def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     with _readable(path):
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    return lambda images: tuple(session.run(["boxes", "scores"], {"images": images}))
+    names = _present({output.name for output in session.get_outputs()})
+    return lambda images: tuple(session.run(names, {"images": images}))
+
+
+def _present(names: set[str]) -> list[str]:
+    """Outputs to read of a file with these outputs."""
+    return [name for name in OUTPUT_NAMES if name in names or name != "shapes"]
 
 
 @functools.cache
@@ -91,10 +100,11 @@ def openvino_engine(
     if threads := threads or _within_quota():
         settings["INFERENCE_NUM_THREADS"] = str(threads)
     request = core.compile_model(model, "CPU", settings).create_infer_request()
+    names = _present({output.get_any_name() for output in model.outputs})
 
-    def run(images: Array) -> tuple[Array, Array]:
+    def run(images: Array) -> tuple[Array, ...]:
         outputs = request.infer({"images": images})
-        return outputs["boxes"].copy(), outputs["scores"].copy()
+        return tuple(outputs[name].copy() for name in names)
 
     return run
 

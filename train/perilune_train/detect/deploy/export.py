@@ -37,30 +37,42 @@ from perilune_train.records.provenance import (
 from perilune_train.training.runs import RunFolder, load_weights
 
 MAX_DIFFERENCE_PX = 1e-3
-"""Largest allowed difference between a compared box coordinate and torch's float32 result, pixels."""
+"""Largest allowed difference of a compared box or standard deviation from torch's float32 result, pixels."""
 MAX_DIFFERENCE_SCORE = 1e-3
-"""Largest allowed difference between a score and torch's float32 result."""
+"""Largest allowed difference of a score or a correlation from torch's float32 result."""
 _CHECKED_BOXES = 100
+_SHAPES = (
+    "(n, K, 5) float32: correlation r of the ellipse in the box, and standard deviations of the centre's x and y, of "
+    "the semi-major and of the semi-minor axis in pixels. With the half sides w and h of the box, the ellipse is "
+    "x^T S^-1 x = 1 about the centre of the box, S = [[w^2, r w h], [r w h, h^2]]: the semi-axes are the square roots "
+    "of the eigenvalues of S, and the semi-major axis has the direction atan2(2 r w h, w^2 - h^2) / 2 from x towards y"
+)
 FORMATS = ("onnx", "openvino")
 _CHECKED_FRAMES = 8
 
 
 @torch.no_grad()
 def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
-    """Largest differences of an engine from torch in float32: of box coordinates (pixels), and of scores.
+    """Largest differences of an engine from torch in float32: in pixels, and of numbers without a unit.
 
-    Compares all scores. Compares a box only if its score is at least `min_score` or among the best 100 of its image.
-    Both differences are infinite if the shapes differ.
+    The first is of box coordinates and standard deviations, the second of scores and correlations. Compares all scores.
+    Compares a box and its ellipse only if its score is at least `min_score` or among the best 100 of its image. Both
+    differences are infinite if the outputs have other sizes.
     """
-    boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
-    engine_boxes, engine_scores = engine(images)
-    if engine_boxes.shape != boxes.shape or engine_scores.shape != scores.shape:
+    expected = [part.numpy() for part in network.detect_ellipses(torch.as_tensor(images)) if part is not None]
+    got = engine(images)
+    if [part.shape for part in got] != [part.shape for part in expected]:
         return float("inf"), float("inf")
+    boxes, scores, *shapes = expected
+    engine_boxes, engine_scores, *engine_shapes = got
     # Always compare some boxes, even if the network detects nothing in these frames.
     best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
     compared = scores >= np.minimum(best, min_score)
-    box_differences = np.abs(engine_boxes - boxes)[compared]
-    return float(box_differences.max(initial=0.0)), float(np.abs(engine_scores - scores).max())
+    px, score = np.abs(engine_boxes - boxes)[compared].max(initial=0.0), np.abs(engine_scores - scores).max()
+    for engine_part, part in zip(engine_shapes, shapes, strict=True):
+        errors = np.abs(engine_part - part)[compared]
+        px, score = max(px, errors[:, 1:].max(initial=0.0)), max(score, errors[:, 0].max(initial=0.0))
+    return float(px), float(score)
 
 
 def check(path: Path, name: str, network: YOLOv3, engine: Engine, images: Array, min_score: float) -> dict[str, float]:
@@ -118,6 +130,7 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
         "outputs": {
             "boxes": "(n, K, 4) float32: x0, y0, x1, y1 in pixels; 0, 0 is the image's upper left corner",
             "scores": "(n, K) float32 in 0..1",
+            **({"shapes": _SHAPES} if network.ellipses else {}),
         },
         "score_threshold": trained.threshold,
         "min_score": settings.min_score,

@@ -9,18 +9,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from perilune_train.detect.deploy.engines import openvino_core, package
+from perilune_train.detect.deploy.engines import OUTPUT_NAMES, openvino_core, package
 from perilune_train.models.fold import fold
-from perilune_train.models.yolo import YOLOv3, decode
+from perilune_train.models.yolo import OUTPUTS, YOLOv3, decode, decode_shapes
 
 _OPSET = 17
 
 
 class FlightDetector(nn.Module):
-    """A detector in operations that ONNX supports: maps images to boxes and scores.
+    """A detector in operations that ONNX supports: maps images to boxes, scores and perhaps shapes.
 
-    Images (N, in_channels, size_px, size_px) give boxes (N, K, 4), x0 y0 x1 y1 in pixels, and scores (N, K). They equal
-    the results of `YOLOv3.detect` up to rounding; non-maximum suppression is not included. Batch norm is folded exactly
+    Images (N, in_channels, size_px, size_px) give boxes (N, K, 4), x0 y0 x1 y1 in pixels, scores (N, K) and, if the
+    network predicts ellipses, shapes (N, K, 5). They equal the results of `YOLOv3.detect_ellipses` up to rounding;
+    non-maximum suppression is not included. Batch norm is folded exactly
     into the convolutions: W' = W g / sqrt(v + eps), b' = beta - m g / sqrt(v + eps). CBAM is replaced by standard
     operations. The given network is not changed.
     """
@@ -37,20 +38,22 @@ class FlightDetector(nn.Module):
             rows, columns = torch.meshgrid(at, at, indexing="ij")
             self.register_buffer(f"cells_{scale}", torch.stack([columns, rows], dim=-1))
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        boxes, scores = [], []
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        boxes, scores, shapes = [], [], []
         for scale, raw in enumerate(self.network(images)):
             anchors = self.network.anchors[scale][:, None, None, :]
             cells = getattr(self, f"cells_{scale}")
             boxes.append(decode(raw, cells, anchors, self.network.strides[scale]).flatten(1, 3))
             scores.append(raw[..., 4].sigmoid().flatten(1))
-        return torch.cat(boxes, 1), torch.cat(scores, 1)
+            if self.network.ellipses:
+                shapes.append(decode_shapes(raw[..., OUTPUTS:].flatten(1, 3), boxes[-1]))
+        return tuple(torch.cat(parts, 1) for parts in (boxes, scores, shapes) if parts)
 
 
 def write_onnx(detector: FlightDetector, path: Path, metadata: dict[str, Any], in_channels: int, size_px: int) -> None:
     """Write an ONNX file for any number of images; it stores each entry of `metadata` as JSON."""
     onnx = package("onnx")
-    names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
+    outputs = OUTPUT_NAMES[: 3 if detector.network.ellipses else 2]
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
         # Use the tracing exporter: the newer exporter needs two more packages and gives the same graph.
@@ -59,8 +62,8 @@ def write_onnx(detector: FlightDetector, path: Path, metadata: dict[str, Any], i
             (torch.zeros(1, in_channels, size_px, size_px),),
             str(path),
             input_names=["images"],
-            output_names=["boxes", "scores"],
-            dynamic_axes=names,
+            output_names=list(outputs),
+            dynamic_axes={name: {0: "n"} for name in ("images", *outputs)},
             opset_version=_OPSET,
             dynamo=False,
         )

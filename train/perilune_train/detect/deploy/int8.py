@@ -27,9 +27,9 @@ MAX_AP_LOSS = 0.005
 """Largest accepted loss of AP on the validation split."""
 _CALIBRATION_FRAMES = 64
 _TIMED = 30
-_KEPT_FLOAT = re.compile(r"/(squeeze|excite|spatial)|/heads\.\d+\.1/")
-"""Operations that stay in floating point: the gates, which are cheap, and the last convolution of each head, which
-gives the boxes."""
+_KEPT_FLOAT = re.compile(r"/(squeeze|excite|spatial)|/heads\.\d+\.1/|/ellipse_heads")
+"""Operations that stay in floating point: the gates, which are cheap, and the last convolutions of each head, which
+give boxes and ellipses."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
         task = bar.add_task(label, total=len(split), unit="frames", note="")
         for frame in split.frames.images:
             image = network_input(normalised(frame[None]), config.in_channels).contiguous().numpy()
-            boxes, scores = (torch.as_tensor(part) for part in engine(image))
+            boxes, scores, *_ = (torch.as_tensor(part) for part in engine(image))
             detections += detections_of(boxes, scores, config.evaluation)
             bar.advance(task)
     return curve(match_detections(split, detections, config)).ap_paper()

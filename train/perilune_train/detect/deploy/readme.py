@@ -43,7 +43,7 @@ def readme(metadata: dict[str, Any]) -> str:
         f"Input: `images`, float32, (n, {channels}, {size_px}, {size_px}). "
         f"{metadata['input']['normalisation'].capitalize()}.",
         "",
-        f"Output: `boxes` {metadata['outputs']['boxes']}; `scores` {metadata['outputs']['scores']}.",
+        f"Output: {'; '.join(f'`{name}` {text}' for name, text in metadata['outputs'].items())}.",
         "",
         f"Report detections with a score of at least {threshold}, the threshold chosen on validation frames. "
         "Apply non-maximum suppression, which is not part of the graph: of two boxes with an IoU above "

@@ -20,10 +20,12 @@ from perilune_train.detect.data.frame_facts import FrameFacts
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.bins import BinFigures, figures_by_bin
 from perilune_train.detect.evaluate.bootstrap import at_threshold_resampled, average_precisions
+from perilune_train.detect.evaluate.ellipse_score import ellipse_score
 from perilune_train.detect.evaluate.matching import (
     COCO_IOUS,
     FALSE,
     FOUND,
+    IGNORED,
     Criteria,
     Detections,
     Matches,
@@ -36,6 +38,8 @@ from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
 Array = NDArray[np.float64]
+_LARGE_PX = 5.0
+"""Craters above this radius have separate errors: smaller craters are limited by the pixels."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,27 @@ class Evaluation:
         """Centre and radius errors of the detected craters; see `errors_of_found`."""
         return errors_of_found(self.overlaps, self.matches, self.threshold)
 
+    @cached_property
+    def ellipse_errors(self) -> dict[str, float]:
+        """Errors of the ellipses of detected craters; see `ellipse_errors_of_found`."""
+        return ellipse_errors_of_found(self.overlaps, self.matches, self.threshold)
+
+    @cached_property
+    def ellipse_scores(self) -> dict[str, float]:
+        """NASA's score (ellipse_score.py) of the detections above the threshold: ellipse_score, strict/ellipse_score.
+
+        The truth is the selected labels. The first score does not count detections that the usual scoring rule
+        ignores; the strict score counts all detections.
+        """
+        overlaps, matches, n_frames = self.overlaps, self.matches, len(self.facts)
+        strong, area = self.matches.scores >= self.threshold, overlaps.ellipses[:, 3] > 0
+        truth = _by_frame(overlaps.label_ellipses, overlaps.label_frame, overlaps.label_selected, n_frames)
+        scores = {}
+        for key, counted in (("", matches.outcome != IGNORED), ("strict/", np.ones(len(strong), bool))):
+            found = _by_frame(overlaps.ellipses, overlaps.frame, strong & area & counted, n_frames)
+            scores[f"{key}ellipse_score"] = ellipse_score(found, truth)
+        return scores
+
     def figures(self) -> Metrics:
         """Entries of metrics.json; NaN where undefined.
 
@@ -90,6 +115,8 @@ class Evaluation:
             "intervals_over": self.resamples.unit,
             "intervals_units": self.resamples.count,
             **self.errors,
+            **self.ellipse_errors,
+            **self.ellipse_scores,
         }
         for name, spread in self.spreads.items():
             result |= spread.keys(name)
@@ -181,6 +208,45 @@ def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> d
             result[f"{name}_error_{ending}_p95"] = _or_nan(values, lambda known: np.percentile(known, 95))
         result[f"radius_bias_{ending}"] = _or_nan(difference / scale, np.mean)
     return result
+
+
+def ellipse_errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
+    """Errors of the ellipses of detected craters; NaN without detections.
+
+    - centre_error_px_rms: root mean square of the distance between the centres; with _above_5_px, of the labels with a
+      radius above 5 px, also as centre_error_px_median_above_5_px
+    - semi_major_error_px_..., semi_minor_error_px_...: median and root mean square of the error of a semi-axis
+    - centre_normalised_error_squared, axes_normalised_error_squared: mean of (error / predicted standard deviation)^2
+      over x and y, or over both semi-axes; 1 if the deviations are right, larger if they are too small. NaN if the
+      detector predicts none. Also with _above_5_px.
+    """
+    hits = (matches.label >= 0) & (matches.scores >= threshold)
+    label = matches.label[hits]
+    error = overlaps.ellipses[hits, :4] - overlaps.label_ellipses[label, :4]
+    squared = (error / overlaps.sigmas_px[hits]) ** 2
+    distance, large = np.linalg.norm(error[:, :2], axis=1), overlaps.label_radius_px[label] > _LARGE_PX
+    result = {
+        "centre_error_px_rms": _or_nan(distance, _rms),
+        "centre_error_px_rms_above_5_px": _or_nan(distance[large], _rms),
+        "centre_error_px_median_above_5_px": _or_nan(distance[large], np.median),
+    }
+    for name, values in (("semi_major", error[:, 2]), ("semi_minor", error[:, 3])):
+        result[f"{name}_error_px_median"] = _or_nan(np.abs(values), np.median)
+        result[f"{name}_error_px_rms"] = _or_nan(values, _rms)
+    for ending, rows in (("", slice(None)), ("_above_5_px", large)):
+        result[f"centre_normalised_error_squared{ending}"] = _or_nan(squared[rows, :2], np.mean)
+        result[f"axes_normalised_error_squared{ending}"] = _or_nan(squared[rows, 2:], np.mean)
+    return result
+
+
+def _by_frame(values: Array, frame: NDArray[np.intp], chosen: NDArray[np.bool_], n_frames: int) -> list[Array]:
+    """The chosen rows of each frame; `frame` (N,) ascends."""
+    kept = frame[chosen]
+    return np.split(values[chosen], np.searchsorted(kept, np.arange(1, n_frames))) if n_frames else []
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _or_nan(values: Array, statistic) -> float:

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.boxes import coverage_matrix, iou_matrix
+from perilune_train.detect.evaluate.ellipses import ellipses_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -72,6 +73,50 @@ class Detections:
     """x0, y0, x1, y1 in pixels (D, 4)."""
     scores: Array
     """Scores (D,), in (0, 1)."""
+    shapes: Array | None = None
+    """Correlation of the ellipse in each box (ellipses.py), and the standard deviations of the ellipse: of the centre's
+    x and y, of the semi-major and of the semi-minor axis, pixels (D, 5). None if the detector predicts only boxes."""
+
+    @property
+    def ellipses(self) -> Array:
+        """Centre x, y, semi-major and semi-minor axis in pixels, direction in radians, in [0, pi) (D, 5).
+
+        Without shapes, the axis-aligned ellipses in the boxes.
+        """
+        return ellipses_of(self.boxes, np.zeros(len(self.boxes)) if self.shapes is None else self.shapes[:, 0])
+
+    def take(self, chosen: NDArray) -> "Detections":
+        """The detections with the given rows, or those for which a mask (D,) is True."""
+        shapes = None if self.shapes is None else self.shapes[chosen]
+        return Detections(self.boxes[chosen], self.scores[chosen], shapes)
+
+    def moved(self, x_px: float, y_px: float) -> "Detections":
+        """The detections with other coordinates: `x_px` and `y_px` are added."""
+        return replace(self, boxes=self.boxes + np.array([x_px, y_px, x_px, y_px]))
+
+    def divided(self, ratio_x: float, ratio_y: float) -> "Detections":
+        """The detections in the coordinates of an image that was resized by these factors before detection.
+
+        A correlation does not change; the standard deviation of a semi-axis changes as the semi-axis.
+        """
+        ratios = np.array([ratio_x, ratio_y])
+        boxes = self.boxes / np.tile(ratios, 2)
+        if self.shapes is None:
+            return Detections(boxes, self.scores)
+        axes, new_axes = (ellipses_of(part, self.shapes[:, 0])[:, 2:4] for part in (self.boxes, boxes))
+        factors = np.divide(new_axes, axes, out=np.ones_like(axes), where=axes > 0)
+        sigmas_px = self.shapes[:, 1:] * np.hstack([np.tile(1 / ratios, (len(boxes), 1)), factors])
+        return Detections(boxes, self.scores, np.column_stack([self.shapes[:, 0], sigmas_px]))
+
+
+def joined_detections(parts: Sequence[Detections]) -> Detections:
+    """The detections of all parts (at least one) as one list, in the order of the parts."""
+    shapes = [part.shapes for part in parts if part.shapes is not None]
+    return Detections(
+        np.concatenate([part.boxes for part in parts]),
+        np.concatenate([part.scores for part in parts]),
+        np.concatenate(shapes) if shapes else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -134,6 +179,12 @@ class Overlaps:
     is first, as in COCO."""
     pair_iou: Array
     """IoU of each pair; for a crowd, the fraction of the detection inside the crowd (P,)."""
+    ellipses: Array
+    """Ellipses of the detections (D, 5), as in `Detections.ellipses`."""
+    sigmas_px: Array
+    """Standard deviations of the ellipses' centre x, y and semi-axes, pixels (D, 4); NaN if they are not predicted."""
+    label_ellipses: Array
+    """Ellipses of the labels (L, 5), as in `FrameLabels.ellipses`."""
 
     def radius_px(self) -> Array:
         """Radius sqrt(w h) / 2 of every detection, pixels (D,)."""
@@ -171,10 +222,13 @@ def find_overlaps(
     `sizes_px` (N, 2) are the widths and heights of the frames.
     """
     boxes, scores, pair_detections, pair_labels, pair_ious, n_found, n_labels = [], [], [], [], [], 0, 0
-    for ours, truth in zip(detections, labels, strict=True):
-        order = np.argsort(-ours.scores, kind="stable")
-        boxes.append(ours.boxes[order].reshape(-1, 4))
-        scores.append(ours.scores[order])
+    ellipses, sigmas_px = [], []
+    for found, truth in zip(detections, labels, strict=True):
+        ours = found.take(np.argsort(-found.scores, kind="stable"))
+        boxes.append(ours.boxes.reshape(-1, 4))
+        scores.append(ours.scores)
+        ellipses.append(replace(ours, boxes=boxes[-1]).ellipses)
+        sigmas_px.append(np.full((len(ours.scores), 4), np.nan) if ours.shapes is None else ours.shapes[:, 1:])
         overlap = iou_matrix(boxes[-1], truth.boxes)
         if truth.crowd is not None:
             overlap[:, truth.crowd] = coverage_matrix(boxes[-1], truth.boxes[truth.crowd])
@@ -202,6 +256,9 @@ def find_overlaps(
         _joined(pair_detections).astype(np.intp),
         _joined(pair_labels).astype(np.intp),
         _joined(pair_ious),
+        np.concatenate(ellipses) if ellipses else np.empty((0, 5)),
+        np.concatenate(sigmas_px) if sigmas_px else np.empty((0, 4)),
+        np.concatenate([part.ellipses.reshape(-1, 5) for part in labels]) if labels else np.empty((0, 5)),
     )
 
 

@@ -102,8 +102,36 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
             ("radius, bias (detected minus true)", "radius_bias", ""),
         )
     ]
-    lines += [*table(["error", "px", "relative to the radius"], rows), ""]
+    lines += [*table(["error", "px", "relative to the radius"], rows), "", *_ellipses(evaluation)]
     return "\n".join(lines)
+
+
+def _ellipses(evaluation: Evaluation) -> list[str]:
+    """Lines of the section about ellipses."""
+    errors, scores = evaluation.ellipse_errors, evaluation.ellipse_scores
+    rows = [
+        [name, number(errors[key]), number(errors[f"{key}_above_5_px"]) if f"{key}_above_5_px" in errors else ""]
+        for name, key in (
+            ("centre, r.m.s., px", "centre_error_px_rms"),
+            ("semi-major axis, median, px", "semi_major_error_px_median"),
+            ("semi-major axis, r.m.s., px", "semi_major_error_px_rms"),
+            ("semi-minor axis, median, px", "semi_minor_error_px_median"),
+            ("semi-minor axis, r.m.s., px", "semi_minor_error_px_rms"),
+            ("centre, (error / standard deviation)^2, mean", "centre_normalised_error_squared"),
+            ("semi-axes, (error / standard deviation)^2, mean", "axes_normalised_error_squared"),
+        )
+    ]
+    median = number(errors["centre_error_px_median_above_5_px"])
+    rows.insert(0, ["centre, median, px", number(evaluation.errors["centre_error_px_median"]), median])
+    score, strict = (number(scores[key]) for key in ("ellipse_score", "strict/ellipse_score"))
+    return [
+        "## Ellipses of detected craters",
+        "",
+        f"Score of NASA's Crater Detection Challenge (0 to 100): {score}; strict: {strict}.",
+        "",
+        *table(["error", "all", "radius above 5 px"], rows),
+        "",
+    ]
 
 
 def bin_tables(evaluation: Evaluation) -> list[str]:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.export.foreign_text import code_span, for_markdown
@@ -13,7 +14,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
-from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, match_split
+from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, joined_detections, match_split
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import protocol_of
 
@@ -26,6 +27,30 @@ WRITTEN = (
     "precision_recall.parquet",
 )
 """Files that an evaluation writes in addition to metrics.json."""
+
+
+ELLIPSE_COLUMNS = (
+    "semi_major_px",
+    "semi_minor_px",
+    "angle_deg",
+    "sigma_x_px",
+    "sigma_y_px",
+    "sigma_semi_major_px",
+    "sigma_semi_minor_px",
+)
+"""Columns of a table of detections: the ellipse and its standard deviations."""
+
+
+def ellipse_columns(detections: Detections) -> dict[str, NDArray[np.float64]]:
+    """Values (D,) of ELLIPSE_COLUMNS.
+
+    If the detector predicts no ellipses, these are the axis-aligned ellipses in the boxes, and the standard deviations
+    are NaN.
+    """
+    _, _, major, minor, theta = detections.ellipses.T
+    unknown = np.full((len(detections.scores), 4), np.nan)
+    sigmas_px = unknown if detections.shapes is None else detections.shapes[:, 1:]
+    return dict(zip(ELLIPSE_COLUMNS, [major, minor, np.degrees(theta), *sigmas_px.T], strict=True))
 
 
 def match_detections(split: DetectSplit, detections: list[Detections], config: DetectConfig) -> Matches:
@@ -82,11 +107,12 @@ def at_scales(scales: tuple[float, ...]) -> str:
 
 
 def write_detections(path: Path, split: DetectSplit, detections: list[Detections]) -> None:
-    """Write the table frame_id, x0_px, y0_px, x1_px, y1_px, score, one row per detection."""
-    boxes = np.concatenate([part.boxes for part in detections])
+    """Write the table frame_id, x0_px, y0_px, x1_px, y1_px, score and ELLIPSE_COLUMNS, one row per detection."""
+    every = joined_detections(detections)
     names = np.repeat(split.frames.table["frame_id"].to_numpy(), [len(part.scores) for part in detections])
     columns = {"frame_id": pa.array(names, pa.string())}
-    columns |= {name: pa.array(boxes[:, k]) for k, name in enumerate(("x0_px", "y0_px", "x1_px", "y1_px"))}
-    columns["score"] = pa.array(np.concatenate([part.scores for part in detections]))
+    columns |= {name: pa.array(every.boxes[:, k]) for k, name in enumerate(("x0_px", "y0_px", "x1_px", "y1_px"))}
+    columns["score"] = pa.array(every.scores)
+    columns |= {name: pa.array(values, from_pandas=True) for name, values in ellipse_columns(every).items()}
     with written_aside(path) as aside:
         pq.write_table(pa.table(columns), aside, compression="zstd")

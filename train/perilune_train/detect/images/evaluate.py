@@ -8,7 +8,7 @@ without labels.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import overload
 
@@ -30,7 +30,7 @@ from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import check_output, chosen_threshold
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, Request, read_images
-from perilune_train.detect.images.overlay import draw_boxes
+from perilune_train.detect.images.overlay import draw_boxes, draw_ellipses
 from perilune_train.detect.images.predict import table_of
 from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import Detector, open_detector
@@ -160,8 +160,7 @@ def evaluate_detections_in_images(
     if image_set.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)
         detections = [
-            Detections(np.clip(part.boxes, 0, limit), part.scores)
-            for part, limit in zip(detections, limits, strict=True)
+            replace(part, boxes=np.clip(part.boxes, 0, limit)) for part, limit in zip(detections, limits, strict=True)
         ]
     return evaluate_detections(
         detections,
@@ -208,8 +207,8 @@ def _crop_pair(image: NDArray[np.uint8], evaluation: Evaluation, index: int) -> 
     draw_boxes(left, 2 * (truth.boxes[truth.selected] - shift), _LABEL)
     strong = (matches.frame == index) & (matches.scores >= evaluation.threshold)
     for outcome, colour in _COLOURS.items():
-        boxes = evaluation.overlaps.boxes[strong & (matches.outcome == outcome)]
-        draw_boxes(right, 2 * (boxes - shift), colour)
+        ellipses = evaluation.overlaps.ellipses[strong & (matches.outcome == outcome)]
+        draw_ellipses(right, (ellipses - [*corner[::-1], 0, 0, 0]) * [2, 2, 2, 2, 1], colour)
     pair = np.concatenate([left, right], axis=1)
     pair[[0, -1]] = pair[:, [0, -1]] = 255
     cv2.putText(pair, evaluation.facts.name[index][:40], (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)

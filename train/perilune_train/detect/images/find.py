@@ -41,7 +41,9 @@ class Craters:
     table: pd.DataFrame
     """One row per crater: the box `x0_px`, `y0_px`, `x1_px`, `y1_px`, then `centre_x_px`, `centre_y_px`, `radius_px`
     (half of sqrt(w h)), `score`, and the ellipse columns of the table `labels`. Pixels count from the outer corner of
-    the first pixel. The detector finds boxes, so the ellipse is the axis-aligned ellipse inside the box."""
+    the first pixel. Further columns have the ellipse in other units, and its standard deviations (`semi_major_px`,
+    `semi_minor_px`, `angle_deg`, `sigma_...`). If the detector predicts only boxes, the ellipse is the axis-aligned
+    ellipse inside the box, and the standard deviations are NaN."""
     image: NDArray[np.uint8]
     """The upright image in 8-bit grey (height, width), before normalisation."""
 
@@ -153,10 +155,5 @@ def _read(image: ImageLike) -> tuple[str, NDArray[np.uint8]]:
 
 
 def _with_ellipses(table: pd.DataFrame, detections: Detections) -> pd.DataFrame:
-    """Add the axis-aligned ellipses inside the boxes to a table, in the ellipse columns of `labels`."""
-    x0, y0, x1, y1 = detections.boxes.T
-    width, height = x1 - x0, y1 - y0
-    columns = [(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(width, height) / 2, np.minimum(width, height) / 2]
-    # Direction of the longer axis.
-    columns.append(np.where(width >= height, 0.0, np.pi / 2))
-    return table.assign(**dict(zip(ELLIPSE_COLUMNS, columns, strict=True)))
+    """Add the ellipses to a table, in the ellipse columns of `labels`."""
+    return table.assign(**dict(zip(ELLIPSE_COLUMNS, detections.ellipses.T, strict=True)))

@@ -17,6 +17,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M
 from perilune_shared.storage.rasters import PICTURE_DRIVERS, opened_raster, raster_files
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.split_evaluation import ellipse_columns
 from perilune_train.detect.images.read import picture_size, stored_from_upright
 
 Array = NDArray[np.float64]
@@ -108,7 +109,9 @@ def can_read_georeferences() -> bool:
 
 
 def features(name: str, detections: Detections, reference: Georeference) -> list[dict[str, Any]]:
-    """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with properties.
+    """GeoJSON features of an image's detections: the ellipse of each as a polygon, with properties.
+
+    The properties have the columns of `ellipse_columns`, and both semi-axes in metres on the ground.
 
     If a polygon crosses 180 degrees, its longitudes continue beyond 180. A polygon around a pole is not valid in
     longitude and latitude: its vertices are correct, but its area is not. Detections that extend off the map are
@@ -118,39 +121,49 @@ def features(name: str, detections: Detections, reference: Georeference) -> list
 
     if not len(detections.boxes):
         return []
-    centre, half = (
-        (detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2,
-        (detections.boxes[:, 2:] - detections.boxes[:, :2]) / 2,
-    )
+    centre, semi_axes = detections.ellipses[:, :2], detections.ellipses[:, 2:4]
+    cos, sin = np.cos(detections.ellipses[:, 4]), np.sin(detections.ellipses[:, 4])
+    # Columns: directions of the semi-major and of the semi-minor axis (N, 2, 2).
+    axes = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1) * semi_axes[:, None]
     angle = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    pixels = np.concatenate([centre[:, None], centre[:, None] + half[:, None] * ring], axis=1)
+    pixels = np.concatenate([centre[:, None], centre[:, None] + ring @ np.swapaxes(axes, 1, 2)], axis=1)
     lon_lat_deg = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
     on_map = np.isfinite(lon_lat_deg).all(axis=(1, 2))
-    lon_lat_deg, centre, half, scores = lon_lat_deg[on_map], centre[on_map], half[on_map], detections.scores[on_map]
+    lon_lat_deg, mapped = lon_lat_deg[on_map], detections.take(on_map)
     lon_lat_deg[:, 1:, 0] -= 360 * np.round((lon_lat_deg[:, 1:, 0] - lon_lat_deg[:, :1, 0]) / 360)
     quarter = _CORNERS // 4
     sphere = Geod(a=MOON_RADIUS_M, b=MOON_RADIUS_M)
     ends = ((lon_lat_deg[:, 1 + k], lon_lat_deg[:, 1 + k + 2 * quarter]) for k in (0, quarter))
     along, across = (sphere.inv(*start.T, *end.T)[2] for start, end in ends)
-    rows = zip(lon_lat_deg, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
+    columns = {
+        "diameter_m": np.sqrt(along * across),
+        "diameter_px": 2 * np.sqrt(mapped.ellipses[:, 2:4].prod(axis=1)),
+        "centre_x_px": mapped.ellipses[:, 0],
+        "centre_y_px": mapped.ellipses[:, 1],
+        "semi_major_m": along / 2,
+        "semi_minor_m": across / 2,
+        **ellipse_columns(mapped),
+    }
     return [
         {
             "type": "Feature",
             "geometry": {"type": "Polygon", "coordinates": [_ring(position[1:])]},
             "properties": {
                 "image": name,
-                "score": round(float(score), 6),
+                "score": round(float(mapped.scores[k]), 6),
                 "longitude_deg": round(float(position[0, 0]), _DECIMALS),
                 "latitude_deg": round(float(position[0, 1]), _DECIMALS),
-                "diameter_m": round(float(diameter_m), 3),
-                "diameter_px": round(float(diameter_px), 3),
-                "centre_x_px": round(float(middle[0]), 3),
-                "centre_y_px": round(float(middle[1]), 3),
+                **{name: _rounded(values[k]) for name, values in columns.items()},
             },
         }
-        for position, diameter_m, diameter_px, score, middle in rows
+        for k, position in enumerate(lon_lat_deg)
     ]
+
+
+def _rounded(value: float) -> float | None:
+    """A number with three decimals; None for NaN, which JSON does not know."""
+    return round(float(value), 3) if np.isfinite(value) else None
 
 
 def collection(parts: list[dict[str, Any]]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, 
     drawn = np.argsort(detections.scores, kind="stable")[-MAX_DRAWN:]
     lines = canvas.copy()
     for k, colour in zip(drawn, _colours(detections.scores[drawn], threshold), strict=True):
-        draw_boxes(lines, detections.boxes[k : k + 1] * factor, colour)
+        draw_ellipses(lines, detections.ellipses[k : k + 1] * [factor, factor, factor, factor, 1], colour)
     canvas = cv2.addWeighted(lines, _LINE_OPACITY, canvas, 1 - _LINE_OPACITY, 0)
     count = f"{len(detections.scores)} craters"
     if len(drawn) < len(detections.scores):
@@ -45,11 +45,20 @@ def write_overlay(path: Path, image: NDArray[np.uint8], detections: Detections, 
 
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
-    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3): blue, green, red."""
+    """Draw the axis-aligned ellipses in boxes (M, 4) onto an image (height, width, 3): blue, green, red."""
+    half = (boxes[:, 2:] - boxes[:, :2]) / 2
+    draw_ellipses(canvas, np.column_stack([(boxes[:, :2] + boxes[:, 2:]) / 2, half, np.zeros(len(boxes))]), colour)
+
+
+def draw_ellipses(canvas: NDArray[np.uint8], ellipses: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
+    """Draw ellipses (M, 5) onto an image (height, width, 3): blue, green, red.
+
+    An ellipse is its centre x, y, semi-axes a and b in pixels, and the direction of a in radians.
+    """
     # OpenCV takes integers, here sixteenths of a pixel, and counts from the centre of the first pixel.
-    sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
-    for x, y, a, b in sixteenths.astype(int).tolist():
-        cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, colour, 1, cv2.LINE_AA, 4)
+    sixteenths = np.rint(16 * (ellipses[:, :4] - [0.5, 0.5, 0, 0])).astype(int)
+    for (x, y, a, b), angle_deg in zip(sixteenths.tolist(), np.degrees(ellipses[:, 4]).tolist(), strict=True):
+        cv2.ellipse(canvas, (x, y), (a, b), angle_deg, 0, 360, colour, 1, cv2.LINE_AA, 4)
 
 
 def _colours(scores: NDArray[np.float64], threshold: float) -> list[tuple[int, int, int]]:

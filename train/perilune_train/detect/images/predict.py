@@ -15,6 +15,7 @@ from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.split_evaluation import ellipse_columns
 from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.detect.images.georeference import (
     Georeference,
@@ -79,6 +80,10 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             progress.advance(check)
         threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
         detector = open_detector(runs.RunFolder(run).best, config)
+        if not detector.network.ellipses:
+            say(
+                f"{run.name}: this detector predicts only boxes: ellipses are axis-aligned, without standard deviations"
+            )
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):
@@ -126,22 +131,20 @@ def _reference(path: Path) -> Georeference | None:
 
 def above(detections: Detections, threshold: float) -> Detections:
     """The detections with at least this score."""
-    strong = detections.scores >= threshold
-    return Detections(detections.boxes[strong], detections.scores[strong])
+    return detections.take(detections.scores >= threshold)
 
 
 def of_size(detections: Detections, min_size_px: float) -> Detections:
     """The detections of at least this size, sqrt(w h), pixels."""
     large = np.sqrt(np.prod(detections.boxes[:, 2:] - detections.boxes[:, :2], axis=1)) >= min_size_px
-    return Detections(detections.boxes[large], detections.scores[large])
+    return detections.take(large)
 
 
 def strongest(detections: Detections, top: int | None) -> Detections:
     """The `top` detections with the highest scores, in the given order; all if None."""
     if top is None or len(detections.scores) <= top:
         return detections
-    best = np.sort(np.argsort(-detections.scores, kind="stable")[:top])
-    return Detections(detections.boxes[best], detections.scores[best])
+    return detections.take(np.sort(np.argsort(-detections.scores, kind="stable")[:top]))
 
 
 def expanded(sources: list[Path], frames: Path) -> list[Path]:
@@ -165,7 +168,10 @@ def expanded(sources: list[Path], frames: Path) -> list[Path]:
 
 
 def table_of(name: str, detections: Detections) -> pd.DataFrame:
-    """Detections as table rows: image name, box, centre, radius sqrt(w h) / 2 (all in pixels) and score."""
+    """Detections as table rows: image name, box, centre, radius sqrt(w h) / 2 (all in pixels), score and ellipse.
+
+    The columns of the ellipse are those of `ellipse_columns`; unknown standard deviations are null.
+    """
     x0, y0, x1, y1 = detections.boxes.T
     columns: dict[str, Any] = {
         "image": pd.Series([name] * len(detections.scores), dtype="str"),
@@ -177,5 +183,6 @@ def table_of(name: str, detections: Detections) -> pd.DataFrame:
         "centre_y_px": (y0 + y1) / 2,
         "radius_px": np.sqrt((x1 - x0) * (y1 - y0)) / 2,
         "score": detections.scores,
+        **ellipse_columns(detections),
     }
     return pd.DataFrame(columns)

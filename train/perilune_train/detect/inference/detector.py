@@ -37,11 +37,14 @@ class Detector:
     """Number of threads on a CPU, adapted to other work on the machine."""
 
     @torch.no_grad()
-    def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
-        """Boxes (N, K, 4) in pixels and scores (N, K) of all predictors, for images (N, height, width)."""
+    def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Boxes (N, K, 4), scores (N, K) and shapes (N, K, 5) of all predictors, for images (N, height, width).
+
+        Boxes and shapes are in pixels, as from `YOLOv3.detect_ellipses`.
+        """
         inputs = network_input(normalised(images), self.config.in_channels).to(self.device)
         with self.threads, torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
-            return self.network.detect(inputs)
+            return self.network.detect_ellipses(inputs)
 
 
 def load_detector(path: Path) -> YOLOv3:
@@ -56,7 +59,9 @@ def load_detector(path: Path) -> YOLOv3:
 def check_detector(content: Mapping[str, Any], path: Path) -> None:
     """Raise UserError unless a checkpoint contains a detector; the check allocates no memory for weights."""
     architecture = content["architecture"]
-    if set(architecture) != set(DetectorArchitecture.model_fields):
+    fields = DetectorArchitecture.model_fields
+    required = {name for name, setting in fields.items() if setting.is_required()}
+    if not required <= set(architecture) <= set(fields):
         raise UserError(path, "architecture", sorted(map(str, architecture)), "a detect run's checkpoint")
     check_architecture_of(DetectorArchitecture, architecture, path)
     runs.check_tensors(path, content["state_dict"], without_memory(lambda: YOLOv3(None, **architecture)))

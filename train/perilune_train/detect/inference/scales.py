@@ -13,6 +13,7 @@ from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.models.ellipse import resized_shapes
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
@@ -76,14 +77,17 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
     The network runs once for each of `detect.evaluation.scales`; one suppression merges the detections of all scales.
     """
     height, width = frames.shape[1:]
-    boxes, scores = [], []
+    boxes, scores, shapes = [], [], []
     for factor in detector.config.evaluation.scales:
         to_height, to_width = scaled_size(height, width, factor)
-        predicted = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
-        ratio = torch.tensor([to_width / width, to_height / height] * 2, device=detector.device)
-        boxes.append(predicted[0] / ratio)
-        scores.append(predicted[1])
-    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation)
+        found, confidence, shape = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
+        ratios = torch.tensor([to_width / width, to_height / height], device=detector.device)
+        boxes.append(found / ratios.repeat(2))
+        scores.append(confidence)
+        if shape is not None:
+            shapes.append(shape if factor == 1 else resized_shapes(shape, found, boxes[-1], ratios))
+    every_shape = torch.cat(shapes, 1) if shapes else None
+    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
 
 
 def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:

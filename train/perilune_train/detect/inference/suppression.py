@@ -12,8 +12,10 @@ _BLOCK = 256
 """Number of boxes in a block: larger blocks compute more overlaps, smaller blocks need more steps."""
 
 
-def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
-    """Detections of each frame from all predictors' boxes (N, K, 4) and scores (N, K).
+def detections_of(
+    boxes: Tensor, scores: Tensor, settings: EvaluationSettings, shapes: Tensor | None = None
+) -> list[Detections]:
+    """Detections of each frame from all predictors' boxes (N, K, 4), scores (N, K) and, if known, shapes (N, K, 5).
 
     For tensors on a GPU, suppression runs on the GPU for the whole batch. For tensors on a CPU it runs frame by frame,
     which is faster there (`make bench-suppress`). Both keep the boxes that OpenCV keeps, in OpenCV's order.
@@ -23,21 +25,37 @@ def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -
         sides = boxes[..., 2:] - boxes[..., :2]
         strong &= sides.amax(-1) <= settings.max_aspect * sides.amin(-1)
     if boxes.device.type == "cpu":
-        return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, strict=True)]
+        every = [None] * len(boxes) if shapes is None else shapes
+        return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, every, strict=True)]
+    return _of_batch(boxes, scores, strong, shapes, settings)
+
+
+def _of_batch(
+    boxes: Tensor, scores: Tensor, strong: Tensor, shapes: Tensor | None, settings: EvaluationSettings
+) -> list[Detections]:
     kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
     # Transfer the whole batch at once.
     boxes, scores, kept = (part.cpu() for part in (boxes, scores, kept))
+    shapes = None if shapes is None else shapes.cpu()
     detections = []
-    for frame_boxes, frame_scores, chosen in zip(boxes, scores, kept, strict=True):
+    for frame, chosen in enumerate(kept):
         best = chosen[chosen >= 0][: settings.max_detections]
-        detections.append(Detections(frame_boxes[best].double().numpy(), frame_scores[best].double().numpy()))
+        frame_shapes = None if shapes is None else shapes[frame, best]
+        detections.append(_arrays(boxes[frame, best], scores[frame, best], frame_shapes))
     return detections
 
 
-def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: EvaluationSettings) -> Detections:
-    strong_boxes, strong_scores = boxes[strong].double().numpy(), scores[strong].double().numpy()
-    kept = suppress(strong_boxes, strong_scores, settings.nms_iou, settings.max_detections)
-    return Detections(strong_boxes[kept], strong_scores[kept])
+def _of_frame(
+    boxes: Tensor, scores: Tensor, strong: Tensor, shapes: Tensor | None, settings: EvaluationSettings
+) -> Detections:
+    candidates = _arrays(boxes[strong], scores[strong], None if shapes is None else shapes[strong])
+    return candidates.take(suppress(candidates.boxes, candidates.scores, settings.nms_iou, settings.max_detections))
+
+
+def _arrays(boxes: Tensor, scores: Tensor, shapes: Tensor | None) -> Detections:
+    return Detections(
+        boxes.double().numpy(), scores.double().numpy(), None if shapes is None else shapes.double().numpy()
+    )
 
 
 @torch.no_grad()

@@ -7,13 +7,14 @@ would add false positives.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.config import COARSEST_STRIDE
 from perilune_train.detect.evaluate.boxes import suppress
-from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.matching import Detections, joined_detections
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import Enlarged, resized
 from perilune_train.detect.inference.suppression import detections_of
@@ -64,7 +65,7 @@ def detect_image(
     the result of `detect_at_scales`.
     """
     height, width = image.shape
-    boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
+    parts: list[Detections] = []
     for scale in tiling.scales:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         large = scale > 1 and size[0] * size[1] > _MAX_ENLARGED_PIXELS and min(size) >= tiling.tile_px
@@ -75,12 +76,10 @@ def detect_image(
             if whole.shape != scaled.shape:
                 # Drop craters in the reflected padding.
                 inside = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2 < size).all(axis=1)
-            boxes.append(detections.boxes[inside] / np.tile([size[0] / width, size[1] / height], 2))
-            scores.append(detections.scores[inside])
-    all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
-    kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
-    margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
-    return Detections(all_boxes[kept] + margin, all_scores[kept])
+            parts.append(detections.take(inside).divided(size[0] / width, size[1] / height))
+    every = joined_detections(parts)
+    found = every.take(suppress_in_blocks(every.boxes, every.scores, detector.config.evaluation.nms_iou))
+    return replace(found, boxes=found.boxes + tiling.box_margin_px * np.array([-1, -1, 1, 1]))
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:
@@ -115,18 +114,19 @@ def _detect_tiles(
     for first in range(0, len(corners), detector.config.batch_size):
         batch = corners[first : first + detector.config.batch_size]
         tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
-        predictions = detections_of(*detector.predict(tiles), detector.config.evaluation)
-        for corner, detections in zip(batch, predictions, strict=True):
-            boxes = detections.boxes + np.tile(corner[::-1], 2)
+        boxes, scores, shapes = detector.predict(tiles)
+        predictions = detections_of(boxes, scores, detector.config.evaluation, shapes)
+        for corner, in_tile in zip(batch, predictions, strict=True):
+            detections = in_tile.moved(corner[1], corner[0])
             clear = [
-                _clearance(boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
+                _clearance(detections.boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
                 for axis, starts, length in ((0, lefts, tile_w), (1, tops, tile_h))
             ]
             column, row = int(np.searchsorted(lefts, corner[1])), int(np.searchsorted(tops, corner[0]))
             clearance = np.minimum(clear[0][:, column], clear[1][:, row])
             best = np.minimum(clear[0].max(axis=1), clear[1].max(axis=1))
             kept = clearance >= best - _TOLERANCE_PX
-            yield Detections(boxes[kept], detections.scores[kept])
+            yield detections.take(kept)
         advance(len(batch))
 
 

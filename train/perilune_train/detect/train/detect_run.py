@@ -178,7 +178,7 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> 
     anchors = kmeans_anchors(sizes_px, count, rng, plain=config.anchor_sampling == "plain")
     lightning.seed_everything(config.seed, verbose=False)
     shaped = torch.as_tensor(anchors).view(len(config.strides), ANCHORS_PER_SCALE, 2)
-    return YOLOv3(shaped, config.in_channels, config.width, config.attention, config.strides)
+    return YOLOv3(shaped, config.in_channels, config.width, config.attention, config.strides, config.ellipses)
 
 
 def load_teacher(path: Path, config: DetectConfig) -> Teacher:

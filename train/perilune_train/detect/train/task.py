@@ -10,6 +10,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.assign import Targets
 from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
 from perilune_train.detect.data.resident import ResidentFrames, fits, may_reside, resident_loader
 from perilune_train.detect.data.split import DetectSplit
@@ -19,6 +20,7 @@ from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.captured import CapturedStep
 from perilune_train.detect.train.distill import Teacher, distill_loss
+from perilune_train.detect.train.ellipse_loss import ellipse_loss
 from perilune_train.detect.train.guide import guide_loss
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.preview_images import preview_images
@@ -93,6 +95,7 @@ class DetectTask(lightning.LightningModule):
             "width": config.width,
             "attention": config.attention,
             "strides": list(config.strides),
+            "ellipses": config.ellipses,
         }
         self.train_split, self.val_split = train, val
         self.detections: list[Detections] = []
@@ -184,9 +187,7 @@ class DetectTask(lightning.LightningModule):
     def training_step(self, batch: Batch | Tensor, batch_idx: int) -> Tensor:
         if self.replays and isinstance(batch, Tensor) and self.captured is not None:
             self.images_seen += len(batch)
-            box, confidence = self.captured(batch)
-            self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(batch))
-            return self.config.loss.lambda_iou * box + self.config.loss.lambda_obj * confidence
+            return self.weighted(self.captured(batch), len(batch))
         images, targets = self.resident_batch(batch) if isinstance(batch, Tensor) else batch
         self.images_seen += len(images) * self.process[1]
         settings, masks = self.config.loss, {}
@@ -195,9 +196,7 @@ class DetectTask(lightning.LightningModule):
             outputs, masks = self.network.outputs_and_masks(images)
         else:
             outputs = self.network(images)
-        box, confidence = detection_loss(outputs, targets, self.network.anchors, self.network.strides, settings)
-        self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
-        loss = settings.lambda_iou * box + settings.lambda_obj * confidence
+        loss = self.weighted(self.losses(outputs, targets), len(images))
         if guided:
             guide = guide_loss(masks, targets, (images.shape[2], images.shape[3]))
             self.log("train/guide", guide, batch_size=len(images))
@@ -209,12 +208,33 @@ class DetectTask(lightning.LightningModule):
             loss = loss + settings.lambda_teacher * (settings.lambda_iou * box + settings.lambda_obj * confidence)
         return loss
 
+    def losses(self, outputs: list[Tensor], targets: Targets) -> tuple[Tensor, ...]:
+        """L_ciou and L_obj of the network's outputs; with ellipses also L_ellipse and L_sigma."""
+        network, settings = self.network, self.config.loss
+        losses = detection_loss(outputs, targets, network.anchors, network.strides, settings)
+        if not network.ellipses:
+            return losses
+        return *losses, *ellipse_loss(outputs, targets, network.anchors, network.strides, settings)
+
+    def weighted(self, losses: tuple[Tensor, ...], batch_size: int | None = None) -> Tensor:
+        """Weighted sum of the result of `losses`; logs each loss if `batch_size` is given."""
+        settings = self.config.loss
+        weights = {
+            "train/ciou": settings.lambda_iou,
+            "train/objectness": settings.lambda_obj,
+            "train/ellipse": settings.lambda_ellipse,
+            "train/sigma": settings.lambda_sigma,
+        }
+        if batch_size is not None:
+            self.log_dict(dict(zip(weights, losses, strict=False)), batch_size=batch_size)
+        return torch.stack([weight * loss for weight, loss in zip(weights.values(), losses, strict=False)]).sum()
+
     def resident_batch(self, numbers: Tensor) -> Batch:
         """The batch of the resident frames with the numbers `numbers` (B,)."""
         assert self.resident is not None
         return self.resident.batch(numbers, self.config.in_channels)
 
-    def whole_step(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+    def whole_step(self, numbers: Tensor) -> tuple[Tensor, ...]:
         """Update the weights and return the losses of a batch of resident frames.
 
         Reads no tensor values on the CPU, so that the step can be captured.
@@ -226,15 +246,13 @@ class DetectTask(lightning.LightningModule):
         enabled, dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
         with torch.autocast(kind, dtype, enabled, cache_enabled=False):
             images, targets = self.resident_batch(numbers)
-            outputs = self.network(images)
-            settings, network = self.config.loss, self.network
-            box, confidence = detection_loss(outputs, targets, network.anchors, network.strides, settings)
-            loss = settings.lambda_iou * box + settings.lambda_obj * confidence
+            losses = self.losses(self.network(images), targets)
+            loss = self.weighted(losses)
         with torch.autocast(kind, enabled=False):
             loss.backward()
             self.configure_gradient_clipping(optimizer)
             optimizer.step()
-        return box.detach(), confidence.detach()
+        return tuple(loss.detach() for loss in losses)
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
         if not self.replays:
@@ -292,8 +310,8 @@ class DetectTask(lightning.LightningModule):
                 torch.distributed.broadcast(value, 0)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        boxes, scores = self.evaluated.detect(batch[0])
-        self.detections += detections_of(boxes, scores, self.config.evaluation)
+        boxes, scores, shapes = self.evaluated.detect_ellipses(batch[0])
+        self.detections += detections_of(boxes, scores, self.config.evaluation, shapes)
 
     def on_validation_epoch_end(self) -> None:
         split, processes = self.val_split, self.process[1]

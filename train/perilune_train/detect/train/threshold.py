@@ -44,6 +44,6 @@ def varied_split(split: DetectSplit, seed: int) -> DetectSplit:
     for number, image in enumerate(split.frames.images):
         frame_labels = split.labels[number]
         rng = np.random.default_rng([seed, _STREAM, number])
-        pixels, _, _ = augment(image, frame_labels.boxes, frame_labels.selected, split.radius_px, VARIED, rng)
+        pixels, _, _ = augment(image, frame_labels.outlines, frame_labels.selected, split.radius_px, VARIED, rng)
         images[number] = np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
     return replace(split, frames=replace(split.frames, images=images))

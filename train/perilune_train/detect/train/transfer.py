@@ -27,7 +27,7 @@ from perilune_train.training import runs
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
 """Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. The deviation is a power of two,
 so scaling by it is exact."""
-_GATES = "backbone.attentions."
+_GATES, _ELLIPSES = "backbone.attentions.", "ellipse_heads."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
 
@@ -64,8 +64,8 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill the network with weights of an earlier detect run or of a Darknet file.
 
     A run with equal strides gives all weights and the anchors; a run with other strides gives only the backbone. If the
-    attention differs, the network's gates keep their initial weights. With `detect.init_layers=from_second`, the first
-    convolution and its norm keep theirs.
+    attention differs, the network's gates keep their initial weights; ellipse outputs keep theirs if the run has none.
+    With `detect.init_layers=from_second`, the first convolution and its norm keep theirs.
 
     Raises UserError if width or in_channels differ, or if a frozen backbone would have plain gates with random weights.
     """
@@ -89,6 +89,8 @@ def _fill(network: YOLOv3, path: Path, config: DetectConfig) -> None:
         check_gates(path, config)
 
     def taken(key: str) -> bool:
+        if key.startswith(_ELLIPSES) and not (network.ellipses and architecture.get("ellipses")):
+            return False
         return (whole or key.startswith("backbone.")) and (gates or not key.startswith(_GATES))
 
     kept = {key: value for key, value in network.state_dict().items() if not taken(key)}
@@ -152,12 +154,12 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
 def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: Path, whole: bool) -> DarknetFile:
     """Darknet file of a network's backbone, or of the `whole` network with 15 output filters.
 
-    Changes the network's stem. Darknet files cannot hold attention gates. Raises UserError if the network does not have
-    the shape of the file.
+    Changes the network's stem. Darknet files cannot hold attention gates or ellipse outputs. Raises UserError if the
+    network does not have the shape of the file.
     """
     expected: dict[str, Any] = dict(DARKNET_SHAPE)
     if whole:
-        expected |= {"strides": [8, 16, 32], "attention": "none"}
-    runs.check_architecture(checkpoint, architecture, expected)
+        expected |= {"strides": [8, 16, 32], "attention": "none", "ellipses": False}
+    runs.check_architecture(checkpoint, {"ellipses": False, **architecture}, expected)
     rescale_input(network.backbone, "grey")
     return content_of(network_slots(network) if whole else backbone_slots(network.backbone))

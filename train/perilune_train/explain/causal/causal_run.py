@@ -184,7 +184,7 @@ def _versions(
 def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
     detections = []
     for start in range(0, len(images), _BATCH):
-        boxes, scores = detector.predict(images[start : start + _BATCH])
+        boxes, scores, _ = detector.predict(images[start : start + _BATCH])
         detections += detections_of(boxes, scores, detector.config.evaluation)
     return detections
 

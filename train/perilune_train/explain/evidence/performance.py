@@ -40,7 +40,7 @@ class DetectionPerformance:
         """
         detections = []
         for start in range(0, len(images), _BATCH):
-            boxes, scores = self.detector.predict(images[start : start + _BATCH])
+            boxes, scores, _ = self.detector.predict(images[start : start + _BATCH])
             detections += detections_of(boxes, scores, self.detector.config.evaluation)
         size = images.shape[2], images.shape[1]
         match_iou = self.detector.config.evaluation.match_iou

@@ -1,0 +1,55 @@
+"""Decode the ellipse outputs of the detector (`YOLOv3` with `ellipses`) in torch.
+
+An anchor's ellipse has the bounding box of `decode`. Five further raw outputs complete it:
+
+t           correlation S_xy / sqrt(S_xx S_yy) = MAX_CORRELATION tanh(t) of the ellipse (detect/evaluate/ellipses.py)
+s_x, s_y    standard deviations of the centre, as logarithms
+s_a, s_b    standard deviations of the semi-major and the semi-minor axis, as logarithms
+
+A standard deviation is exp(s - 2) sqrt(d) pixels with d = sqrt(w h) of the box in pixels: errors grow about as the
+square root of a crater's size, so all craters have similar outputs s.
+"""
+
+import torch
+from torch import Tensor
+
+from perilune_train.detect.evaluate.ellipses import MAX_CORRELATION
+
+ELLIPSE_OUTPUTS = 5
+_TYPICAL_LOG_SIGMA = -2.0
+_MAX_LOG_SIGMA = 4.0
+_MIN_SIDE_PX = 1e-3
+
+
+def decode_correlation(raw: Tensor) -> Tensor:
+    """Correlations (...) from raw ellipse outputs (..., 5)."""
+    return MAX_CORRELATION * raw[..., 0].tanh()
+
+
+def decode_sigmas(raw: Tensor, boxes: Tensor) -> Tensor:
+    """Standard deviations (..., 4) of centre x, y and both semi-axes, pixels.
+
+    `raw` (..., 5) are ellipse outputs, `boxes` (..., 4) the decoded boxes in pixels.
+    """
+    sides = (boxes[..., 2:] - boxes[..., :2]).clamp(min=_MIN_SIDE_PX)
+    scale = (sides[..., 0] * sides[..., 1]).pow(0.25)
+    return scale[..., None] * (raw[..., 1:].clamp(-_MAX_LOG_SIGMA, _MAX_LOG_SIGMA) + _TYPICAL_LOG_SIGMA).exp()
+
+
+def resized_shapes(shapes: Tensor, boxes: Tensor, new_boxes: Tensor, ratios: Tensor) -> Tensor:
+    """Shapes (..., 5) in the coordinates of an image that was resized by the factors `ratios` (2,) before detection.
+
+    `new_boxes` (..., 4) are `boxes` in these coordinates. As `Detections.divided` (detect/evaluate/matching.py).
+    """
+    factors = semi_axes(new_boxes, shapes[..., 0]) / semi_axes(boxes, shapes[..., 0])
+    return torch.cat([shapes[..., :1], shapes[..., 1:3] / ratios, shapes[..., 3:] * factors], dim=-1)
+
+
+def semi_axes(boxes: Tensor, correlations: Tensor) -> Tensor:
+    """Semi-major and semi-minor axes (..., 2), pixels, of ellipses with boxes (..., 4) and correlations (...)."""
+    half = (boxes[..., 2:] - boxes[..., :2]).clamp(min=_MIN_SIDE_PX) / 2
+    sxx, syy = half[..., 0].square(), half[..., 1].square()
+    product = half[..., 0] * half[..., 1]
+    major = ((sxx + syy) / 2 + torch.hypot((sxx - syy) / 2, correlations * product)).sqrt()
+    minor = product * (1 - correlations.square()).clamp(min=0).sqrt() / major
+    return torch.stack([major, minor], dim=-1)
