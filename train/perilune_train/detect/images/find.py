@@ -22,7 +22,7 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.images.predict import above, table_of
 from perilune_train.detect.images.read import grey_of_array, read_grey
-from perilune_train.detect.inference.detector import Detector, open_detector
+from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.shipped.models import shipped_models, shipped_run
@@ -80,7 +80,7 @@ class CraterDetector:
         self.run = run
         self.threshold = chosen_threshold(run)
         self._tiling = Tiling(scales=tuple(config.evaluation.scales))
-        self._detector: Detector = open_detector(RunFolder(run).best, config)
+        self._detector: Detector = open_run(run, config)
 
     @overload
     def __call__(self, image: ImageLike, *, threshold: float | None = None) -> Craters: ...

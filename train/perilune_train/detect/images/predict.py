@@ -28,10 +28,9 @@ from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.images.sequences import frames_of
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
-from perilune_train.training import runs
 
 _SHOWN_DOUBTS = 5
 
@@ -78,7 +77,9 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             n_tiles += count_tiles(height, width, tiling)
             progress.advance(check)
         threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
-        detector = open_detector(runs.RunFolder(run).best, config)
+        detector = open_run(run, config)
+        if detector.calibration is None:
+            say("scores are no probabilities: the run has no calibration; `perilune-train detect calibrate` adds one")
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):

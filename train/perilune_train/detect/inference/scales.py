@@ -83,7 +83,8 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
         ratio = torch.tensor([to_width / width, to_height / height] * 2, device=detector.device)
         boxes.append(predicted[0] / ratio)
         scores.append(predicted[1])
-    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation)
+    found = detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation)
+    return [detector.calibrated(of_frame) for of_frame in found]
 
 
 def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:

@@ -80,7 +80,7 @@ def detect_image(
     all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
     kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
     margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
-    return Detections(all_boxes[kept] + margin, all_scores[kept])
+    return detector.calibrated(Detections(all_boxes[kept] + margin, all_scores[kept]))
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:
