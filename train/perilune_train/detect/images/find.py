@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
+from perilune_shared.console.terminal import say
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.pictures import display, with_ellipses
@@ -22,6 +23,7 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.images.predict import above, table_of
 from perilune_train.detect.images.read import grey_of_array, read_grey
+from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
@@ -44,6 +46,8 @@ class Craters:
     the first pixel. The detector finds boxes, so the ellipse is the axis-aligned ellipse inside the box."""
     image: NDArray[np.uint8]
     """The upright image in 8-bit grey (height, width), before normalisation."""
+    suspicion: Suspicion | None = None
+    """Why the image may not show regolith at a usable scale; None if nothing is suspicious. A warning tells it too."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -103,8 +107,11 @@ class CraterDetector:
 
     def _craters(self, image: ImageLike, threshold: float) -> Craters:
         name, grey = _read(image)
-        detections = above(detect_image(self._detector, grey, self._tiling), threshold)
-        return Craters(_with_ellipses(table_of(name, detections), detections), grey)
+        every = detect_image(self._detector, grey, self._tiling)
+        suspicion, detections = suspicion_of(grey, every), above(every, threshold)
+        if suspicion is not None:
+            say(f"warning: {name}: {suspicion.text}")
+        return Craters(_with_ellipses(table_of(name, detections), detections), grey, suspicion)
 
     def __repr__(self) -> str:
         where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"

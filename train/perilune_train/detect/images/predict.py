@@ -23,11 +23,11 @@ from perilune_train.detect.images.georeference import (
     features,
     read_georeference,
 )
-from perilune_train.detect.images.one_light import doubt_of
 from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.images.sequences import frames_of
+from perilune_train.detect.images.suspect import suspicion_of
 from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
@@ -86,10 +86,12 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
             detections = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
-            if doubt := doubt_of(image, detections):
-                doubts.append(f"warning: {path.name}: {doubt}")
+            suspicion = suspicion_of(image, detections)
+            if suspicion is not None:
+                doubts.append(f"warning: {path.name}: {suspicion.text}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
-            tables.append(table_of(path.name, detections))
+            reason = pd.Series(["" if suspicion is None else suspicion.reason] * len(detections.scores), dtype="str")
+            tables.append(table_of(path.name, detections).assign(suspect=reason))
             write_overlay(folder / f"{path.name}.overlay.png", image, detections, threshold)
             if reference is not None:
                 located = features(path.name, detections, reference)
