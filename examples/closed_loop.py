@@ -32,9 +32,9 @@ from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, 
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_errors import drawn_errors
 from perilune_shared.geometry.inertial_grades import GRADES
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
-from perilune_train.detect.inference.detector import open_run
+from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.landing.craters.catalogue import Catalogue, CatalogueErrors, with_errors
@@ -43,6 +43,7 @@ from perilune_train.landing.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander
 from perilune_train.landing.filter.propagate import Increments, InertialNoise, start_sigmas
 from perilune_train.landing.filter.state import State
 from perilune_train.shipped.models import shipped_run
+from perilune_train.training.runs import RunFolder
 
 SCENE = Path(__file__).with_name("closed_loop.yaml")
 START_M, START_MPS = np.array([520.0, -260.0, 1400.0]), np.array([-14.0, 7.0, -24.0])
@@ -148,8 +149,8 @@ class CraterCamera:
     def __init__(self, scene: SceneClient):
         run = shipped_run("detect")
         config = config_of_run(run)
-        self._scene, self._threshold = scene, chosen_threshold(run)
-        self._detector = open_run(run, config)
+        self._scene, self._threshold = scene, raw_threshold(run)
+        self._detector = open_detector(RunFolder(run).best, config)
         self._tiling = Tiling(scales=tuple(config.evaluation.scales))
 
     def look(

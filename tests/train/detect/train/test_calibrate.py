@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 from tests.helpers import in_process
 
 from perilune_shared.dataset.manifest import open_dataset
@@ -24,6 +25,7 @@ from perilune_train.detect.inference.detector import load_detector as load_netwo
 from perilune_train.detect.inference.detector import open_detector, open_run
 from perilune_train.detect.inference.scales import detect_at_scales
 from perilune_train.detect.train.threshold import calibration_entries, detect_validation
+from perilune_train.landing.fly.detections import by_network
 from perilune_train.records.metrics_file import read_metrics
 from perilune_train.shipped.models import shipped_run
 from perilune_train.training import runs
@@ -94,8 +96,6 @@ def test_a_second_calibration_replaces_the_first(calibrated, dataset_detect, tmp
 
 def test_predict_says_whether_scores_are_probabilities(old, calibrated, split, tmp_path):
     """The tables have the same craters; only the scores differ."""
-    from PIL import Image
-
     Image.fromarray(split.frames.images[0]).save(tmp_path / "a.png")
     tables, notes = [], []
     for run in (old, calibrated[0]):
@@ -110,6 +110,13 @@ def test_predict_says_whether_scores_are_probabilities(old, calibrated, split, t
     assert np.array_equal(calibration_of(calibrated[0]).probabilities(raw), probability)
     craters = load_detector(calibrated[0])(tmp_path / "a.png")
     assert craters["score"] == pytest.approx(probability)
+
+
+def test_the_filter_has_the_scores_of_the_network(old, calibrated, split, tmp_path):
+    """It derives the error of a centre from them."""
+    Image.fromarray(split.frames.images[0]).save(tmp_path / "a.png")
+    before, after = (by_network(run)(tmp_path / "a.png") for run in (old, calibrated[0]))
+    assert len(before.scores) > 5 and np.array_equal(before.scores, after.scores)
 
 
 def test_evaluations_report_the_error(calibrated, dataset_detect, tmp_path):

@@ -108,7 +108,8 @@ class CraterDetector:
     def _craters(self, image: ImageLike, threshold: float) -> Craters:
         name, grey = _read(image)
         every = detect_image(self._detector, grey, self._tiling)
-        suspicion, detections = suspicion_of(grey, every), above(every, threshold)
+        calibrated = self._detector.calibration is not None
+        suspicion, detections = suspicion_of(grey, every, calibrated), above(every, threshold)
         if suspicion is not None:
             say(f"warning: {name}: {suspicion.text}")
         return Craters(_with_ellipses(table_of(name, detections), detections), grey, suspicion)

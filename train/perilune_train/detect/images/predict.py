@@ -86,7 +86,7 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
             detections = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
-            suspicion = suspicion_of(image, detections)
+            suspicion = suspicion_of(image, detections, detector.calibration is not None)
             if suspicion is not None:
                 doubts.append(f"warning: {path.name}: {suspicion.text}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)

@@ -26,8 +26,9 @@ MAX_STRAIGHT = 0.15
 """Largest share of the strong gradients in one of 36 directions."""
 MIN_SLOPE = -2.9
 """Smallest slope of the power spectrum: power is proportional to frequency^slope."""
-MIN_LIGHT = 1.9
-"""Smallest sum of the agreement of the light and twice the median score of the craters."""
+MIN_LIGHT, MIN_LIGHT_UNCALIBRATED = 2.25, 1.9
+"""Smallest sum of the agreement of the light and twice the median score of the craters, with scores that are
+probabilities and with scores without calibration."""
 _TILE_PX, _MAX_TILES, _MIN_SIDE_PX = 256, 4, 128
 _BLOCK_PX, _BLACK = 8, 8
 _BANDS = np.geomspace(1 / 64, 0.45, 9)
@@ -43,8 +44,11 @@ class Suspicion:
     """The measured statistic and its limit, in one line."""
 
 
-def suspicion_of(image: NDArray[np.uint8], detections: Detections) -> Suspicion | None:
-    """Check a grey image (height, width) and all its detections; returns None if nothing is suspicious."""
+def suspicion_of(image: NDArray[np.uint8], detections: Detections, calibrated: bool) -> Suspicion | None:
+    """Check a grey image (height, width) and all its detections; returns None if nothing is suspicious.
+
+    `calibrated` states whether the scores are probabilities.
+    """
     deviation, white = float(image.std()), float((image >= 254).mean())
     dark = float((image <= 0.15 * np.quantile(image, 0.999)).mean())
     if deviation < MIN_DEVIATION:
@@ -67,9 +71,10 @@ def suspicion_of(image: NDArray[np.uint8], detections: Detections) -> Suspicion 
         if straight > MAX_STRAIGHT:
             return _below("straight", "share of the strong edges in one direction", straight, MAX_STRAIGHT)
     agreement, median, count = agreement_of_light(image, detections)
-    if count >= MIN_CRATERS and agreement + 2 * median < MIN_LIGHT:
+    total, limit = agreement + 2 * median, MIN_LIGHT if calibrated else MIN_LIGHT_UNCALIBRATED
+    if count >= MIN_CRATERS and total < limit:
         what = f"agreement of the light on {count} craters ({agreement:.2f}) plus twice their median score"
-        return _above("light", what, agreement + 2 * median, MIN_LIGHT)
+        return _above("light", what, total, limit)
     return None
 
 
