@@ -22,9 +22,9 @@ from perilune_shared.storage.files import write_text
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import FOUND, IGNORED, find_overlaps
-from perilune_train.detect.evaluate.reliability import Judged, expected_calibration_error
+from perilune_train.detect.evaluate.reliability import Judged, draw_reliability, expected_calibration_error
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
-from perilune_train.detect.inference.calibration import _features, _logistic, fit_calibration
+from perilune_train.detect.inference.calibration import log_features, logistic_fit, fit_calibration
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.train.threshold import detect_validation
 from perilune_train.shipped.models import shipped_run
@@ -47,20 +47,20 @@ def _beta(scores: Array, radius_px: Array, matched: NDArray[np.bool_]) -> Callab
 
 def _linear(columns: Callable[[Array, Array], Array]) -> Fit:
     def fit(scores: Array, radius_px: Array, matched: NDArray[np.bool_]) -> Callable[[Array, Array], Array]:
-        coefficients = _logistic(columns(scores, radius_px), matched.astype(np.float64))
+        coefficients = logistic_fit(columns(scores, radius_px), matched.astype(np.float64))
         return lambda s, r: 1 / (1 + np.exp(-(columns(s, r) @ coefficients)))
 
     return fit
 
 
 def _platt_columns(scores: Array, radius_px: Array) -> Array:
-    log, complement, one = _features(scores).T
+    log, complement, one = log_features(scores).T
     return np.column_stack([log + complement, one])
 
 
 def _beta_radius_columns(scores: Array, radius_px: Array) -> Array:
     log_radius = np.log(radius_px)
-    return np.column_stack([_features(scores), log_radius, log_radius**2])
+    return np.column_stack([log_features(scores), log_radius, log_radius**2])
 
 
 def _isotonic(scores: Array, radius_px: Array, matched: NDArray[np.bool_]) -> Callable[[Array, Array], Array]:
@@ -83,6 +83,10 @@ MAPS: dict[str, Fit] = {
     "isotonic": _isotonic,
     "beta and radius, 5 parameters": _linear(_beta_radius_columns),
 }
+
+
+_DRAWN = ("none", "beta, 3 parameters")
+"""Maps whose reliability diagrams are drawn."""
 
 
 def main(
@@ -110,6 +114,8 @@ def main(
         for left_out in np.unique(scene):
             here = scene == left_out
             mapped[here] = fit(scores[~here], radius[~here], matched[~here])(scores[here], radius[here])
+        if name in _DRAWN:
+            draw_reliability(Judged(mapped, matched), out.with_name(f"reliability_{name.split(',')[0]}.png"))
         result[name] = _errors(mapped, matched, scores >= raw_threshold(folder), varied, radius, scene)
         answer(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in result[name].items()))
     write_text(out, json.dumps(result, indent=2) + "\n")

@@ -97,15 +97,16 @@ def expected_calibration_error(detections: Judged, equal_width: bool = False, bi
 
 
 def draw_reliability(detections: Judged, path: Path) -> None:
-    """Draw the share of matches against the mean score of 15 bins of equal numbers, and the number of scores."""
+    """Draw the share of matches against the mean score of both kinds of bins, and a histogram of the scores."""
     figure = Figure(figsize=(5.2, 5.6), layout="constrained")
     axes, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)
-    mean, share, count = reliability(detections)
-    deviation = np.sqrt(np.maximum(share * (1 - share), 1e-4) / np.maximum(count, 1))
     axes.plot([0, 1], [0, 1], color="#808080", linewidth=0.8)
-    axes.errorbar(mean, share, deviation, fmt="o-", color="#3b7dd8", markersize=4, linewidth=1)
+    for equal_width, style, name in ((False, "o-", "bins of equal numbers"), (True, "x--", "bins of equal width")):
+        mean, share, _ = reliability(detections, equal_width)
+        axes.plot(mean, share, style, markersize=4, linewidth=1, label=name)
+    axes.legend(loc="upper left", fontsize=8)
     error = expected_calibration_error(detections)
-    axes.set(ylabel="share that matches a label", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    axes.set(ylabel="share that matches a label", xlim=(0, 1), ylim=(0, 1))
     title = f"{len(detections.scores)} detections in {BINS} bins; expected calibration error {error:.3f}"
     axes.set_title(title, fontsize=9)
     axes.grid(alpha=0.3)

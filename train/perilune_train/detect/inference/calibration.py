@@ -36,7 +36,7 @@ class Calibration:
 
     def probabilities(self, scores: NDArray[Any]) -> Array:
         """Probabilities (D,) of scores (D,)."""
-        log, complement, _ = _features(scores).T
+        log, complement, _ = log_features(scores).T
         # No matrix product: it would round a single score differently, and thresholds are single scores.
         logit = self.log_score * log + self.log_complement * complement + self.offset
         return np.asarray(1 / (1 + np.exp(-logit)))
@@ -61,23 +61,24 @@ def fit_calibration(scores: NDArray[Any], matched: NDArray[np.bool_]) -> Calibra
     n_matched, n_false = int(matched.sum()), int((~matched).sum())
     if min(n_matched, n_false) < MIN_EACH:
         return None
-    features = _features(scores)
+    features = log_features(scores)
     # Platt's targets keep the fit finite if a score separates the two kinds.
     target = np.where(matched, (n_matched + 1) / (n_matched + 2), 1 / (n_false + 2))
     for used in ([0, 1, 2], [0, 2], [1, 2]):
         found = np.zeros(3)
-        found[used] = _logistic(features[:, used], target)
+        found[used] = logistic_fit(features[:, used], target)
         if (found[:2] >= 0).all() and found[:2].any():
             return Calibration(*found.tolist())
     return None
 
 
-def _features(scores: NDArray[Any]) -> Array:
+def log_features(scores: NDArray[Any]) -> Array:
+    """Columns (D, 3) ln s, -ln(1 - s) and 1 of scores (D,)."""
     limited = np.clip(np.asarray(scores, np.float64), _SMALLEST, _LARGEST)
     return np.column_stack([np.log(limited), -np.log1p(-limited), np.ones(len(limited))])
 
 
-def _logistic(features: Array, target: Array) -> Array:
+def logistic_fit(features: Array, target: Array) -> Array:
     """Coefficients (K,) of the logistic regression of targets (N,) on features (N, K), by Newton's method."""
 
     def loss(coefficients: Array) -> float:
