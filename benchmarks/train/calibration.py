@@ -24,7 +24,7 @@ from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import FOUND, IGNORED, find_overlaps
 from perilune_train.detect.evaluate.reliability import Judged, draw_reliability, expected_calibration_error
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
-from perilune_train.detect.inference.calibration import log_features, logistic_fit, fit_calibration
+from perilune_train.detect.inference.calibration import fit_calibration, log_features, logistic_fit
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.train.threshold import detect_validation
 from perilune_train.shipped.models import shipped_run
