@@ -3,12 +3,16 @@
 import math
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from perilune_shared.config.resolve import parse_setting, read_config_file, resolve_over
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
+
+if TYPE_CHECKING:
+    # Commands read settings before they load NumPy.
+    from perilune_train.detect.inference.calibration import Calibration
 
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
@@ -62,13 +66,15 @@ def threshold_of_table(run: Path) -> float:
     return _number(run, "test/threshold", "a number")
 
 
-def calibration_of(run: Path) -> Calibration | None:
+def calibration_of(run: Path) -> "Calibration | None":
     """Calibration of a run's scores; None if the run has none. Raises UserError if it is damaged."""
     return calibration_in(read_metrics(run), run / METRICS_FILE)
 
 
-def calibration_in(metrics: Metrics, path: Path) -> Calibration | None:
+def calibration_in(metrics: Metrics, path: Path) -> "Calibration | None":
     """Calibration in the content of the file metrics.json at `path`; see `calibration_of`."""
+    from perilune_train.detect.inference.calibration import Calibration
+
     keys = [f"calibration/{part.name}" for part in fields(Calibration)]
     if not metrics.keys() & set(keys):
         return None
