@@ -103,8 +103,8 @@ def load_trained(root: Path) -> Trained:
 
     Raises UserError if the folder is not a finished run.
     """
-    best = RunFolder(root).best
-    return Trained(load_detector(best), config_of_run(root), raw_threshold(root), best, calibration_of(root))
+    config, threshold, best = config_of_run(root), raw_threshold(root), RunFolder(root).best
+    return Trained(load_detector(best), config, threshold, best, calibration_of(root))
 
 
 def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:

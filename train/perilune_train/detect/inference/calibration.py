@@ -47,9 +47,9 @@ class Calibration:
 
     @property
     def formula(self) -> str:
-        """The map as a formula, for files that leave the package."""
+        """The map as a formula of the score s in Python, for files that leave the package."""
         a, b, c = self.log_score, self.log_complement, self.offset
-        return f"1 / (1 + exp(-({a:.6g} ln(s) - {b:.6g} ln(1 - s) + {c:.6g})))"
+        return f"1 / (1 + exp(-({a:.6g} * log(s) - {b:.6g} * log(1 - s) {c:+.6g})))"
 
 
 def fit_calibration(scores: NDArray[Any], matched: NDArray[np.bool_]) -> Calibration | None:
