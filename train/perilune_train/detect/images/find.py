@@ -21,7 +21,7 @@ from perilune_shared.errors import UserError, one_line
 from perilune_shared.pictures import display, with_ellipses
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
-from perilune_train.detect.images.predict import above, table_of
+from perilune_train.detect.images.predict import above, flagged, table_of
 from perilune_train.detect.images.read import grey_of_array, read_grey
 from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import Detector, open_run
@@ -42,8 +42,9 @@ class Craters:
 
     table: pd.DataFrame
     """One row per crater: the box `x0_px`, `y0_px`, `x1_px`, `y1_px`, then `centre_x_px`, `centre_y_px`, `radius_px`
-    (half of sqrt(w h)), `score`, and the ellipse columns of the table `labels`. Pixels count from the outer corner of
-    the first pixel. The detector finds boxes, so the ellipse is the axis-aligned ellipse inside the box."""
+    (half of sqrt(w h)), `score`, `suspect` (the reason of `suspicion`, or empty), and the ellipse columns of the table
+    `labels`. Pixels count from the outer corner of the first pixel. The detector finds boxes, so the ellipse is the
+    axis-aligned ellipse inside the box."""
     image: NDArray[np.uint8]
     """The upright image in 8-bit grey (height, width), before normalisation."""
     suspicion: Suspicion | None = None
@@ -112,7 +113,8 @@ class CraterDetector:
         suspicion, detections = suspicion_of(grey, every, calibrated), above(every, threshold)
         if suspicion is not None:
             say(f"warning: {name}: {suspicion.text}")
-        return Craters(_with_ellipses(table_of(name, detections), detections), grey, suspicion)
+        table = _with_ellipses(flagged(table_of(name, detections), suspicion), detections)
+        return Craters(table, grey, suspicion)
 
     def __repr__(self) -> str:
         where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"

@@ -27,7 +27,7 @@ from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.images.sequences import frames_of
-from perilune_train.detect.images.suspect import suspicion_of
+from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
@@ -90,8 +90,7 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             if suspicion is not None:
                 doubts.append(f"warning: {path.name}: {suspicion.text}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
-            reason = pd.Series(["" if suspicion is None else suspicion.reason] * len(detections.scores), dtype="str")
-            tables.append(table_of(path.name, detections).assign(suspect=reason))
+            tables.append(flagged(table_of(path.name, detections), suspicion))
             write_overlay(folder / f"{path.name}.overlay.png", image, detections, threshold)
             if reference is not None:
                 located = features(path.name, detections, reference)
@@ -182,3 +181,9 @@ def table_of(name: str, detections: Detections) -> pd.DataFrame:
         "score": detections.scores,
     }
     return pd.DataFrame(columns)
+
+
+def flagged(table: pd.DataFrame, suspicion: Suspicion | None) -> pd.DataFrame:
+    """Add the column `suspect` to the table of an image: the reason of the suspicion, or an empty text."""
+    reason = "" if suspicion is None else suspicion.reason
+    return table.assign(suspect=pd.Series([reason] * len(table), dtype="str"))
