@@ -356,8 +356,8 @@ bench-monte-carlo: setup-dev # time of 1200 flights of the navigation filter on 
 bench-stream: setup-dev # navigator trained on rendered sequences, compared with training on a dataset alone, at equal processor time; writes runs/bench/stream.json
 	@$(BIN)/python -m benchmarks.train.stream
 
-bench-one-light: setup-dev # agreement of the directions of light on craters, in lunar pictures and in other pictures (MOON=folder OTHERS=folder)
-	@$(BIN)/python -m benchmarks.train.one_light $(call quoted,$(MOON)) --others $(call quoted,$(OTHERS))
+bench-suspect: setup-dev # pictures that detect predict suspects not to show the Moon, among lunar pictures and others (MOON=folder OTHERS=folder)
+	@$(BIN)/python -m benchmarks.train.suspect $(call quoted,$(MOON)) --others $(call quoted,$(OTHERS))
 
 bench-suppress: setup-dev # time of non-maximum suppression of a batch, compared with OpenCV frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress

@@ -73,13 +73,12 @@ def detection() -> Step:
     import numpy as np
 
     from perilune_train.detect.finished_run import config_of_run
-    from perilune_train.detect.inference.detector import open_detector
+    from perilune_train.detect.inference.detector import open_run
     from perilune_train.detect.inference.scales import detect_at_scales
     from perilune_train.shipped.models import shipped_run
-    from perilune_train.training.runs import RunFolder
 
     run = shipped_run("detect")
-    detector = open_detector(RunFolder(run).best, config_of_run(run, ()))
+    detector = open_run(run, config_of_run(run, ()))
     frames = np.random.default_rng(0).integers(0, 255, (4, 256, 256), np.uint8)
     return lambda: detect_at_scales(detector, frames)
 

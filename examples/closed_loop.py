@@ -32,7 +32,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, 
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_errors import drawn_errors
 from perilune_shared.geometry.inertial_grades import GRADES
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import detect_image
@@ -149,7 +149,7 @@ class CraterCamera:
     def __init__(self, scene: SceneClient):
         run = shipped_run("detect")
         config = config_of_run(run)
-        self._scene, self._threshold = scene, chosen_threshold(run)
+        self._scene, self._threshold = scene, raw_threshold(run)
         self._detector = open_detector(RunFolder(run).best, config)
         self._tiling = Tiling(scales=tuple(config.evaluation.scales))
 

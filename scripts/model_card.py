@@ -35,15 +35,32 @@ def model_card(shipment: Shipment) -> str:
     return "\n".join([f"# {shipment.name}", "", *_detector(shipment), *[f"- {note}" for note in shipment.notes], ""])
 
 
-def _facts(shipment: Shipment, network: str, threshold: str | None) -> list[str]:
+def _scores(shipment: Shipment) -> tuple[str, str]:
+    """Texts on the threshold and on the meaning of a score."""
+    metrics, threshold = shipment.metrics, shipment.figures.get("threshold", 0)
+    if "calibration/threshold" not in metrics:
+        meaning = "of the network, without calibration: a score is no probability"
+        return f"{threshold:.3f}, chosen on validation scenes", meaning
+    raw, error = metrics["calibration/raw_threshold"], metrics["calibration/ece_after"]
+    return (
+        f"a probability of {metrics['calibration/threshold']:.3f} ({raw:.3f} before calibration), chosen on validation "
+        "scenes",
+        f"probabilities of a match with a label `visible`; expected calibration error {error:.3f} on the frames of the "
+        f"fit ({metrics['calibration/frames']})",
+    )
+
+
+def _facts(shipment: Shipment, network: str) -> list[str]:
     commit = str(shipment.metrics.get("run/commit", "unknown"))[:7]
     data = f"manifest `{shipment.manifest}`, SHA-256 of dataset.json {shipment.sha256[:16]}; rendered frames only"
+    threshold, meaning = _scores(shipment)
     rows = {
         "Network": network,
         "Weights": f"{shipment.size_mb:.1f} MB, {shipment.precision}, safetensors",
         "Training data": data,
         "Trained at": f"commit {commit}, {shipment.metrics.get('run/hardware', 'unknown hardware')}",
         "Threshold": threshold,
+        "Scores": meaning,
         "Licence": "Apache-2.0",
     }
     return ["| | |", "|---|---|", *[f"| {key} | {value} |" for key, value in rows.items() if value]]
@@ -80,7 +97,7 @@ def _detector(shipment: Shipment) -> list[str]:
         "This detector finds lunar craters in camera images taken from above. `perilune-train detect predict` uses it "
         "if `--run` is not given.",
         "",
-        *_facts(shipment, network, f"{figures.get('threshold', 0):.3f}, chosen on validation scenes"),
+        *_facts(shipment, network),
         "",
         "## Locked benchmark",
         "",

@@ -17,11 +17,10 @@ from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detec
 from perilune_train.detect.evaluate.matching import EDGE, Criteria, Detections
 from perilune_train.detect.evaluate.pictures import draw_frames
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.scales import detect_split
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.shipped.models import shipped_run
-from perilune_train.training.runs import RunFolder
 
 RIMS = {"listed": "catalogue", "measured": "measured"}
 """Names of two sets of labels, and their `dataset.terrain.elevation.rims`."""
@@ -61,7 +60,7 @@ def score(folders: dict[str, Path], pictures: Path) -> dict[str, object]:
     all sets are scored with the same detections.
     """
     run = shipped_run("detect")
-    detector, threshold = open_detector(RunFolder(run).best, config_of_run(run)), chosen_threshold(run)
+    detector, threshold = open_run(run, config_of_run(run)), chosen_threshold(run)
     found: dict[str, list[Detections]] = {}
     result: dict[str, object] = {}
     for labels in (*RIMS, FITTED):

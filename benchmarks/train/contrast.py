@@ -32,9 +32,8 @@ from perilune_train.detect.evaluate.boxes import iou_matrix
 from perilune_train.detect.evaluate.matching import Detections, match_split
 from perilune_train.detect.evaluate.metrics import figures
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.scales import detect_split
-from perilune_train.training.runs import RunFolder
 
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
@@ -158,7 +157,7 @@ def main(
     opened = open_dataset(dataset)
     config, threshold = config_of_run(run), chosen_threshold(run)
     frames = load_split(opened, split, config.labels)
-    found, _ = detect_split(open_detector(RunFolder(run).best, config), frames, split)
+    found, _ = detect_split(open_run(run, config), frames, split)
     detections = dict(zip(frames.frames.table["frame_id"], found, strict=True))
     result = {
         **measure(opened, detections, threshold, split),

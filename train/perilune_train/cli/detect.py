@@ -82,8 +82,8 @@ def train(
     """Train the crater detector (attention YOLOv3) and evaluate it on the test split.
 
     Writes runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
-    detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. The same
-    command resumes an interrupted run and leaves a finished run unchanged; --overwrite replaces it.
+    detections.parquet, detections.png, precision_recall.png and .parquet, reliability.png, bins.png and TensorBoard
+    events. The same command resumes an interrupted run and leaves a finished run unchanged; --overwrite replaces it.
 
     To train the baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
@@ -207,7 +207,7 @@ def evaluate(
         request = Request(chosen, tuple(category or ()), image_folder)
         settings = ImageSettings(tiling, min_size, threshold, nodata, request)
         evaluate_images(run, config, images, folder, settings)
-        say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
+        say(f"{folder}: metrics.json, report.md, detections.parquet, *.png")
         return
     if scale:
         values = config.model_dump(mode="json")
@@ -222,7 +222,38 @@ def evaluate(
         "validation" if choose_threshold else "run" if threshold is None else threshold
     )
     folder = evaluate_again(run, config, EvaluatedSplit(address, split, allow_overlap), score, out)
-    say(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
+    say(f"{folder}: metrics.json, report.md, detections.parquet, *.png")
+
+
+@app.command("calibrate")
+def calibrate(
+    run: Annotated[Path, typer.Option(help="Folder of a finished detect run.")],
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="Dataset with the validation frames: a folder, s3://bucket/prefix or gs://bucket/prefix."
+            " [default: data/<name of the run>/detect]"
+        ),
+    ] = None,
+) -> None:
+    """Make the scores of a finished run probabilities: fit their calibration on validation frames.
+
+    Training does this at its end; runs of earlier releases need it once. Writes the calibration into metrics.json of
+    the run. The order of detections, AP and the reported detections do not change. Give the dataset on which the run
+    was trained.
+    """
+    config = config_of_run(run)
+    # Importing torch takes seconds; check the run first.
+    from perilune_train.detect.calibrate import calibrate_run
+
+    entries = calibrate_run(run, config, dataset or Path("data", run.resolve().name, "detect"))
+    before, after, raw, threshold = (
+        float(str(entries[f"calibration/{key}"])) for key in ("ece_before", "ece_after", "raw_threshold", "threshold")
+    )
+    say(
+        f"{run / 'metrics.json'}: expected calibration error on {entries['calibration/frames']} {before:.3f} before, "
+        f"{after:.3f} after; the threshold of {raw:.3f} is a probability of {threshold:.3f}"
+    )
 
 
 @app.command("benchmark")

@@ -20,11 +20,12 @@ from perilune_train.detect.evaluate.split_evaluation import (
     dataset_entries,
     evaluate_split,
     report_head,
+    score_meaning,
     selection_entries,
     write_detections,
 )
 from perilune_train.detect.finished_run import check_output, chosen_threshold
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.scales import detect_split
 from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.records.markdown import number, table, write_markdown
@@ -86,7 +87,7 @@ def evaluate_again(
         protocol = f"not the run's dataset ({known}); split by {dataset.info.split_by}"
     if split != "test":
         protocol += f"; {split} frames, used to {'train' if split == 'train' else 'select'} the network"
-    detector = open_detector(best, config)
+    detector = open_run(run, config)
     frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
@@ -97,6 +98,7 @@ def evaluate_again(
     evaluation = evaluate_split(frames, detections, config, chosen)
     write_detections(folder / "detections.parquet", frames, detections)
     about = report_head(dataset, split, config, protocol, run.resolve().name, threshold_source)
+    about.append(score_meaning(detector.calibration))
     write_evaluation(folder, evaluation, list(frames.frames.images), about)
     metrics = (
         selection_entries(config, frames) | dataset_entries(dataset, split, config) | {"dataset/protocol": protocol}

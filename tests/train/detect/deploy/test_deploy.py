@@ -2,8 +2,10 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,9 @@ from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.files import FlightDetector, write_onnx, write_openvino
+from perilune_train.detect.deploy.readme import readme
 from perilune_train.detect.finished_run import config_of_run
+from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training import runs
@@ -218,6 +222,26 @@ def test_the_readmes_program_finds_what_we_find(exported, dataset_detect, images
     assert len(own.scores) > 3
     np.testing.assert_allclose(boxes, own.boxes, atol=1e-3)
     np.testing.assert_allclose(scores, own.scores, atol=1e-4)
+
+
+def test_the_readme_has_the_probability_of_a_score(run_folder, tmp_path):
+    """The exported network has the scores of training, so its threshold is the one before calibration."""
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    assert "a score is no probability" in readme(export.export_metadata(export.load_trained(run), SIZE) | {"files": {}})
+    calibration = Calibration(0.7, 2.9, -2.0)
+    entries = {f"calibration/{name}": value for name, value in asdict(calibration).items()}
+    entries |= {"calibration/raw_threshold": 0.4, "calibration/threshold": calibration.probability(0.4)}
+    write_metrics(run, {"test/threshold": 0.4, **entries})
+    metadata = export.export_metadata(export.load_trained(run), SIZE)
+    assert metadata["score_threshold"] == 0.4
+    assert {key: metadata["score_calibration"][key] for key in asdict(calibration)} == asdict(calibration)
+    formula = metadata["score_calibration"]["probability"]
+    assert f"`{formula}`" in readme(metadata | {"files": {}})
+    done = subprocess.run(
+        [sys.executable, "-c", f"from math import exp, log\ns = 0.6\nprint({formula})"], capture_output=True, text=True
+    )
+    assert float(done.stdout) == pytest.approx(calibration.probability(0.6), rel=1e-5)
 
 
 def test_a_file_that_differs_is_not_left(run_folder, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate.report import write_evaluation
+from perilune_train.detect.evaluate.split_evaluation import score_meaning
 from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.records.benchmark_parts import Part, open_parts
 from perilune_train.records.markdown import write_markdown
@@ -21,7 +22,14 @@ from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.records.provenance import TerrainCheck, check_terrain, read_provenance
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
-_PICTURES = ("report.md", "precision_recall.png", "precision_recall.parquet", "bins.png", "detections.png")
+_PICTURES = (
+    "report.md",
+    "precision_recall.png",
+    "precision_recall.parquet",
+    "reliability.png",
+    "bins.png",
+    "detections.png",
+)
 
 
 def score_run(
@@ -33,7 +41,7 @@ def score_run(
     (`allow_overlap` permits this).
     """
     # torch takes seconds to load, and a table of detections does not need it.
-    from perilune_train.detect.inference.detector import open_detector
+    from perilune_train.detect.inference.detector import open_run
     from perilune_train.detect.inference.scales import detect_split
     from perilune_train.training import runs
 
@@ -41,13 +49,14 @@ def score_run(
     best = runs.RunFolder(run).best
     provenance = read_provenance(runs.load_weights(best), best)
     checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
-    detector, loaded = open_detector(best, config), load_parts(parts)
+    detector, loaded = open_run(run, config), load_parts(parts)
     detections, rates = {}, {}
     for name, split in next(iter(loaded.values())).items():
         detections[name], rates[name] = detect_split(detector, split, name)
     scales = " and ".join(f"{factor:g}" for factor in config.evaluation.scales)
     about = [f"run {code_span(run.resolve().name)}, best weights, frames evaluated at scale {scales}"]
     about.append(f"threshold {threshold:.4f}, chosen on the validation split of the run's own dataset")
+    about.append(score_meaning(detector.calibration))
     more: Metrics = {"scored": f"run {run.resolve().name}", "scales": scales}
     more |= {f"images_per_s/{name}": round(rate, 2) for name, rate in rates.items()}
     return _write(out, parts, loaded, _Entry(detections, threshold, about, more, checks))

@@ -1,7 +1,7 @@
 """Export of a trained detector for flight: ONNX and OpenVINO files, checked against torch."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from perilune_train.detect.deploy.engines import Array, Engine, onnxruntime_engi
 from perilune_train.detect.deploy.files import FlightDetector, write_onnx, write_openvino
 from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import calibration_of, config_of_run, raw_threshold
+from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
@@ -102,9 +103,11 @@ class Trained:
     config: DetectConfig
     """Settings of the run."""
     threshold: float
-    """Score threshold that the run chose on its validation split."""
+    """Threshold of the network's scores, before calibration, that the run chose on its validation split."""
     checkpoint: Path
     """File of the weights."""
+    calibration: Calibration | None = None
+    """Map from the network's scores to probabilities; None if the run has none."""
 
 
 def load_trained(root: Path) -> Trained:
@@ -112,8 +115,8 @@ def load_trained(root: Path) -> Trained:
 
     Raises UserError if the folder is not a finished run.
     """
-    config, threshold, best = config_of_run(root), chosen_threshold(root), RunFolder(root).best
-    return Trained(load_detector(best), config, threshold, best)
+    config, threshold, best = config_of_run(root), raw_threshold(root), RunFolder(root).best
+    return Trained(load_detector(best), config, threshold, best, calibration_of(root))
 
 
 def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
@@ -133,6 +136,9 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
             **({"shapes": _SHAPES} if network.ellipses else {}),
         },
         "score_threshold": trained.threshold,
+        "score_calibration": None
+        if trained.calibration is None
+        else asdict(trained.calibration) | {"probability": trained.calibration.formula},
         "min_score": settings.min_score,
         "nms_iou": settings.nms_iou,
         "max_detections": settings.max_detections,

@@ -49,6 +49,7 @@ def readme(metadata: dict[str, Any]) -> str:
         "Apply non-maximum suppression, which is not part of the graph: of two boxes with an IoU above "
         f"{metadata['nms_iou']:g}, drop the one with the lower score.",
         "",
+        *_probability(metadata),
         f"{metadata['multiply_adds'] / 1e9:.3f} G multiply-adds per image, {metadata['parameters']:,} parameters.",
         "",
         "| File | SHA-256 |",
@@ -79,3 +80,16 @@ def readme(metadata: dict[str, Any]) -> str:
     if "detector.onnx" in metadata["files"]:
         lines += ["```python", _PROGRAM.rstrip(), "```", ""]
     return "\n".join(lines)
+
+
+def _probability(metadata: dict[str, Any]) -> list[str]:
+    """Lines on the calibration of the scores."""
+    calibration = metadata["score_calibration"]
+    if calibration is None:
+        return ["The run has no calibration: a score is no probability.", ""]
+    return [
+        "A score is no probability. After suppression, the probability that a detection with the score s matches a "
+        f"label is `{calibration['probability']}` (beta calibration, fitted on validation frames; parameters in "
+        "`detector.json`).",
+        "",
+    ]

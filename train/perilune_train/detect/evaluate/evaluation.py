@@ -34,6 +34,7 @@ from perilune_train.detect.evaluate.matching import (
     find_overlaps,
 )
 from perilune_train.detect.evaluate.metrics import figures, figures_of_rule, figures_over_ious
+from perilune_train.detect.evaluate.reliability import Judged, calibration_errors, judged
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
@@ -64,6 +65,10 @@ class Evaluation:
     """Matches at match_iou by the edge scoring rule (matching.py)."""
     by_iou: list[Matches]
     """Matches at each of COCO_IOUS."""
+    judged: Judged
+    """Detections that the labels can decide, for calibration errors (reliability.py)."""
+    calibration_errors: dict[str, float]
+    """Expected calibration errors by the keys of `reliability.NAMES`."""
     bins: list[BinFigures]
     """Metrics by radius, altitude, Sun elevation and freshness, for bins that hold selected labels."""
     spreads: dict[str, Spread]
@@ -101,8 +106,8 @@ class Evaluation:
     def figures(self) -> Metrics:
         """Entries of metrics.json; NaN where undefined.
 
-        The keys come from `metrics.figures`, `figures_over_ious`, `Spread.keys` and `errors`. Further keys are
-        <bin>/ap50_paper and other metrics of each bin, recall_radius_... and lowest_ap50_paper_by_...
+        The keys come from `metrics.figures`, `figures_over_ious`, `Spread.keys`, `errors` and `reliability.NAMES`.
+        Further keys are <bin>/ap50_paper and other metrics of each bin, recall_radius_... and lowest_ap50_paper_by_...
         """
         result: Metrics = {
             **figures(self.matches, self.threshold),
@@ -117,6 +122,7 @@ class Evaluation:
             **self.errors,
             **self.ellipse_errors,
             **self.ellipse_scores,
+            **self.calibration_errors,
         }
         for name, spread in self.spreads.items():
             result |= spread.keys(name)
@@ -182,6 +188,8 @@ def evaluate_detections(
         matches,
         at_edge,
         by_iou,
+        judged(overlaps, matches, radius_px),
+        calibration_errors(overlaps, matches, radius_px, threshold),
         figures_by_bin(overlaps, matches, facts, criteria, resamples),
         spreads(statistics, matches.selected_frame, resamples),
         resamples,

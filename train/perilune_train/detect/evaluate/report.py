@@ -14,6 +14,7 @@ from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
 from perilune_train.detect.evaluate.pictures import draw_bins, draw_curves, draw_frames
+from perilune_train.detect.evaluate.reliability import NAMES, draw_reliability
 from perilune_train.records.markdown import number, table, write_markdown
 from perilune_train.records.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 
@@ -32,7 +33,7 @@ _ROWS = {
 def write_evaluation(
     folder: Path, evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], about: Sequence[str]
 ) -> None:
-    """Write report.md, precision_recall.png and .parquet, bins.png (if there are bins) and detections.png.
+    """Write report.md, precision_recall.png and .parquet, reliability.png, bins.png and detections.png.
 
     `images` are the grey frames (height, width); the Markdown lines `about` state what was evaluated and how.
     """
@@ -42,6 +43,7 @@ def write_evaluation(
     dashed = {f"IoU {evaluation.match_iou:g}, {name}": curve(matches) for name, matches in others.items()}
     draw_curves(_with_ap(curves), folder / "precision_recall.png", dashed=_with_ap(dashed))
     write_curve(folder / CURVE_FILE, curve(evaluation.matches))
+    draw_reliability(evaluation.judged, folder / "reliability.png")
     draw_bins(evaluation.bins, folder / "bins.png")
     draw_frames(evaluation, images, folder / "detections.png")
 
@@ -103,6 +105,10 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         )
     ]
     lines += [*table(["error", "px", "relative to the radius"], rows), "", *_ellipses(evaluation)]
+    lines += ["## Scores as probabilities", ""]
+    lines += ["Expected calibration error: mean difference of score and share of matches; see reliability.png.", ""]
+    rows = [[title, number(evaluation.calibration_errors[key])] for key, title in NAMES.items()]
+    lines += [*table(["detections, match and bins", "expected calibration error"], rows), ""]
     return "\n".join(lines)
 
 

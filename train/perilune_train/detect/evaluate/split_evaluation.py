@@ -15,6 +15,7 @@ from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, joined_detections, match_split
+from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import protocol_of
 
@@ -22,6 +23,7 @@ WRITTEN = (
     "report.md",
     "detections.png",
     "precision_recall.png",
+    "reliability.png",
     "bins.png",
     "detections.parquet",
     "precision_recall.parquet",
@@ -95,10 +97,20 @@ def report_head(
         f"split {for_markdown(split)}; protocol: {protocol}",
         f"labels: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
         f"threshold {threshold_source}",
-        f"detections below a score of {settings.min_score:g} are dropped, non-maximum suppression at IoU "
-        f"{settings.nms_iou:g}, at most {settings.max_detections} detections per frame; frames evaluated "
+        f"detections below a score of {settings.min_score:g} (before calibration) are dropped, non-maximum suppression "
+        f"at IoU {settings.nms_iou:g}, at most {settings.max_detections} detections per frame; frames evaluated "
         f"{at_scales(settings.scales)}",
     ]
+
+
+def score_meaning(calibration: Calibration | None) -> str:
+    """What a score is, for the head of a report."""
+    if calibration is None:
+        return "scores are those of the network, without calibration: a score is no probability"
+    return (
+        "scores are calibrated: a score is the probability that the detection matches a label, fitted on validation "
+        "frames"
+    )
 
 
 def at_scales(scales: tuple[float, ...]) -> str:

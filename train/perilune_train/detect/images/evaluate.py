@@ -28,17 +28,17 @@ from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detec
 from perilune_train.detect.evaluate.matching import FALSE, FOUND, Criteria, Detections
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
+from perilune_train.detect.evaluate.split_evaluation import score_meaning
 from perilune_train.detect.finished_run import check_output, chosen_threshold
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, Request, read_images
 from perilune_train.detect.images.overlay import draw_boxes, draw_ellipses
 from perilune_train.detect.images.predict import table_of
 from perilune_train.detect.images.read import read_grey
-from perilune_train.detect.inference.detector import Detector, open_detector
+from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.records.pictures import save_image
-from perilune_train.training import runs
 
 _CROP_PX = 200
 _PAIRS_PER_ROW, _MAX_PAIRS = 3, 12
@@ -90,7 +90,8 @@ class _Pictures(Sequence[NDArray[np.uint8]]):
 def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, settings: ImageSettings) -> Metrics:
     """Evaluate a run on labelled images (labelled.py); returns the metrics written to `out`/metrics.json.
 
-    Also writes report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png into `out`.
+    Also writes report.md, detections.parquet, precision_recall.png, reliability.png, bins.png, detections.png and
+    crops.png into `out`.
     Raises UserError if any input cannot be read; then nothing is written.
     """
     check_output(out, run)
@@ -109,7 +110,8 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
     # Read all images once, so that a damaged image is refused before hours of detection.
     for _ in images:
         pass
-    detections = _detect(open_detector(runs.RunFolder(run).best, config), image_set, images, tiling)
+    detector = open_run(run, config)
+    detections = _detect(detector, image_set, images, tiling)
     evaluation = evaluate_detections_in_images(
         image_set, detections, threshold, min_size_px, config.evaluation.match_iou
     )
@@ -121,6 +123,7 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
         f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
         + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
         f"threshold {threshold_source}",
+        score_meaning(detector.calibration),
         f"oracle: with the threshold of highest F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]

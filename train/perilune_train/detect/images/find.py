@@ -15,14 +15,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
+from perilune_shared.console.terminal import say
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.pictures import display, with_ellipses
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
-from perilune_train.detect.images.predict import above, table_of
+from perilune_train.detect.images.predict import above, flagged, table_of
 from perilune_train.detect.images.read import grey_of_array, read_grey
-from perilune_train.detect.inference.detector import Detector, open_detector
+from perilune_train.detect.images.suspect import Suspicion, suspicion_of
+from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.shipped.models import shipped_models, shipped_run
@@ -40,12 +42,14 @@ class Craters:
 
     table: pd.DataFrame
     """One row per crater: the box `x0_px`, `y0_px`, `x1_px`, `y1_px`, then `centre_x_px`, `centre_y_px`, `radius_px`
-    (half of sqrt(w h)), `score`, and the ellipse columns of the table `labels`. Pixels count from the outer corner of
-    the first pixel. Further columns have the ellipse in other units, and its standard deviations (`semi_major_px`,
-    `semi_minor_px`, `angle_deg`, `sigma_...`). If the detector predicts only boxes, the ellipse is the axis-aligned
-    ellipse inside the box, and the standard deviations are NaN."""
+    (half of sqrt(w h)), `score`, `suspect` (the reason of `suspicion`, or empty), and the ellipse columns of the table
+    `labels`. Pixels count from the outer corner of the first pixel. Further columns have the ellipse in other units,
+    and its standard deviations (`semi_major_px`, `semi_minor_px`, `angle_deg`, `sigma_...`). If the detector predicts
+    only boxes, the ellipse is the axis-aligned ellipse inside the box, and the standard deviations are NaN."""
     image: NDArray[np.uint8]
     """The upright image in 8-bit grey (height, width), before normalisation."""
+    suspicion: Suspicion | None = None
+    """Why the image may not show regolith at a usable scale; None if nothing is suspicious. A warning tells it too."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -82,7 +86,7 @@ class CraterDetector:
         self.run = run
         self.threshold = chosen_threshold(run)
         self._tiling = Tiling(scales=tuple(config.evaluation.scales))
-        self._detector: Detector = open_detector(RunFolder(run).best, config)
+        self._detector: Detector = open_run(run, config)
 
     @overload
     def __call__(self, image: ImageLike, *, threshold: float | None = None) -> Craters: ...
@@ -105,8 +109,13 @@ class CraterDetector:
 
     def _craters(self, image: ImageLike, threshold: float) -> Craters:
         name, grey = _read(image)
-        detections = above(detect_image(self._detector, grey, self._tiling), threshold)
-        return Craters(_with_ellipses(table_of(name, detections), detections), grey)
+        every = detect_image(self._detector, grey, self._tiling)
+        calibrated = self._detector.calibration is not None
+        suspicion, detections = suspicion_of(grey, every, calibrated), above(every, threshold)
+        if suspicion is not None:
+            say(f"warning: {name}: {suspicion.text}")
+        table = _with_ellipses(flagged(table_of(name, detections), suspicion), detections)
+        return Craters(table, grey, suspicion)
 
     def __repr__(self) -> str:
         where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"

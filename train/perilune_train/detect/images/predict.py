@@ -24,15 +24,14 @@ from perilune_train.detect.images.georeference import (
     features,
     read_georeference,
 )
-from perilune_train.detect.images.one_light import doubt_of
 from perilune_train.detect.images.overlay import write_overlay
 from perilune_train.detect.images.pictures import check_names, pictures_of
 from perilune_train.detect.images.read import picture_size, read_grey
 from perilune_train.detect.images.sequences import frames_of
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.images.suspect import Suspicion, suspicion_of
+from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
-from perilune_train.training import runs
 
 _SHOWN_DOUBTS = 5
 
@@ -79,21 +78,24 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             n_tiles += count_tiles(height, width, tiling)
             progress.advance(check)
         threshold = chosen_threshold(run) if settings.threshold is None else settings.threshold
-        detector = open_detector(runs.RunFolder(run).best, config)
+        detector = open_run(run, config)
         if not detector.network.ellipses:
             say(
                 f"{run.name}: this detector predicts only boxes: ellipses are axis-aligned, without standard deviations"
             )
+        if detector.calibration is None:
+            say("scores are no probabilities: the run has no calibration; `perilune-train detect calibrate` adds one")
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
             detections = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
-            if doubt := doubt_of(image, detections):
-                doubts.append(f"warning: {path.name}: {doubt}")
+            suspicion = suspicion_of(image, detections, detector.calibration is not None)
+            if suspicion is not None:
+                doubts.append(f"warning: {path.name}: {suspicion.text}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
-            tables.append(table_of(path.name, detections))
+            tables.append(flagged(table_of(path.name, detections), suspicion))
             write_overlay(folder / f"{path.name}.overlay.png", image, detections, threshold)
             if reference is not None:
                 located = features(path.name, detections, reference)
@@ -186,3 +188,9 @@ def table_of(name: str, detections: Detections) -> pd.DataFrame:
         **ellipse_columns(detections),
     }
     return pd.DataFrame(columns)
+
+
+def flagged(table: pd.DataFrame, suspicion: Suspicion | None) -> pd.DataFrame:
+    """Add the column `suspect` to the table of an image: the reason of the suspicion, or an empty text."""
+    reason = "" if suspicion is None else suspicion.reason
+    return table.assign(suspect=pd.Series([reason] * len(table), dtype="str"))

@@ -1,7 +1,7 @@
 """Load a trained detector, and run its network on a device."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,9 @@ from perilune_shared.threads import warn_if_crowded
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.finished_run import calibration_of
+from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.models.architecture import DetectorArchitecture, check_architecture_of, without_memory
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
@@ -35,6 +38,8 @@ class Detector:
     """Whether the network computes in bfloat16."""
     threads: FairThreads = field(default_factory=FairThreads)
     """Number of threads on a CPU, adapted to other work on the machine."""
+    calibration: Calibration | None = None
+    """Map from the network's scores to probabilities; None leaves the scores as they are."""
 
     @torch.no_grad()
     def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -45,6 +50,12 @@ class Detector:
         inputs = network_input(normalised(images), self.config.in_channels).to(self.device)
         with self.threads, torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
             return self.network.detect_ellipses(inputs)
+
+    def calibrated(self, detections: Detections) -> Detections:
+        """The detections, after suppression, with their probabilities as scores."""
+        if self.calibration is None:
+            return detections
+        return replace(detections, scores=self.calibration.probabilities(detections.scores))
 
 
 def load_detector(path: Path) -> YOLOv3:
@@ -68,9 +79,21 @@ def check_detector(content: Mapping[str, Any], path: Path) -> None:
 
 
 def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:
-    """Load a detect run's best.ckpt onto the device of the settings; same errors as `load_detector`."""
+    """Load a detect run's best.ckpt onto the device of the settings, without calibration.
+
+    Same errors as `load_detector`. `open_run` also reads the calibration of a finished run.
+    """
     device = runs.choose_device(config.device)
     if device == "cpu":
         warn_if_crowded()
     network = load_detector(checkpoint).to(device)
     return Detector(network, config, device, runs.choose_bf16(config.precision, device), FairThreads(device == "cpu"))
+
+
+def open_run(run: Path, config: DetectConfig) -> Detector:
+    """Load the best weights and the calibration of a finished run; `config` is the run's, or a changed copy of it.
+
+    If the run has a calibration, the scores of all detections are probabilities, like its threshold
+    (`finished_run.chosen_threshold`). Raises UserError if a file is missing or damaged.
+    """
+    return replace(open_detector(runs.RunFolder(run).best, config), calibration=calibration_of(run))

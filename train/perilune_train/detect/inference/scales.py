@@ -87,7 +87,8 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
         if shape is not None:
             shapes.append(shape if factor == 1 else resized_shapes(shape, found, boxes[-1], ratios))
     every_shape = torch.cat(shapes, 1) if shapes else None
-    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
+    merged = detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
+    return [detector.calibrated(of_frame) for of_frame in merged]
 
 
 def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:

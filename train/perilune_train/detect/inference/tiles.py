@@ -79,7 +79,8 @@ def detect_image(
             parts.append(detections.take(inside).divided(size[0] / width, size[1] / height))
     every = joined_detections(parts)
     found = every.take(suppress_in_blocks(every.boxes, every.scores, detector.config.evaluation.nms_iou))
-    return replace(found, boxes=found.boxes + tiling.box_margin_px * np.array([-1, -1, 1, 1]))
+    margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
+    return detector.calibrated(replace(found, boxes=found.boxes + margin))
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:

@@ -1,5 +1,6 @@
 """One training run of the detector: load, train, evaluate, write."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import lightning
@@ -24,15 +25,17 @@ from perilune_train.detect.evaluate.split_evaluation import (
     evaluate_split,
     match_detections,
     report_head,
+    score_meaning,
     selection_entries,
     write_detections,
 )
+from perilune_train.detect.finished_run import calibration_in
 from perilune_train.detect.inference.detector import load_detector, open_detector
 from perilune_train.detect.inference.scales import detect_split, multiply_adds_of_a_frame
 from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.train.distill import Teacher
 from perilune_train.detect.train.task import DetectTask
-from perilune_train.detect.train.threshold import threshold_on_validation
+from perilune_train.detect.train.threshold import calibration_entries, detect_validation
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 from perilune_train.records.marks import mark_files
@@ -139,7 +142,7 @@ def _run(
     mark_files(run.root, WRITTEN, terrain_check.mark)
     metrics |= terrain_check.metrics()
     write_metrics(run.root, metrics)
-    say(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
+    say(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, reliability.png, bins.png")
     return run
 
 
@@ -152,21 +155,30 @@ def evaluate(
 ) -> Metrics:
     """Evaluate the best weights on val and test; write tables and pictures.
 
-    The threshold is chosen on val only. `sizes_px` (S, 2) are the sizes of the training labels.
+    The threshold is chosen, and the calibration of the scores is fitted, on val only. `sizes_px` (S, 2) are the sizes
+    of the training labels.
     """
     detector = open_detector(run.best, config)
-    found_val, _ = detect_split(detector, splits["val"], "val")
+    raw_val, _ = detect_split(detector, splits["val"], "val")
+    validation = detect_validation(detector, splits["val"], raw_val)
+    threshold, chosen_on = validation.threshold(config.evaluation)
+    entries = calibration_entries(validation, config.evaluation, threshold)
+    calibration = calibration_in(entries, run.metrics)
+    if calibration is not None:
+        threshold = calibration.probability(threshold)
+    detector = replace(detector, calibration=calibration)
+    found_val = [detector.calibrated(of_frame) for of_frame in raw_val]
     found_test, rate = detect_split(detector, splits["test"], "test")
     matches = match_detections(splits["val"], found_val, config)
-    threshold, chosen_on = threshold_on_validation(detector, splits["val"], found_val)
     evaluation = evaluate_split(splits["test"], found_test, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found_test)
     about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, chosen_on)
+    about.append(score_meaning(calibration))
     about.append(anchor_report(detector.network, sizes_px, config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}
-    return metrics | {"test/images_per_s": round(rate, 2)}
+    return metrics | entries | {"test/images_per_s": round(rate, 2)}
 
 
 def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> YOLOv3:

@@ -16,7 +16,7 @@ from perilune_shared.storage.store import Address
 from perilune_train.data.frames import load_images
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.explain.causal import bins, pictures
@@ -120,7 +120,7 @@ def causal_run(
     if state == "finished":
         return run
     folder = folder_of(checkpoint)
-    config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
+    config, threshold = config_of_run(folder, ()), raw_threshold(folder)
     removed, opened = read_removed(inputs.counterfactual), open_single(dataset)
     fitted = {"detector": (checkpoint, dataset)} | (
         {} if pose is None else {"navigator": (pose.checkpoint, pose.dataset)}

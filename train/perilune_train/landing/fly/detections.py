@@ -15,7 +15,7 @@ from perilune_shared.storage.tables.limits import DETECTIONS
 from perilune_shared.storage.tables.read import read_table
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import open_detector
@@ -55,8 +55,12 @@ def flight_config(run: Path) -> DetectConfig:
 
 
 def by_network(run: Path) -> Detect:
-    """Detect craters with the network of a detect run, at the score threshold chosen by the run."""
-    config, threshold = flight_config(run), chosen_threshold(run)
+    """Detect craters with the network of a detect run, at the score threshold chosen by the run.
+
+    Scores are the network's, without calibration: the filter derives the error of a centre from them
+    (`Sightings.noise_px`), and a probability says less about this error.
+    """
+    config, threshold = flight_config(run), raw_threshold(run)
     detector = open_detector(RunFolder(run).best, config)
     tiling = Tiling(_TILE_PX, scales=_SCALES)
     return lambda path: above(detect_image(detector, _grey(path), tiling, lambda n: None), threshold)

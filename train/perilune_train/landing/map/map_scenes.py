@@ -17,7 +17,7 @@ from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_train.data.frames import decode
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
@@ -69,7 +69,7 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
     best = RunFolder(detector).best
     provenance = read_provenance(load_weights(best), best)
     checks = [check_terrain(provenance, dataset, split, allow_overlap) for split in frames["split"].unique()]
-    network, threshold = open_detector(best, config_of_run(detector)), chosen_threshold(detector)
+    network, threshold = open_detector(best, config_of_run(detector)), raw_threshold(detector)
     maps = []
     with new_folder(out) as folder:
         with progress_bar() as progress:

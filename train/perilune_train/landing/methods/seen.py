@@ -10,7 +10,7 @@ from perilune_shared.console.terminal import progress_bar
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
-from perilune_train.detect.finished_run import chosen_threshold
+from perilune_train.detect.finished_run import raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_at_scales
@@ -47,7 +47,7 @@ class SeenDescent:
 
 def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -> tuple[list[SeenDescent], float]:
     """Detect craters in all frames; returns the descents and the detection time, seconds per frame."""
-    detector, threshold = open_detector(RunFolder(run).best, flight_config(run)), chosen_threshold(run)
+    detector, threshold = open_detector(RunFolder(run).best, flight_config(run)), raw_threshold(run)
     scenes = dataset.table("scenes", ["scene_id", "sun_elevation_deg"]).to_pylist()
     sun_elevation_deg = {row["scene_id"]: row["sun_elevation_deg"] for row in scenes}
     descents, seconds = [], 0.0

@@ -15,7 +15,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.matching import Detections, find_overlaps
-from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.finished_run import config_of_run, threshold_of_table
 from perilune_train.records.pictures import save_figure
 from perilune_train.records.spread import Interval, Resamples, draw_resamples, spreads
 
@@ -54,7 +54,7 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
         unusable = table[name][~np.isfinite(table[name])]
         if len(unusable):
             raise UserError(path, name, unusable.iloc[0], "finite numbers")
-    table = table[table["score"] >= chosen_threshold(trained)]
+    table = table[table["score"] >= threshold_of_table(run)]
     of_frame = {str(name): rows for name, rows in table.groupby("frame_id")}
     names = split.frames.table["frame_id"].tolist()
     unknown = set(of_frame) - set(names)
