@@ -55,9 +55,7 @@ class Unstamped:
         boulders = draw_boulders(config.terrain.boulders, scene.grid, scene.craters, scene.seed, removed)
         z_m = boulders.centre_height_m(value_at(new_m, scene.grid, boulders.x_m, boulders.y_m))
         light = np.clip(self._albedo + albedo, 0.5, 2.2).astype(np.float32)
-        return replace(
-            scene, height_m=new_m.astype(np.float32), albedo=light, boulders=boulders, boulder_z_m=z_m
-        )
+        return replace(scene, height_m=new_m.astype(np.float32), albedo=light, boulders=boulders, boulder_z_m=z_m)
 
     def _rays_without(self, rows: np.ndarray | None) -> Array:
         """Brightening by the rays of all drawn craters but those at `rows` (n_vertices,)."""

@@ -93,11 +93,12 @@ class HeightfieldEngine:
     def render_again(
         self, before: Radiance, wanted: np.ndarray, position_m: Array, rotation_camera_from_site: Array, seed: int = 0
     ) -> Radiance:
-        """A copy of a rendering with new pixels where `wanted` (h, w) is true, and in some pixels around them.
+        """The radiance factors and depths of a rendering, with new pixels where `wanted` (h, w) is true.
 
-        The new pixels equal the pixels of `render` with the same pose and seed.
+        Some pixels around them are new too. The new pixels equal the pixels of `render` with the same pose and seed.
         """
-        image = Radiance(*(getattr(before, name).copy() for name in ("radiance_factor", "depth_m", "normal", "sunlit")))
+        image = Radiance.empty(before.radiance_factor.shape)
+        image.radiance_factor[:], image.depth_m[:] = before.radiance_factor, before.depth_m
         pose, size = (position_m, rotation_camera_from_site), _SMALL_TILE_PX
         places = np.unique(np.argwhere(wanted) // size, axis=0) * size
         tiles = [(slice(row, row + size), slice(column, column + size)) for row, column in places.tolist()]

@@ -55,7 +55,7 @@ class CraterChanges:
         brightness: Array,
         profile: str,
     ):
-        """Stamp `craters` on the heights and the albedo in `soil` (n_vertices,), both in place, as `stamp_craters` does.
+        """Stamp `craters` on heights and albedo, the pair `soil` of arrays (n_vertices,), in place.
 
         `recorded` are the indices of the craters that may be omitted later, `brightness` (N,) is the relative
         brightening within each rim.
@@ -91,7 +91,7 @@ class CraterChanges:
         return difference.height, difference.albedo
 
     def _near(self, omitted: np.ndarray) -> np.ndarray:
-        """Indices, ascending, of the craters that may change the ground of omitted craters after these, and of these."""
+        """Indices, ascending, of the omitted craters and of younger craters that may change their ground."""
         x, y, reach = self._craters.x_m, self._craters.y_m, _MARGIN * REACH * self._shapes.radius
         touched = np.zeros(len(x), bool)
         for k in omitted.tolist():
@@ -166,7 +166,9 @@ def _subtract(difference, shapes, tables, changes, is_omitted, chosen):
         bounds = x - reach, x + reach, y - reach, y + reach
         window = Window(lines, lines_in(bounds, difference.n_half, difference.half_widths, lines))
         fits, plane = _fit_plane(difference.height, x, y, shapes.radius[k], window)
-        if fits and (plane.level != 0 or plane.slope_x != 0 or plane.slope_y != 0 or _any(difference, x, y, reach, window)):
+        if fits and (
+            plane.level != 0 or plane.slope_x != 0 or plane.slope_y != 0 or _any(difference, x, y, reach, window)
+        ):
             _stamp_one(difference, shapes, k, profile, plane, window)
 
 
