@@ -129,16 +129,15 @@ class _SceneWork:
             of_camera = rows[rows["frame_id"].map(self._camera_of) == camera] if camera else rows
             frames = list(of_camera.groupby("frame_id"))
             items = [(self._frames[str(name)], _ellipses(part), part.index.to_numpy()) for name, part in frames]
-            for (name, _), (frame, _, _), removals in zip(frames, items, renderer.without(without, items), strict=True):
-                for removal in removals:
-                    label = rows.loc[removal.label]
+            for (name, part), (frame, _, _), removals in zip(
+                frames, items, renderer.without(without, items), strict=True
+            ):
+                labels = part[["crater_id", "ellipse_cx_px", "ellipse_cy_px", "radius_px"]].itertuples(index=False)
+                for removal, (crater_id, x, y, radius) in zip(removals, labels, strict=True):
                     signal = np.zeros_like(frame.mean)
                     signal[removal.rows, removal.columns] = removal.signal(frame.mean)
-                    centre = float(label["ellipse_cx_px"]), float(label["ellipse_cy_px"])
-                    seen = observe(
-                        signal, removal.background(frame.mean), frame.noise, centre, float(label["radius_px"])
-                    )
-                    found.append((name, int(label["crater_id"]), *astuple(seen)))
+                    seen = observe(signal, removal.background(frame.mean), frame.noise, (x, y), radius)
+                    found.append((name, crater_id, *astuple(seen)))
         columns = list(zip(*found, strict=True)) if found else [()] * len(SCHEMA)
         return pa.table([pa.array(c, kind) for c, kind in zip(columns, SCHEMA.types, strict=True)], schema=SCHEMA)
 

@@ -81,13 +81,12 @@ class RemovalRenderer:
     def __init__(self, scene: Scene, config: DatasetConfig, cameras: tuple[Camera, Camera], sun: Array):
         """`cameras` are the camera of the frames and the camera of the engine; `sun` (3,) is in O_L."""
         self._config, self._cameras, self._sun = heightfield_settings(config), cameras, sun
-        self._scene = scene
-        self._source = self._source_over(scene)
+        self._source, _ = self._source_over(scene)
 
-    def _source_over(self, scene: Scene) -> FrameSource:
+    def _source_over(self, scene: Scene) -> tuple[FrameSource, HeightfieldEngine]:
         camera, engine_camera = self._cameras
         engine = HeightfieldEngine(scene, self._config, engine_camera, self._sun)
-        return FrameSource.of(engine, self._config, camera, RimCircles.of_scene(scene))
+        return FrameSource.of(engine, self._config, camera, RimCircles.of_scene(scene)), engine
 
     def frame(self, shot: Shot) -> ExpectedFrame:
         """The expected image of a shot with all craters."""
@@ -103,18 +102,22 @@ class RemovalRenderer:
 
         A frame comes with the ellipses of its labels in pixels of the image and the indices of these labels.
         """
-        source = self._source_over(scene)
+        source, engine = self._source_over(scene)
         for frame, ellipses, labels in frames:
             shape = frame.mean.shape
             windows = [_window(ellipses, k, shape) for k in range(len(labels))]
-            mean = self._expected_again(source, frame, windows)
+            mean = self._expected_again(source, engine, frame, windows)
             yield [
                 Removal(int(label), rows, columns, inside, mean[rows, columns].copy())
                 for label, (rows, columns, inside) in zip(labels, windows, strict=True)
             ]
 
     def _expected_again(
-        self, source: FrameSource, frame: ExpectedFrame, windows: list[tuple[slice, slice, np.ndarray]]
+        self,
+        source: FrameSource,
+        engine: HeightfieldEngine,
+        frame: ExpectedFrame,
+        windows: list[tuple[slice, slice, np.ndarray]],
     ) -> np.ndarray:
         """The expected image over the ground of `source`, with the exposure time of the frame with all craters."""
         shot, sensor = frame.shot, self._config.sensor
@@ -126,7 +129,7 @@ class RemovalRenderer:
             for rows, columns, _ in windows:
                 first_row, first_column = max(rows.start - margin, 0), max(columns.start - margin, 0)
                 wanted[first_row : rows.stop + margin, first_column : columns.stop + margin] = True
-            radiance = source.engine.render_again(frame.radiance, wanted, *shot.pose, shot.render_seed)
+            radiance = engine.render_again(frame.radiance, wanted, *shot.pose, shot.render_seed)
         else:
             radiance = source.render(shot)
         fixed = sensor.model_copy(update={"exposure": "fixed", "exposure_time_s": frame.exposure_time_s})
@@ -136,7 +139,7 @@ class RemovalRenderer:
         return expected(exposure, fixed)[0]
 
 
-def _window(ellipses: Ellipses, k: int, shape: tuple[int, int]) -> tuple[slice, slice, np.ndarray]:
+def _window(ellipses: Ellipses, k: int, shape: tuple[int, ...]) -> tuple[slice, slice, np.ndarray]:
     """Rows and columns of the window of an ellipse, and which of its pixels are within SIGNAL_RADII."""
     height, width = shape
     cx, cy, theta = ellipses.cx_px[k], ellipses.cy_px[k], ellipses.theta_rad[k]

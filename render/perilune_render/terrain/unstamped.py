@@ -20,7 +20,7 @@ from perilune_shared.geometry.frames import Array
 class Unstamped:
     """Generates one scene several times, each time without some of its craters."""
 
-    def __init__(self, scene: Scene, config: DatasetConfig, view: ViewEnvelope, crater_ids: Sequence[int]):
+    def __init__(self, scene: Scene, config: DatasetConfig, view: ViewEnvelope, crater_ids: Sequence[int] | np.ndarray):
         """`crater_ids` are the craters of `scene` that may be removed; `scene` has no removed craters.
 
         Raises UserError if an id does not belong to a generated crater of the scene.
@@ -38,7 +38,7 @@ class Unstamped:
         self._changes = CraterChanges(grounds, scene.grid, self._drawn, self._index, brightening, law.profile)
         self._albedo = soil.albedo
 
-    def without(self, crater_ids: Sequence[int]) -> Scene:
+    def without(self, crater_ids: Sequence[int] | np.ndarray) -> Scene:
         """The scene without some of its craters, with their rays and boulders removed.
 
         Heights equal the heights of `grow_scene` without these craters, except for rounding to float32. The tables of
