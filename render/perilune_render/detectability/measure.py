@@ -126,18 +126,15 @@ class _SceneWork:
         without = self._unstamped.without(batch)
         found: list[tuple] = []
         for camera, renderer in self._renderers.items():
-            of_camera = rows[rows["frame_id"].map(self._camera_of) == camera] if camera else rows
-            frames = list(of_camera.groupby("frame_id"))
-            items = [(self._frames[str(name)], _ellipses(part), part.index.to_numpy()) for name, part in frames]
-            for (name, part), (frame, _, _), removals in zip(
-                frames, items, renderer.without(without, items), strict=True
-            ):
-                labels = part[["crater_id", "ellipse_cx_px", "ellipse_cy_px", "radius_px"]].itertuples(index=False)
-                for removal, (crater_id, x, y, radius) in zip(removals, labels, strict=True):
-                    signal = np.zeros_like(frame.mean)
-                    signal[removal.rows, removal.columns] = removal.signal(frame.mean)
-                    seen = observe(signal, removal.background(frame.mean), frame.noise, (x, y), radius)
-                    found.append((name, crater_id, *astuple(seen)))
+            of_camera = rows[rows["frame_id"].map(self._camera_of).isin([camera])]
+            parts = [(str(name), part) for name, part in of_camera.groupby("frame_id")]
+            items = [(self._frames[name], part["crater_id"].to_numpy(), _ellipses(part)) for name, part in parts]
+            for (name, _), (frame, _, _), removals in zip(parts, items, renderer.without(without, items), strict=True):
+                for each in removals:
+                    noise = frame.noise[each.rows, each.columns]
+                    signal, background = each.signal(frame.mean), each.background(frame.mean)
+                    seen = observe(signal, background, noise, each.centre_px, each.axes_px)
+                    found.append((name, each.crater_id, *astuple(seen)))
         columns = list(zip(*found, strict=True)) if found else [()] * len(SCHEMA)
         return pa.table([pa.array(c, kind) for c, kind in zip(columns, SCHEMA.types, strict=True)], schema=SCHEMA)
 

@@ -1,25 +1,29 @@
-"""Detectability d' of a known signal in sensor noise and in the local clutter of its frame.
+"""Detectability d' of a crater in sensor noise and in the clutter of the ground at its place.
 
-The prewhitening observer knows the signal s and the power spectrum of what hides it. Its d' is
+The observer knows where the crater is, how large it is and where the Sun stands, but not its exact image. It has one
+channel: the shading t of a bowl that is lit from one side, -s exp(-(r / 0.8)^4) within REACH radii, with r the distance
+from the centre and s the offset towards the Sun, both in radii. The part of t that a plane explains is removed. The
+response to an image g is t . g. With the change of the expected image by the crater as the signal,
 
-    d'^2 = sum over frequencies f of |S(f)|^2 / (C(f) + N),
+    d' = (t . signal) / (|t| sigma) sqrt(min(1, MAX_PIXELS / n)),    sigma^2 = clutter^2 + noise^2.
 
-with S the unitary Fourier transform of s, C the power spectrum of the clutter and N the variance of the sensor noise,
-which is white. C is the power of the frame itself around the crater, but without the crater: a tapered window of
-CLUTTER_RADII radii, minus a fitted plane, averaged over all directions. Clutter of other ground and other light
-therefore has no effect. Without clutter, d' is the norm of s divided by the standard deviation of the noise.
+`noise` is the standard deviation of the sensor noise. `clutter` is the standard deviation of the expected image without
+the crater within the same n pixels, after a plane is subtracted: the relief, boulders and other craters at this place,
+under this Sun. Neighbouring pixels of clutter are alike, so at most MAX_PIXELS pixels count as independent.
+
+This observer was chosen among others because its d' predicts best what a detector finds (docs/explanation/labels.md).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from perilune_render.labels.pixels import REACH
 from perilune_shared.geometry.frames import Array
 
-CLUTTER_RADII = 2.0
-"""Half-width of the window in which clutter is measured, in radii of the crater."""
-MIN_HALF_PX = 6.0
-"""Smallest half-width of this window, pixels."""
+MAX_PIXELS = 250.0
+"""Largest number of pixels that count as independent; the same as in the selection `visible`."""
+_N_PLANE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,70 +31,59 @@ class Observation:
     """Detectability of one crater in one frame, and its parts."""
 
     d_prime: float
-    """Distance of the means of the observer's response with and without the crater, in standard deviations."""
+    """Distance between the observer's mean responses with and without the crater, in standard deviations of the
+    response. Negative if the crater looks like a bump, 0 if too few pixels are in the image."""
     signal_energy: float
     """Sum of the squared change of the expected image by the crater, DN^2."""
     clutter_sigma: float
-    """Standard deviation of the clutter around the crater, DN."""
+    """Standard deviation of the expected image without the crater, at its place, DN."""
     noise_sigma: float
-    """Standard deviation of the sensor noise around the crater, DN."""
+    """Standard deviation of the sensor noise at the crater, DN."""
 
 
 def observe(
-    signal: np.ndarray, background: np.ndarray, noise: np.ndarray, centre_px: tuple[float, float], radius_px: float
+    signal: np.ndarray, background: np.ndarray, noise: np.ndarray, centre_px: tuple[float, float], axes_px: Array
 ) -> Observation:
-    """The detectability of a crater with a known signal.
+    """The detectability of a crater.
 
-    `signal` (H, W) is the change of the expected image by the crater, `background` (H, W) the expected image without
-    it, `noise` (H, W) the standard deviation of the sensor noise; all in DN. `centre_px` are x and y of the crater's
-    centre, `radius_px` is its radius. The part of the signal outside the window of the clutter is ignored.
+    `signal` (h, w) is the change of the expected image by the crater, `background` (h, w) the expected image without
+    it, `noise` (h, w) the standard deviation of the sensor noise, all in DN. `centre_px` are x and y of the crater's
+    centre in these arrays. `axes_px` (2, 2) maps offsets in the plane of the rim, in radii along and across the
+    direction of the Sun, to offsets in pixels (x, y).
     """
-    window = _window(signal.shape, centre_px, max(CLUTTER_RADII * radius_px, MIN_HALF_PX))
-    s = signal[window].astype(np.float64)
-    clutter = clutter_power(background[window].astype(np.float64))
-    variance = float(np.square(noise[window], dtype=np.float64).mean())
-    power = np.square(np.abs(np.fft.fft2(s))) / s.size
-    return Observation(
-        float(np.sqrt((power / (clutter + variance)).sum())),
-        float(np.square(signal, dtype=np.float64).sum()),
-        float(np.sqrt(clutter.mean())),
-        float(np.sqrt(variance)),
-    )
+    energy = float(np.square(signal, dtype=np.float64).sum())
+    along, across, rows, columns = _offsets(signal.shape, centre_px, axes_px)
+    square = along**2 + across**2
+    inside = square <= REACH**2
+    n = int(inside.sum())
+    if n <= _N_PLANE + 1:
+        return Observation(0.0, energy, 0.0, 0.0)
+    s, t, square = along[inside], across[inside], square[inside]
+    pixels = [image[rows, columns][inside].astype(np.float64) for image in (signal, background, noise)]
+    plane, _ = np.linalg.qr(np.stack([np.ones(n), s, t], axis=1))
+    shading = -s * np.exp(-np.square(square / 0.64))
+    shading, rest = (values - plane @ (plane.T @ values) for values in (shading, pixels[1]))
+    length = np.sqrt(shading @ shading)
+    clutter = rest @ rest / (n - _N_PLANE)
+    variance = np.square(pixels[2]).mean()
+    response = shading @ pixels[0] / length if length > 1e-9 else 0.0
+    d_prime = response * np.sqrt(min(1.0, MAX_PIXELS / n) / (clutter + variance))
+    return Observation(float(d_prime), energy, float(np.sqrt(clutter)), float(np.sqrt(variance)))
 
 
-def _window(shape: tuple[int, ...], centre_px: tuple[float, float], half_px: float) -> tuple[slice, slice]:
-    """Rows and columns of a square window, moved inwards or cut off at the edge of the image."""
-    slices = []
-    for centre, size in zip(reversed(centre_px), shape, strict=True):
-        start, stop = int(np.floor(centre - half_px)), int(np.ceil(centre + half_px))
-        least = min(int(2 * MIN_HALF_PX), size)
-        start = min(max(start, 0), size - least)
-        slices.append(slice(start, max(min(stop, size), start + least)))
-    return slices[0], slices[1]
+def _offsets(
+    shape: tuple[int, ...], centre_px: tuple[float, float], axes_px: Array
+) -> tuple[Array, Array, slice, slice]:
+    """Offsets of pixels from the centre along and across the Sun, in radii, and the rows and columns of the pixels.
 
-
-def clutter_power(patch: Array) -> Array:
-    """Power spectrum (h, w) of a patch of background (h, w), DN^2, in the order of `numpy.fft.fft2`.
-
-    A plane is subtracted and the patch is tapered by a Hann window. The power is averaged over all directions, in rings
-    that are a frequency step of the window's shorter side wide. The mean over all frequencies is the variance.
+    The pixels are those of the box around the disc of REACH radii.
     """
-    height, width = patch.shape
-    taper = np.outer(_hann(height), _hann(width))
-    y, x = np.mgrid[0:height, 0:width]
-    terms = np.stack([np.ones(patch.size), y.ravel() - y.mean(), x.ravel() - x.mean()], axis=1)
-    weight = taper.ravel()[:, None]
-    fitted = np.linalg.lstsq(terms * weight, patch.ravel() * weight[:, 0], rcond=None)[0]
-    rest = (patch.ravel() - terms @ fitted).reshape(patch.shape) * taper
-    power = np.square(np.abs(np.fft.fft2(rest))) / np.square(taper).sum()
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None])
-    n_rings = min(height, width) // 2
-    ring = np.minimum((frequency * 2 * n_rings).astype(int), n_rings)
-    mean = np.bincount(ring.ravel(), power.ravel()) / np.maximum(np.bincount(ring.ravel()), 1)
-    # The plane has removed the power at frequency 0.
-    mean[0] = max(mean[0], mean[1])
-    return mean[ring]
-
-
-def _hann(n: int) -> Array:
-    return np.hanning(n + 2)[1:-1]
+    half = REACH * np.hypot(axes_px[:, 0], axes_px[:, 1])
+    limits = []
+    for centre, reach, size in zip(centre_px, half, reversed(shape), strict=True):
+        start = min(max(int(np.floor(centre - reach)), 0), size)
+        limits.append(slice(start, max(min(int(np.ceil(centre + reach)), size), start)))
+    columns, rows = limits
+    y, x = np.mgrid[rows, columns] + 0.5
+    along, across = np.linalg.solve(axes_px, np.stack([(x - centre_px[0]).ravel(), (y - centre_px[1]).ravel()]))
+    return along.reshape(x.shape), across.reshape(x.shape), rows, columns

@@ -33,7 +33,7 @@ class ExpectedFrame:
     shot: Shot
     """Pose, velocity and random seed."""
     radiance: Radiance
-    """Rendering by the engine's camera."""
+    """Rendering by the engine's camera: radiance factors and depths."""
     exposure_time_s: float
     """Exposure time, seconds."""
     mean: np.ndarray
@@ -46,8 +46,12 @@ class ExpectedFrame:
 class Removal:
     """A crater in a frame, and the expected image around it without this crater."""
 
-    label: int
-    """Index of the label in its frame."""
+    crater_id: int
+    """Id of the crater in its scene."""
+    centre_px: tuple[float, float]
+    """x and y of the centre of the crater's ellipse in the window, pixels."""
+    axes_px: Array
+    """Map from offsets in the rim's plane to pixels (2, 2), as in `frame_labels.shading_axes`."""
     rows: slice
     """Rows of the window in the image."""
     columns: slice
@@ -58,10 +62,8 @@ class Removal:
     """Expected grey values of the window without the crater, DN (h, w) float32."""
 
     def background(self, mean: np.ndarray) -> np.ndarray:
-        """The expected image of the whole frame without the crater (H, W), from the expected image with it."""
-        image = mean.copy()
-        image[self.rows, self.columns][self.inside] = self.without[self.inside]
-        return image
+        """Expected image of the window without the crater (h, w), DN, from the frame's expected image with it."""
+        return np.where(self.inside, self.without, mean[self.rows, self.columns])
 
     def signal(self, mean: np.ndarray) -> np.ndarray:
         """Change of the expected image by the crater (h, w) in the window, DN; 0 outside `inside`."""
@@ -93,23 +95,33 @@ class RemovalRenderer:
         radiance = self._source.render(shot)
         exposure = self._source.develop(shot, radiance).exposure
         mean, noise = expected(exposure, self._config.sensor)
+        # Only the radiance and the depth are needed again, and a scene may have many frames.
+        radiance = replace(radiance, normal=np.empty((0, 0, 3)), sunlit=np.empty((0, 0), bool), blurred=None)
         return ExpectedFrame(shot, radiance, exposure.time_s, mean, noise)
 
     def without(
-        self, scene: Scene, frames: list[tuple[ExpectedFrame, Ellipses, np.ndarray]]
+        self, scene: Scene, frames: list[tuple[ExpectedFrame, np.ndarray, Ellipses]]
     ) -> Iterator[list[Removal]]:
-        """For each of `frames`, the removals of its labels over a scene without their craters.
+        """For each of `frames`, the removals of some craters over a scene that lacks them.
 
-        A frame comes with the ellipses of its labels in pixels of the image and the indices of these labels.
+        A frame comes with the ids of these craters (N,) and with their ellipses in the image.
         """
         source, engine = self._source_over(scene)
-        for frame, ellipses, labels in frames:
-            shape = frame.mean.shape
-            windows = [_window(ellipses, k, shape) for k in range(len(labels))]
+        for frame, crater_id, ellipses in frames:
+            windows = [_window(ellipses, k, frame.mean.shape) for k in range(len(crater_id))]
             mean = self._expected_again(source, engine, frame, windows)
+            axes = self._source.shading_axes(frame.shot, crater_id)
             yield [
-                Removal(int(label), rows, columns, inside, mean[rows, columns].copy())
-                for label, (rows, columns, inside) in zip(labels, windows, strict=True)
+                Removal(
+                    int(crater_id[k]),
+                    (float(ellipses.cx_px[k] - columns.start), float(ellipses.cy_px[k] - rows.start)),
+                    axes[k],
+                    rows,
+                    columns,
+                    inside,
+                    mean[rows, columns].copy(),
+                )
+                for k, (rows, columns, inside) in enumerate(windows)
             ]
 
     def _expected_again(

@@ -29,7 +29,7 @@ from perilune_train.records.markdown import number, table, write_markdown
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-D_PRIME_BINS = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, float("inf"))
+D_PRIME_BINS = (float("-inf"), 1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, float("inf"))
 BOUNDS = (1.0, 2.0, 3.0, 4.0, 6.0)
 """Smallest d' of the selected labels of each AP."""
 DETECTABILITY_FILE = "detectability.md"
@@ -74,6 +74,8 @@ class Group:
         """The limits as text."""
         if self.by == "all":
             return "all"
+        if not np.isfinite(self.low):
+            return f"below {self.high:g}"
         return f"{self.low:g} to {self.high:g}" if np.isfinite(self.high) else f"above {self.low:g}"
 
 
@@ -180,11 +182,11 @@ class ByDetectability:
 def read_d_prime(path: Path, split: DetectSplit) -> Array:
     """The d' of the labels of a split, frame after frame (L,); NaN where the table has no row.
 
-    Raises UserError if the table is damaged, has a negative d' or a key twice, or has no label of the split.
+    Raises UserError if the table is damaged, has a key twice, or has no label of the split.
     """
     kinds = {"frame_id": "text", "crater_id": "integer", "d_prime": "number"}
     columns = read_table(path, DETECTABILITIES, kinds)  # type: ignore[arg-type]
-    values = columns.finite("d_prime", 0.0, 1e12)
+    values = columns.finite("d_prime", -1e12, 1e12)
     keys = list(zip(columns.texts("frame_id").to_list(), columns.integers("crater_id").tolist(), strict=True))
     known = dict(zip(keys, values.tolist(), strict=True))
     if len(known) < len(keys):
