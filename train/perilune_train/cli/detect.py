@@ -94,7 +94,7 @@ def train(
     run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)
 
 
-_FOR_DATASETS = ("dataset", "allow_overlap")
+_FOR_DATASETS = ("dataset", "allow_overlap", "detectability")
 _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin", "category", "image_folder", "nodata")
 
 
