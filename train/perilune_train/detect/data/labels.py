@@ -37,7 +37,7 @@ class FrameLabels:
     ellipses: Array
     """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
     selected: NDArray[np.bool_]
-    """False for a crater to ignore: hardly visible, or not labelled (M,)."""
+    """False for a crater to ignore: not selected, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
     """False for a crater without a label: its radius is slightly out of range, or its centre is off the image (M,)."""
     depth_ratio: Array | None = None
