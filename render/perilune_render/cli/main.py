@@ -10,6 +10,7 @@ import perilune_render
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
 from perilune_render.cli.dataset import dataset
+from perilune_render.cli.detectability import detectability
 from perilune_render.cli.frames import CameraAxes, frames, with_camera
 from perilune_render.cli.options import (
     Catalogue,
@@ -65,6 +66,7 @@ app.command()(serve)
 app.command()(status)
 app.command()(survey)
 app.command()(counterfactual)
+app.command()(detectability)
 
 
 @app.command()

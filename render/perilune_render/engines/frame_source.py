@@ -18,7 +18,15 @@ from perilune_render.flight.sub_poses import Pose, RowPoses, moved, row_times_s,
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import seen_by
 from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out, time_of_exposure_s
-from perilune_render.labels.frame_labels import GreyAndSun, Labels, RimCircles, crater_index, label_frame, with_contrast
+from perilune_render.labels.frame_labels import (
+    GreyAndSun,
+    Labels,
+    RimCircles,
+    crater_index,
+    label_frame,
+    shading_axes,
+    with_contrast,
+)
 from perilune_render.streams import camera_seed, derived_seed, stream
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
@@ -210,6 +218,10 @@ class FrameSource:
         """The labels with their contrast, computed from the frame's exposure."""
         grey = GreyAndSun(*expected(frame.exposure, self.sensor), self.engine.sun)
         return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, grey)
+
+    def shading_axes(self, shot: Shot, crater_id: np.ndarray) -> Array:
+        """The map from the rim planes of craters (N,) to pixels (N, 2, 2) (`labels.frame_labels.shading_axes`)."""
+        return shading_axes(crater_id, self._seen_circles(shot), self.camera, *shot.pose, self.engine.sun)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
         """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32; -1 without a crater."""

@@ -173,6 +173,17 @@ def with_contrast(
     return replace(labels, contrast=contrasts(centre, matrices, image.grey, image.noise))
 
 
+def shading_axes(
+    crater_id: np.ndarray, circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array
+) -> Array:
+    """Matrices (N, 2, 2) that map offsets in the rim planes of craters to pixels, as `with_contrast` uses them.
+
+    The offsets are in radii, along and across the direction of the Sun.
+    """
+    rows = np.searchsorted(circles.crater_id, crater_id)
+    return _image_from_rim(circles, camera, position_m, rotation, sun, rows)
+
+
 def _image_from_rim(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
 ) -> Array:

@@ -18,7 +18,7 @@ import numpy as np
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.config.terrain import TerrainConfig
 from perilune_render.terrain.albedo import RayLaw, add_patches, add_rays, brightness
-from perilune_render.terrain.base import base_of
+from perilune_render.terrain.base import Base, base_of
 from perilune_render.terrain.boulders import Boulders, check_boulders, draw_boulders
 from perilune_render.terrain.craters.population import Craters, check_craters, draw_craters
 from perilune_render.terrain.craters.removal import indices_of, near
@@ -88,7 +88,7 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class _Soil:
+class Soil:
     """The values at the vertices that craters change in place."""
 
     height_m: Array
@@ -96,8 +96,22 @@ class _Soil:
     albedo: Array
     """Factor on the reflectance (n_vertices,)."""
 
-    def copy(self) -> "_Soil":
-        return _Soil(self.height_m.copy(), self.albedo.copy())
+    def copy(self) -> "Soil":
+        return Soil(self.height_m.copy(), self.albedo.copy())
+
+
+@dataclass(frozen=True, slots=True)
+class UncrateredGround:
+    """The ground of a scene before its craters are stamped."""
+
+    grid: Grid
+    """Positions of the vertices."""
+    base: Base
+    """Base with long waves; its heights are the same array as the heights of `soil`."""
+    soil: Soil
+    """Heights and albedo without craters."""
+    drawn: Craters
+    """The craters to stamp, oldest first."""
 
 
 def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
@@ -109,16 +123,9 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     remove does not exist.
     """
     terrain = config.terrain
-    grid = checked_grid(terrain, view)
-    model = model_of(terrain, grid.extent_m)
-    # 1. Base and long waves.
-    base = base_of(model, grid, terrain, seed)
-    soil = _Soil(base.height_m, np.ones(grid.n_vertices))
-    base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
-    # 2. Craters and rays; drop the craters that younger craters have erased.
-    drawn = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
-    if config.light.albedo_variation > 0:
-        add_patches(soil.albedo, grid, config.light.albedo_variation, seed)
+    ground = uncratered_ground(config, view, seed)
+    grid, base, soil, drawn = ground.grid, ground.base, ground.soil, ground.drawn
+    model = base.model
     wanted = config.removed_from(seed)
     uncratered = soil.copy() if wanted else soil
     stamped = _stamp(config, soil, grid, drawn, seed)
@@ -167,8 +174,27 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     )
 
 
+def uncratered_ground(config: DatasetConfig, view: ViewEnvelope, seed: int) -> UncrateredGround:
+    """The ground of a scene before its craters are stamped, and these craters.
+
+    Raises UserError if frames of `view` need too many vertices.
+    """
+    terrain = config.terrain
+    grid = checked_grid(terrain, view)
+    model = model_of(terrain, grid.extent_m)
+    # 1. Base and long waves.
+    base = base_of(model, grid, terrain, seed)
+    soil = Soil(base.height_m, np.ones(grid.n_vertices))
+    base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
+    # 2. Craters; `grow_scene` drops the craters that younger craters have erased.
+    drawn = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
+    if config.light.albedo_variation > 0:
+        add_patches(soil.albedo, grid, config.light.albedo_variation, seed)
+    return UncrateredGround(grid, base, soil, drawn)
+
+
 def _stamp(
-    config: DatasetConfig, soil: _Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
+    config: DatasetConfig, soil: Soil, grid: Grid, craters: Craters, seed: int, removed: np.ndarray | None = None
 ) -> Stamped:
     """Add rays and stamp craters except the `removed` ones (indices), in place.
 

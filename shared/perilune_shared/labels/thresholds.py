@@ -1,4 +1,4 @@
-"""Named sets of label thresholds: from all craters in the frame to those visible in the image.
+"""Named sets of label thresholds: from all craters in the frame to those above a threshold of contrast.
 
 This module does not import pandas and pyarrow, so that configurations and `--help` load quickly.
 `perilune_shared.labels.selection` applies the thresholds.
@@ -47,7 +47,8 @@ SELECTIONS: dict[str, Selection] = {
     ),
 }
 """`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (every label's centre is).
-`visible`: craters that can be seen in the frame, for training and evaluation (docs/explanation/labels.md)."""
+`visible`: craters above the contrast at which a detector found about half of them, for training and evaluation. It is
+no statement about human observers (docs/explanation/labels.md)."""
 
 
 REACH_RADII = 1.5

@@ -94,7 +94,7 @@ def train(
     run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)
 
 
-_FOR_DATASETS = ("dataset", "allow_overlap")
+_FOR_DATASETS = ("dataset", "allow_overlap", "detectability")
 _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin", "category", "image_folder", "nodata")
 
 
@@ -137,6 +137,12 @@ def evaluate(
         ),
     ] = None,
     allow_overlap: AllowOverlap = False,
+    detectability: Annotated[
+        Path | None,
+        typer.Option(
+            help="Table of `perilune-render detectability` over the split: recall and AP by d', and an ideal observer."
+        ),
+    ] = None,
     images: Annotated[
         Path | None,
         typer.Option(
@@ -221,7 +227,7 @@ def evaluate(
     score: float | Literal["run", "validation"] = (
         "validation" if choose_threshold else "run" if threshold is None else threshold
     )
-    folder = evaluate_again(run, config, EvaluatedSplit(address, split, allow_overlap), score, out)
+    folder = evaluate_again(run, config, EvaluatedSplit(address, split, allow_overlap), score, out, detectability)
     say(f"{folder}: metrics.json, report.md, detections.parquet, *.png")
 
 

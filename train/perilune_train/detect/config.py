@@ -24,7 +24,8 @@ class LabelSettings(Selection):
     """
 
     selection: str = "visible"
-    """Name of a selection: all, paper (radius 2 to 50 px, centre in the frame) or visible (recognisable in a frame)."""
+    """Name of a selection: all, paper (radius 2 to 50 px, centre in the frame) or visible (above a threshold of
+    contrast)."""
 
     @model_validator(mode="before")
     @classmethod

@@ -11,6 +11,12 @@ from perilune_shared.storage.tables.limits import RUN_TABLE
 from perilune_shared.storage.tables.read import read_table
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.detectability import (
+    DETECTABILITY_FILE,
+    by_detectability,
+    read_d_prime,
+    write_by_detectability,
+)
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.metrics import Curve
 from perilune_train.detect.evaluate.pictures import draw_curves
@@ -62,11 +68,13 @@ def evaluate_again(
     evaluated: EvaluatedSplit,
     threshold: float | Literal["run", "validation"] = "run",
     out: Path | None = None,
+    detectability: Path | None = None,
 ) -> Path:
     """Evaluate a run's best weights on a split of a dataset; returns the folder of the output.
 
     `threshold` is a score, "run" for the threshold that the run chose, or "validation" to choose a new threshold on the
     validation split of the dataset. Without `out`, the output folder is `evaluation` in the run's folder.
+    `detectability` is a table of `perilune-render detectability`, with which recall and AP by d' are computed too.
     """
     folder = out or run / "evaluation"
     check_output(folder, run)
@@ -89,6 +97,7 @@ def evaluate_again(
         protocol += f"; {split} frames, used to {'train' if split == 'train' else 'select'} the network"
     detector = open_run(run, config)
     frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
+    d_prime = None if detectability is None else read_d_prime(detectability, frames)
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(detector, val, "val")
@@ -105,7 +114,11 @@ def evaluate_again(
     )
     metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
     metrics[f"{split}/images_per_s"] = round(rate, 2)
-    mark_files(folder, WRITTEN, terrain_check.mark)
+    if d_prime is not None:
+        by_d_prime = by_detectability(frames, detections, d_prime, chosen, config.evaluation.match_iou)
+        write_by_detectability(folder, by_d_prime, about)
+        metrics |= {f"{split}/{key}": value for key, value in by_d_prime.figures().items()}
+    mark_files(folder, WRITTEN if d_prime is None else (*WRITTEN, DETECTABILITY_FILE), terrain_check.mark)
     write_metrics(folder, metrics | terrain_check.metrics())
     return folder
 

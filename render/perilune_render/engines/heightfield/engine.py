@@ -28,6 +28,8 @@ _TILE_PX = 64
 """Width of the tiles in which an image is rendered, pixels."""
 _RAYS_AT_ONCE = 8192
 """Largest number of rays in a tile of several rows. The photometry of this many rays fits into the cache of a core."""
+_SMALL_TILE_PX = 16
+"""Width and height of the tiles in which parts of an image are rendered again, pixels."""
 _LIT = 1e-4
 """Radiance factor above which a pixel counts as sunlit."""
 _RAYS_PER_VERTEX = 0.3
@@ -85,7 +87,22 @@ class HeightfieldEngine:
         shape = self.camera.height_px, self.camera.width_px
         image = Radiance.empty(shape)
         pose = position_m, rotation_camera_from_site
-        self._cast(image, slice(0, shape[0]), pose, self._drawn(seed), self._horizon_now())
+        self._cast(image, self._tiles(slice(0, shape[0])), pose, self._drawn(seed), self._horizon_now())
+        return image
+
+    def render_again(
+        self, before: Radiance, wanted: np.ndarray, position_m: Array, rotation_camera_from_site: Array, seed: int = 0
+    ) -> Radiance:
+        """The radiance factors and depths of a rendering, with new pixels where `wanted` (h, w) is true.
+
+        Some pixels around them are new too. The new pixels equal the pixels of `render` with the same pose and seed.
+        """
+        image = Radiance.empty(before.radiance_factor.shape)
+        image.radiance_factor[:], image.depth_m[:] = before.radiance_factor, before.depth_m
+        pose, size = (position_m, rotation_camera_from_site), _SMALL_TILE_PX
+        places = np.unique(np.argwhere(wanted) // size, axis=0) * size
+        tiles = [(slice(row, row + size), slice(column, column + size)) for row, column in places.tolist()]
+        self._cast(image, tiles, pose, self._drawn(seed), self._horizon_now(len(tiles) * size**2))
         return image
 
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
@@ -102,7 +119,7 @@ class HeightfieldEngine:
                 continue
             # A row of a sensor with distortion crosses several rows of the rendering.
             rows = slice(int(seen[0]), int(seen[-1]) + 1)
-            self._cast(band, rows, pose, drawn, horizon)
+            self._cast(band, self._tiles(rows), pose, drawn, horizon)
             whole.take_from(band, rows, pixels[rows])
         return whole
 
@@ -116,10 +133,24 @@ class HeightfieldEngine:
         moved[0] = 0.0
         return moved, rng.random(shape, np.float32)
 
+    def _tiles(self, rows: slice) -> list[tuple[slice, slice]]:
+        """The tiles, rows and columns, in which some rows of an image are rendered."""
+        tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
+        return [
+            (slice(row, min(row + tile_rows, rows.stop)), slice(column, column + _TILE_PX))
+            for row in range(rows.start, rows.stop, tile_rows)
+            for column in range(0, self.camera.width_px, _TILE_PX)
+        ]
+
     def _cast(
-        self, image: Radiance, rows: slice, pose: Pose, drawn: tuple[np.ndarray, np.ndarray], horizon: Horizon
+        self,
+        image: Radiance,
+        tiles: list[tuple[slice, slice]],
+        pose: Pose,
+        drawn: tuple[np.ndarray, np.ndarray],
+        horizon: Horizon,
     ) -> None:
-        """Render rows from one pose into `image`, tile by tile on all threads."""
+        """Render tiles from one pose into `image`, on all threads."""
         position_m, rotation_camera_from_site = pose
         moved, disc = drawn
         origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
@@ -127,30 +158,26 @@ class HeightfieldEngine:
         view = View(origin, basis, self._far_m, self.sun, plane, horizon)
         ground, rocks = self.surface.ground, self.surface.rocks
 
-        def cast(first: tuple[int, int]) -> None:
-            last_row = min(first[0] + tile_rows, rows.stop)
-            tile = slice(first[0], last_row), slice(first[1], first[1] + _TILE_PX)
+        def cast(tile: tuple[slice, slice]) -> None:
             moves, suns = moved[:, *tile], disc_places(disc[:, *tile], self._disc_rad)
             angles = np.empty((5, *moves.shape[:3]), np.float32)
+            first = tile[0].start, tile[1].start
             see(ground, rocks, self.tops, view, Tile(first, moves, suns, image.depth_m, image.normal, angles))
             seen = reflected(self._law, angles).mean(axis=0)
             image.radiance_factor[tile], image.sunlit[tile] = seen, seen > _LIT
 
-        tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
-        columns = range(0, self.camera.width_px, _TILE_PX)
-        firsts = [(row, column) for row in range(rows.start, rows.stop, tile_rows) for column in columns]
         if self._threads is not None:
-            list(self._threads.map(cast, firsts))
+            list(self._threads.map(cast, tiles))
             return
-        for each in firsts:
+        for each in tiles:
             cast(each)
 
-    def _horizon_now(self) -> Horizon:
-        """The horizon, or `NOWHERE` while computing it would not save time.
+    def _horizon_now(self, n_pixels: int | None = None) -> Horizon:
+        """The horizon, or `NOWHERE` while computing it would not save time; `n_pixels` None means a whole image.
 
         Frames do not depend on the horizon.
         """
-        self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
+        self._n_rays += self._samples * (n_pixels or self.camera.width_px * self.camera.height_px)
         if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
             self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))
         return self.horizon

@@ -113,6 +113,12 @@ def stamp_craters(
     A crater first replaces the ground below it by a fitted plane and then adds its profile. The more worn a crater is,
     the less of the older ground it replaces. `brightness` (N,) is the relative brightening within the rim.
     """
+    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m)
+    return Stamped(*_stamp(ground, *_shapes_and_tables(craters, brightness, profile)))
+
+
+def _shapes_and_tables(craters: Craters, brightness: Array, profile: str) -> tuple[_Shapes, _Tables]:
+    """Craters and profiles as arguments of the compiled functions; see `stamp_craters`."""
     tables = profile_tables(profile)
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     # The label marks the current crest, but the profile is scaled by the radius of the fresh crest.
@@ -130,9 +136,7 @@ def stamp_craters(
         craters.crest,
         brightness,
     )
-    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m)
-    bowls = np.stack([tables.bowl, tables.flat_bowl])
-    return Stamped(*_stamp(ground, shapes, _Tables(tables.rim, bowls, tables.removed)))
+    return shapes, _Tables(tables.rim, np.stack([tables.bowl, tables.flat_bowl]), tables.removed)
 
 
 @njit()

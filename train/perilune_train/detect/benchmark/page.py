@@ -10,7 +10,7 @@ from perilune_train.records.markdown import number, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
 _SELECTIONS = {
-    "visible": "`visible`: craters above a threshold of contrast in the frame",
+    "visible": "`visible`: craters above the contrast at which an earlier detector found about half",
     "paper": "`paper`: all craters with a radius of 2 to 50 px, however faint",
 }
 

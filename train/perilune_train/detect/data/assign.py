@@ -29,7 +29,7 @@ class BatchLabels:
     frame: Tensor
     """Index in the batch of each label's frame (T,)."""
     selected: Tensor
-    """False for a label to ignore, such as a hardly visible crater (T,)."""
+    """False for a label to ignore, such as a crater with little contrast (T,)."""
     correlations: Tensor | None = None
     """Correlation of the ellipse in each box (T,), see detect/evaluate/ellipses.py; None if only boxes are learned."""
 

@@ -38,7 +38,7 @@ class FrameLabels:
     ellipses: Array
     """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5)."""
     selected: NDArray[np.bool_]
-    """False for a crater to ignore: hardly visible, or not labelled (M,)."""
+    """False for a crater to ignore: not selected, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
     """False for a crater without a label: its radius is slightly out of range, or its centre is off the image (M,)."""
     depth_ratio: Array | None = None
@@ -46,6 +46,8 @@ class FrameLabels:
     crowd: NDArray[np.bool_] | None = None
     """Whether a label is a region of many craters (M,), as COCO's `iscrowd`. Such a label is never selected. None if
     there are no such labels."""
+    crater_id: NDArray[np.int64] | None = None
+    """Id of each crater in its scene (M,), -1 for a crater without a label; None if there are no ids."""
 
     @property
     def outlines(self) -> Array:
@@ -82,6 +84,8 @@ class SplitLabels(Sequence[FrameLabels]):
     """See FrameLabels (L,)."""
     bounds: NDArray[np.int64]
     """Start of each frame's labels (N + 1,): frame i has the labels bounds[i] to bounds[i + 1] - 1."""
+    crater_id: NDArray[np.int64]
+    """See FrameLabels (L,)."""
 
     def __len__(self) -> int:
         return len(self.bounds) - 1
@@ -97,7 +101,13 @@ class SplitLabels(Sequence[FrameLabels]):
         rows = slice(self.bounds[index], self.bounds[index + 1])
         shape = self.shape[rows]
         return FrameLabels(
-            shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[rows], self.labelled[rows], self.depth_ratio[rows]
+            shape[:, :4],
+            shape[:, 4],
+            shape[:, 5:],
+            self.selected[rows],
+            self.labelled[rows],
+            self.depth_ratio[rows],
+            crater_id=self.crater_id[rows],
         )
 
 
@@ -142,9 +152,7 @@ def read_split_labels(
                     part, row = slice(start, stop), table.iloc[frame_index].to_dict()
                     ids = scene_labels.crater_id[part]
                     ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, ids)
-                    frames.add(
-                        scene_labels.shape[part], scene_labels.selected[part], scene_labels.depth_ratio[part], ignored
-                    )
+                    frames.add(scene_labels.part(part), ignored)
     check.finish()
     return frames.joined(), np.concatenate(sizes)
 
@@ -169,7 +177,7 @@ def frame_labels(
     scene_labels = _SceneLabels.of(labels, craters, limits.selection)
     ignored = unlabelled_craters(craters, dataset.camera, row, limits.radius_px, limits.zoom, scene_labels.crater_id)
     frames = _Joined()
-    frames.add(scene_labels.shape, scene_labels.selected, scene_labels.depth_ratio, ignored)
+    frames.add(scene_labels, ignored)
     return frames.joined()[0]
 
 
@@ -197,6 +205,10 @@ class _SceneLabels:
         shape = np.column_stack([labels[name].to_numpy().astype(np.float64, copy=False) for name in _SHAPE])
         return cls(ids, shape, chosen, depth_m / diameter_m)
 
+    def part(self, rows: slice) -> "_SceneLabels":
+        """Some of the labels."""
+        return _SceneLabels(self.crater_id[rows], self.shape[rows], self.selected[rows], self.depth_ratio[rows])
+
 
 class _Joined:
     """Collects the labels and the ignored craters of frames, one frame at a time."""
@@ -206,16 +218,18 @@ class _Joined:
         self.selected: list[NDArray[np.bool_]] = []
         self.labelled: list[NDArray[np.bool_]] = []
         self.depth_ratio: list[Array] = []
+        self.crater_id: list[NDArray[np.int64]] = []
         self.counts: list[int] = []
 
-    def add(self, shape: Array, chosen: NDArray[np.bool_], depth_ratio: Array, ignored: Array) -> None:
-        """Add a frame with M labels and K ignored craters, whose shapes are (M, 10) and (K, 10)."""
+    def add(self, labels: _SceneLabels, ignored: Array) -> None:
+        """Add a frame with M labels and K ignored craters, whose shapes are (K, 10)."""
         nothing = np.zeros(len(ignored), np.bool_)
-        self.shape += [shape, ignored]
-        self.selected += [chosen, nothing]
-        self.labelled += [np.ones(len(shape), np.bool_), nothing]
-        self.depth_ratio += [depth_ratio, np.full(len(ignored), np.nan)]
-        self.counts.append(len(shape) + len(ignored))
+        self.shape += [labels.shape, ignored]
+        self.selected += [labels.selected, nothing]
+        self.labelled += [np.ones(len(labels.shape), np.bool_), nothing]
+        self.depth_ratio += [labels.depth_ratio, np.full(len(ignored), np.nan)]
+        self.crater_id += [labels.crater_id, np.full(len(ignored), -1)]
+        self.counts.append(len(labels.shape) + len(ignored))
 
     def joined(self) -> SplitLabels:
         """The labels of all frames."""
@@ -225,4 +239,5 @@ class _Joined:
             np.concatenate(self.labelled),
             np.concatenate(self.depth_ratio),
             np.cumsum([0, *self.counts]),
+            np.concatenate(self.crater_id),
         )

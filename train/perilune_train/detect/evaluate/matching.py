@@ -10,7 +10,7 @@ Detections are matched in order of score. Each takes the unmatched selected labe
 least `match_iou`. Only selected labels count in recall. Three scoring rules differ in which unmatched detections are
 false positives:
 
-- Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the range
+- Usual: an unmatched detection is ignored if it overlaps an ignored crater (not selected, or just outside the range
   of radii), if its radius sqrt(w h) / 2 is outside the range of radii, or if its centre is off the image. The labels
   cannot decide whether these detections are right. All other unmatched detections are false positives.
 - Edge (`edge_range`): as usual, but the range of radii of detections starts at 0.75 of the smallest radius. By the
