@@ -17,16 +17,18 @@ ROOMS = {
     "shared/perilune_shared/console": "interrupts terminal progress usage command_line",
     "shared/perilune_shared/config": "yaml_text errors resolve page",
     "render/perilune_render": (
-        "config streams provenance terrain flight poses imaging labels engines outputs dataset preview server scenes "
-        "jobs cli"
+        "config streams provenance terrain flight poses imaging labels engines outputs dataset detectability preview "
+        "server scenes jobs cli"
     ),
     "perilune/perilune": "parts datasets",
     "render/perilune_render/config": "values cameras terrain derived scene outputs dataset",
     "render/perilune_render/engines": "frame_source blender heightfield open_engine",
-    "render/perilune_render/cli": "options sun dataset frames spice serve status survey counterfactual main",
+    "render/perilune_render/cli": (
+        "options sun dataset frames spice serve status survey counterfactual detectability main"
+    ),
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
-        "level_ground cache export"
+        "unstamped level_ground cache export"
     ),
     "render/perilune_render/jobs": (
         "job records work_list report scene_renderer worker local in_process ray_actors run status estimate"
@@ -36,7 +38,8 @@ ROOMS = {
     ),
     "train/perilune_train/cli": "options detect navigate explain report main",
     "train/perilune_train/detect": (
-        "config finished_run data evaluate inference train evaluate_runs benchmark images deploy"
+        "config ellipses calibration finished_run data evaluate inference train calibrate evaluate_runs benchmark "
+        "images deploy"
     ),
     "train/perilune_train/motion": (
         "config geometry data network pose classical metrics covariance train evaluate_runs benchmark deploy"

@@ -19,12 +19,12 @@ from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import answer
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.files import write_text
+from perilune_train.detect.calibration import fit_calibration, log_features, logistic_fit
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import FOUND, IGNORED, find_overlaps
 from perilune_train.detect.evaluate.reliability import Judged, draw_reliability, expected_calibration_error
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
-from perilune_train.detect.inference.calibration import fit_calibration, log_features, logistic_fit
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.train.threshold import detect_validation
 from perilune_train.shipped.models import shipped_run

@@ -12,7 +12,7 @@ from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metr
 
 if TYPE_CHECKING:
     # Commands read settings before they load NumPy.
-    from perilune_train.detect.inference.calibration import Calibration
+    from perilune_train.detect.calibration import Calibration
 
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
@@ -73,7 +73,7 @@ def calibration_of(run: Path) -> "Calibration | None":
 
 def calibration_in(metrics: Metrics, path: Path) -> "Calibration | None":
     """Calibration in the content of the file metrics.json at `path`; see `calibration_of`."""
-    from perilune_train.detect.inference.calibration import Calibration
+    from perilune_train.detect.calibration import Calibration
 
     keys = [f"calibration/{part.name}" for part in fields(Calibration)]
     if not metrics.keys() & set(keys):

@@ -2,7 +2,7 @@
 
 An anchor's ellipse has the bounding box of `decode`. Five further raw outputs complete it:
 
-t           correlation S_xy / sqrt(S_xx S_yy) = MAX_CORRELATION tanh(t) of the ellipse (detect/evaluate/ellipses.py)
+t           correlation S_xy / sqrt(S_xx S_yy) = MAX_CORRELATION tanh(t) of the ellipse (detect/ellipses.py)
 s_x, s_y    standard deviations of the centre, as logarithms
 s_a, s_b    standard deviations of the semi-major and the semi-minor axis, as logarithms
 
@@ -13,9 +13,10 @@ square root of a crater's size, so all craters have similar outputs s.
 import torch
 from torch import Tensor
 
-from perilune_train.detect.evaluate.ellipses import MAX_CORRELATION
-
 ELLIPSE_OUTPUTS = 5
+MAX_CORRELATION = 0.98
+"""Largest magnitude of a correlation that a detector predicts: an ellipse at 45 degrees that is ten times as long as
+wide."""
 _TYPICAL_LOG_SIGMA = -2.0
 _MAX_LOG_SIGMA = 4.0
 _MIN_SIDE_PX = 1e-3

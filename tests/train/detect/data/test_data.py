@@ -24,7 +24,7 @@ from perilune_train.detect.data.batches import (
 )
 from perilune_train.detect.data.ignored import Craters, unlabelled_craters
 from perilune_train.detect.data.split import load_split
-from perilune_train.detect.evaluate.ellipses import ellipses_of
+from perilune_train.detect.ellipses import ellipses_of
 
 PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
 ANCHORS = torch.tensor([[[8.0, 8.0], [12.0, 12.0], [16.0, 16.0]], [[20.0, 20.0]] * 3, [[32.0, 32.0]] * 3])

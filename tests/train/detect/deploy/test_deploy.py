@@ -18,12 +18,12 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.cli.main import app
 from perilune_train.data.frames import load_frames, normalised
+from perilune_train.detect.calibration import Calibration
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.files import FlightDetector, write_onnx, write_openvino
 from perilune_train.detect.deploy.readme import readme
 from perilune_train.detect.finished_run import config_of_run
-from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.records.metrics_file import write_metrics
 from perilune_train.training import runs

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from perilune_train.detect.calibration import Calibration
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.matching import Detections, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
@@ -14,7 +15,6 @@ from perilune_train.detect.evaluate.reliability import (
     judged,
     reliability,
 )
-from perilune_train.detect.inference.calibration import Calibration
 
 
 def test_an_error_by_hand():

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M
 from perilune_train.cli.main import app
-from perilune_train.detect.evaluate.ellipses import correlations_of
+from perilune_train.detect.ellipses import correlations_of
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate.split_evaluation import ELLIPSE_COLUMNS
 from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference

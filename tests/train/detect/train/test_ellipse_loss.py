@@ -14,7 +14,7 @@ from perilune_train.detect.data.assign import Assignment, BatchLabels, assign
 from perilune_train.detect.data.augment import augment
 from perilune_train.detect.data.batches import batch_labels, network_input
 from perilune_train.detect.data.labels import FrameLabels
-from perilune_train.detect.evaluate.ellipses import correlations_of, ellipses_of
+from perilune_train.detect.ellipses import correlations_of, ellipses_of
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.ellipse_loss import ellipse_loss
 from perilune_train.detect.train.loss import detection_loss

@@ -16,7 +16,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.evaluate.ellipses import correlations_of, ellipses_of
+from perilune_train.detect.ellipses import correlations_of, ellipses_of
 from perilune_train.detect.evaluate.split_evaluation import ELLIPSE_COLUMNS
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import load_detector

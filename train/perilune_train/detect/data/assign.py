@@ -31,7 +31,7 @@ class BatchLabels:
     selected: Tensor
     """False for a label to ignore, such as a crater with little contrast (T,)."""
     correlations: Tensor | None = None
-    """Correlation of the ellipse in each box (T,), see detect/evaluate/ellipses.py; None if only boxes are learned."""
+    """Correlation of the ellipse in each box (T,), see detect/ellipses.py; None if only boxes are learned."""
 
 
 @dataclass(frozen=True)

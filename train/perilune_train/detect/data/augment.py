@@ -1,6 +1,6 @@
 """Random augmentation of training frames and their outlines.
 
-An outline is a box x0, y0, x1, y1 in pixels and the correlation of the ellipse in it (detect/evaluate/ellipses.py).
+An outline is a box x0, y0, x1, y1 in pixels and the correlation of the ellipse in it (detect/ellipses.py).
 """
 
 import cv2

@@ -17,7 +17,7 @@ from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import Selection
 from perilune_train.data.shares import Share
 from perilune_train.detect.data.ignored import Craters, read_craters, unlabelled_craters
-from perilune_train.detect.evaluate.ellipses import correlations_of
+from perilune_train.detect.ellipses import correlations_of
 
 Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
@@ -51,7 +51,7 @@ class FrameLabels:
 
     @property
     def outlines(self) -> Array:
-        """Boxes with the correlations of their ellipses (M, 5), see detect/evaluate/ellipses.py."""
+        """Boxes with the correlations of their ellipses (M, 5), see detect/ellipses.py."""
         return np.column_stack([self.boxes, correlations_of(self.ellipses)])
 
 

@@ -14,6 +14,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
 from perilune_shared.storage.store import Address
 from perilune_train.data.frames import normalised
+from perilune_train.detect.calibration import Calibration
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.data.split import load_split
@@ -22,7 +23,6 @@ from perilune_train.detect.deploy.files import FlightDetector, write_onnx, write
 from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
 from perilune_train.detect.finished_run import calibration_of, config_of_run, raw_threshold
-from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3

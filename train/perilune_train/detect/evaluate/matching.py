@@ -34,8 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.data.labels import FrameLabels
+from perilune_train.detect.ellipses import ellipses_of
 from perilune_train.detect.evaluate.boxes import coverage_matrix, iou_matrix
-from perilune_train.detect.evaluate.ellipses import ellipses_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.export.foreign_text import code_span, for_markdown
 from perilune_shared.storage.files import written_aside
+from perilune_train.detect.calibration import Calibration
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, joined_detections, match_split
-from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import protocol_of
 

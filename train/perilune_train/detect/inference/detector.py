@@ -13,11 +13,11 @@ from torch import Tensor
 from perilune_shared.errors import UserError
 from perilune_shared.threads import warn_if_crowded
 from perilune_train.data.frames import normalised
+from perilune_train.detect.calibration import Calibration
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import calibration_of
-from perilune_train.detect.inference.calibration import Calibration
 from perilune_train.models.architecture import DetectorArchitecture, check_architecture_of, without_memory
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from perilune_train.detect.calibration import fit_calibration
 from perilune_train.detect.config import AugmentSettings, EvaluationSettings
 from perilune_train.detect.data.augment import augment
 from perilune_train.detect.data.labels import FrameLabels
@@ -15,7 +16,6 @@ from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections, Overlaps, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.reliability import Judged, expected_calibration_error, judged
-from perilune_train.detect.inference.calibration import fit_calibration
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import detect_split
 from perilune_train.records.metrics_file import Metrics

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.detect.inference.calibration import MIN_EACH, Calibration, fit_calibration
+from perilune_train.detect.calibration import MIN_EACH, Calibration, fit_calibration
 
 KNOWN = Calibration(1.7, 0.6, 0.8)
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perilune_train.detect.evaluate.ellipses import correlations_of, ellipses_of
+from perilune_train.detect.ellipses import correlations_of, ellipses_of
 from perilune_train.detect.evaluate.matching import Detections, joined_detections
 from perilune_train.models.ellipse import decode_sigmas, semi_axes
 

@@ -10,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-MAX_CORRELATION = 0.98
-"""Largest magnitude of a correlation that a detector predicts: an ellipse at 45 degrees that is ten times as long as
-wide."""
 
 
 def correlations_of(ellipses: Array) -> Array:
