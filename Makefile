@@ -117,7 +117,7 @@ ablate-detect: train-detect ## train variants of the detector (attention, guidan
 
 compare-detectors: setup-dev train-detect train-detect-baseline ## train RT-DETRv2 on the same frames, and compare it with YOLOv3 with and without attention; run again to resume
 	@$(BIN)/python -m benchmarks.train.compare_detectors "$(DATA)/detect" "$(RUNS)/detect/$(NAME)" "$(RUNS)/detect/$(NAME)-none" \
-	  --out "$(RUNS)/compare/$(NAME)"
+	  --out "$(RUNS)/compare/$(NAME)" $(OVER)
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect

@@ -20,6 +20,7 @@ import itertools
 import json
 import statistics
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -31,7 +32,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.figures import write_figures
 from perilune_shared.console.command_line import one_command, run_command_line
-from perilune_shared.console.terminal import answer, say
+from perilune_shared.console.terminal import answer_page, say
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
@@ -75,6 +76,11 @@ else:
 
 ATTENTION, PLAIN = "attention-YOLOv3", "YOLOv3"
 FRAMES, TIME = "RT-DETRv2, equal frames", "RT-DETRv2, equal processor time"
+FIGURES = {"AP": "ap50_paper", "AP, edge": "edge/ap50_paper", "AP, strict": "strict/ap50_paper", "F1": "f1"} | {
+    f"AP, {low:g} to {high:g} px radius".replace(" to inf", " or more"): f"radius_{low:g}_{high:g}_px/ap50_paper"
+    for low, high in itertools.pairwise(RADIUS_BINS_PX)
+}
+"""Figures of the table with their keys in metrics.json."""
 _TURNS = 7
 _WARM_UP = 2
 
@@ -157,17 +163,21 @@ def step_seconds(task: DetectTask, batches: Any, optimizer: Any, number: int) ->
     return time.process_time() - began_s
 
 
+def endless(loader: Any) -> Iterator[Any]:
+    """Batches of a loader, again and again."""
+    return itertools.chain.from_iterable(itertools.repeat(loader))
+
+
 def measured_costs(tasks: dict[str, DetectTask], sizes: dict[str, int], frames: DetectSplit) -> dict[str, Cost]:
-    """Costs of networks with the multiply-adds `sizes`; their steps and detections alternate. Changes their weights."""
-    loops = {
-        name: (iter(task.train_dataloader()), task.configure_optimizers()["optimizer"]) for name, task in tasks.items()
-    }
+    """Costs of networks with the multiply-adds `sizes`; steps of all networks alternate. Changes their weights."""
+    batches = {name: endless(task.train_dataloader()) for name, task in tasks.items()}
+    optimizers = {name: task.configure_optimizers()["optimizer"] for name, task in tasks.items()}
     training: dict[str, list[float]] = {name: [] for name in tasks}
     detection: dict[str, list[float]] = {name: [] for name in tasks}
     detectors = {name: detector_of(task.evaluated, task.config, "cpu") for name, task in tasks.items()}
     for turn in range(_WARM_UP + _TURNS):
         for name, task in tasks.items():
-            training[name].append(step_seconds(task, *loops[name], turn) / task.config.batch_size)
+            training[name].append(step_seconds(task, batches[name], optimizers[name], turn) / task.config.batch_size)
             began_s = time.process_time()
             detect_at_scales(detectors[name], frames.frames.images[turn % len(frames)][None])
             detection[name].append(time.process_time() - began_s)
@@ -187,11 +197,11 @@ def detector_of(network: nn.Module, config: DetectConfig, device: str) -> Detect
     return Detector(cast(Any, network.eval().to(device)), config, device, runs.choose_bf16(config.precision, device))
 
 
-def train_witness(run: runs.RunFolder, config: "WitnessConfig", data: Data) -> None:
-    """Train and evaluate the witness, or resume it; a finished witness is left unchanged."""
+def train_witness(run: runs.RunFolder, config: "WitnessConfig", data: Data, overwrite: bool = False) -> None:
+    """Train and evaluate the witness, or resume it. A finished witness is left unchanged, unless `overwrite`."""
     inputs = hashes_of({"dataset": data.folder})
     with held(run):
-        state = state_of(run, "detect", config, inputs)
+        state = state_of(run, "detect", config, inputs, overwrite)
         if state == "finished":
             return
         splits = data.splits
@@ -248,11 +258,7 @@ def comparison(metrics: dict[str, Metrics], costs: dict[str, Cost], frames_seen:
         ],
         ["processor time of a frame, ms", *(f"{1e3 * costs[name].detection_s_per_frame:.0f}" for name in names)],
     ]
-    figures = {"AP": "ap50_paper", "AP, edge": "edge/ap50_paper", "AP, strict": "strict/ap50_paper", "F1": "f1"}
-    for low, high in itertools.pairwise(RADIUS_BINS_PX):
-        words = f"{low:g} to {high:g}" if high < float("inf") else f"above {low:g}"
-        figures[f"AP, {words} px radius"] = f"radius_{low:g}_{high:g}_px/ap50_paper"
-    for words, key in figures.items():
+    for words, key in FIGURES.items():
         cells = [metrics[name].get(f"test/{key}") for name in names]
         if any(cell is not None for cell in cells):
             rows.append([words, *map(number, cells)])
@@ -264,6 +270,7 @@ def main(
     run: Annotated[Path, typer.Argument(help="Folder of a finished detect run with attention.")],
     baseline: Annotated[Path, typer.Argument(help="Folder of the same run without attention.")],
     out: Annotated[Path, typer.Option(help="Folder of the comparison and of both witnesses.")] = Path("runs/compare"),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Measure and train the witness again.")] = False,
 ) -> None:
     """Train RT-DETRv2 on the frames of two detect runs, and compare the three detectors in one table."""
     if _MISSING is not None:
@@ -274,7 +281,7 @@ def main(
     height, width = train.frames.images.shape[1:]
     witness = witness_config(config, train)
     costs_file = out / "costs.json"
-    if costs_file.is_file():
+    if costs_file.is_file() and not overwrite:
         costs = {name: Cost(**entry) for name, entry in json.loads(costs_file.read_text(encoding="utf-8")).items()}
     else:
         say("measuring processor times")
@@ -298,7 +305,7 @@ def main(
         changes = {"epochs": epochs[name], "validate_every": 1 if name == TIME else config.validate_every}
         own_config = witness.model_copy(update=changes)
         trained = runs.RunFolder(out / folder)
-        train_witness(trained, own_config, data)
+        train_witness(trained, own_config, data, overwrite)
         metrics[name] = read_metrics(trained.root)
     seen = {name: epochs.get(name, config.epochs) * len(train) for name in metrics}
     lines = comparison(metrics, costs, seen)
@@ -312,12 +319,12 @@ def main(
         name: {
             "frames_seen": seen[name],
             **asdict(costs[name]),
-            **{key.removeprefix("test/"): value for key, value in metrics[name].items() if key.startswith("test/")},
+            **{key: metrics[name].get(f"test/{key}") for key in (*FIGURES.values(), "precision", "recall", "labels")},
         }
         for name in metrics
     }
     write_figures(out / "compare_detectors.json", figures)
-    answer("\n".join(lines))
+    answer_page("\n".join(lines))
 
 
 def _recorded(run: Path) -> int:

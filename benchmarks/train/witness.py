@@ -201,7 +201,7 @@ def build_witness(config: WitnessConfig) -> Witness:
 class WitnessTask(DetectTask):
     """Training of the witness: schedule, moving average and validation of `DetectTask`, with RT-DETR's loss."""
 
-    resides = False  # type: ignore[assignment]
+    resides = False
 
     def __init__(self, network: Witness, config: WitnessConfig, train: DetectSplit, val: DetectSplit):
         super().__init__(network, config, train, val, 0)  # type: ignore[arg-type]

@@ -1,6 +1,8 @@
 """The witness RT-DETRv2 and its comparison with YOLOv3."""
 
 import json
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,15 @@ SMALL = {
     "precision": "float32",
     "device": "cpu",
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_pictures() -> Iterator[None]:
+    """Evaluations draw no pictures, which take most of their time."""
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("draw_bins", "draw_curves", "draw_frames"):
+            patched.setattr(f"perilune_train.detect.evaluate.report.{name}", lambda *_, **__: None)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +111,6 @@ def test_two_frames_are_learned(train):
         optimizer.step()
         losses.append(loss.item())
     after = average_precision()
-    print(losses[::5], before, after)
     assert losses[-1] < 0.7 * losses[0]
     assert before < 0.01 and after > 0.1
 
@@ -153,9 +163,36 @@ def test_the_comparison_is_complete_and_is_resumed(few, compared, tmp_path, monk
     assert weights.stat().st_mtime_ns == before
 
 
+def test_a_witness_that_is_killed_within_an_epoch_is_resumed_with_the_same_weights(few, train, tmp_path, monkeypatch):
+    config = settings(train, epochs=2, checkpoint_minutes=0)
+    data = compare_detectors.Data.of(few, config)
+    whole, killed = (compare_detectors.runs.RunFolder(tmp_path / name) for name in ("whole", "killed"))
+    compare_detectors.train_witness(whole, config, data)
+    original = witness.WitnessTask.training_step
+
+    def dies(self, batch, batch_idx):
+        if self.current_epoch == 1 and batch_idx == 1:
+            raise KeyError("killed")
+        return original(self, batch, batch_idx)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(witness.WitnessTask, "training_step", dies)
+        with pytest.raises(KeyError):
+            compare_detectors.train_witness(killed, config, data)
+    assert not killed.metrics.is_file()
+    compare_detectors.train_witness(killed, config, data)
+    first, again = (torch.load(run.last, weights_only=True) for run in (whole, killed))
+    assert first["global_step"] == again["global_step"] == 6
+    assert all(torch.equal(value, again["state_dict"][name]) for name, value in first["state_dict"].items())
+
+
 def test_runs_that_differ_in_more_than_attention_are_refused(few, compared, tmp_path):
     run, baseline = compared
-    other = run_detect(DetectConfig(**{**SMALL, "attention": "none", "width": 0.25}), few, tmp_path, "wide").root
+    other = tmp_path / "wide"
+    shutil.copytree(baseline, other)
+    text = (other / "config.yaml").read_text()
+    assert "width: 0.125" in text
+    (other / "config.yaml").write_text(text.replace("width: 0.125", "width: 0.25"))
     with pytest.raises(UserError, match=r"detect\.width"):
         compare_detectors.compared_config(run, other, few)
     elsewhere = build_dataset(tmp_path / "other", "detect", n_frames=3)
