@@ -274,7 +274,7 @@ def main(
 ) -> None:
     """Train RT-DETRv2 on the frames of two detect runs, and compare the three detectors in one table."""
     if _MISSING is not None:
-        raise UserError(_MISSING, "package", "none", "the package: make setup-dev")
+        raise UserError(_MISSING, "package", "no such package", "the package, which `make setup-dev` installs")
     config, plain = compared_config(run, baseline, dataset)
     data = Data.of(dataset, config)
     train, val = data.splits["train"], data.splits["val"]
