@@ -198,7 +198,7 @@ def detector_of(network: nn.Module, config: DetectConfig, device: str) -> Detect
 
 
 def train_witness(run: runs.RunFolder, config: "WitnessConfig", data: Data, overwrite: bool = False) -> None:
-    """Train and evaluate the witness, or resume it. A finished witness is left unchanged, unless `overwrite`."""
+    """Train and evaluate the witness, or resume it. `overwrite` replaces an existing witness."""
     inputs = hashes_of({"dataset": data.folder})
     with held(run):
         state = state_of(run, "detect", config, inputs, overwrite)
@@ -256,7 +256,7 @@ def comparison(metrics: dict[str, Metrics], costs: dict[str, Cost], frames_seen:
             "processor time of training, minutes",
             *(f"{costs[name].training_s_per_frame * frames_seen[name] / 60:.1f}" for name in names),
         ],
-        ["processor time of a frame, ms", *(f"{1e3 * costs[name].detection_s_per_frame:.0f}" for name in names)],
+        ["processor time of detection per frame, ms", *(f"{1e3 * costs[name].detection_s_per_frame:.0f}" for name in names)],
     ]
     for words, key in FIGURES.items():
         cells = [metrics[name].get(f"test/{key}") for name in names]

@@ -44,8 +44,10 @@ Target = dict[str, Tensor]
 
 
 class WitnessConfig(DetectConfig):
-    """Settings of the witness: those of the compared detector, and three more. Architecture and loss of YOLOv3 have no
-    effect."""
+    """Settings of the compared detector, with three settings of the witness.
+
+    Settings of the architecture and the loss of YOLOv3 have no effect.
+    """
 
     queries: Count
     """Largest number of detections in a frame."""
