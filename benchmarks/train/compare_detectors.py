@@ -256,7 +256,10 @@ def comparison(metrics: dict[str, Metrics], costs: dict[str, Cost], frames_seen:
             "processor time of training, minutes",
             *(f"{costs[name].training_s_per_frame * frames_seen[name] / 60:.1f}" for name in names),
         ],
-        ["processor time of detection per frame, ms", *(f"{1e3 * costs[name].detection_s_per_frame:.0f}" for name in names)],
+        [
+            "processor time of detection per frame, ms",
+            *(f"{1e3 * costs[name].detection_s_per_frame:.0f}" for name in names),
+        ],
     ]
     for words, key in FIGURES.items():
         cells = [metrics[name].get(f"test/{key}") for name in names]
