@@ -4,8 +4,8 @@
 
 The benchmark has nine scenes of highland and nine of mare ground, two scenes with another camera, and one scene on each
 of two elevation models (NPB_1km.tif and NPC_2km.tif of the repository nasa-jpl/lunasynth), for detection and for
-navigation. All frames are test frames. Seeds depend on the dataset's name, and no preset has these names, so no preset
-renders these scenes.
+navigation. For detection, six more scenes are seen at 20 to 60 degrees from straight down. All frames are test frames.
+Seeds depend on the dataset's name, and no preset has these names, so no preset renders these scenes.
 """
 
 import subprocess
@@ -44,6 +44,19 @@ OTHER_CAMERA = {
     "dataset.sensor.psf_sigma_px": 0.7,
 }
 """A narrower field of view with a distorting lens and a noisier sensor."""
+OBLIQUE = {
+    "dataset.light.photometry": "hapke_mean",
+    "dataset.terrain.spacing_px": 0.75,
+    "dataset.terrain.relief.rms_slope_deg": "{low: 2, high: 7}",
+    "dataset.terrain.craters.equilibrium_share": "{low: 0.9, high: 1.8}",
+    "dataset.detect.trajectories_per_scene": 5,
+    "dataset.detect.n_frames": 8,
+    "dataset.detect.flight.off_nadir_deg": "{low: 20, high: 60}",
+    "dataset.detect.flight.off_nadir_azimuth_deg": "{low: 0, high: 360}",
+}
+"""Tilted views of ground from mare to highland. Each trajectory has its own tilt, and five for each scene cover the
+range. With the default spacing_px of 0.5, ground up to the horizon would have more than the 12 million vertices that
+terrain.max_vertices allows."""
 ELEVATION_MODELS = {"npb": "NPB_1km.tif", "npc": "NPC_2km.tif"}
 """File of each elevation model, by the end of the manifest's name."""
 
@@ -66,13 +79,14 @@ def main(
     elevation_models: Annotated[Path, typer.Option(help="Folder with the two GeoTIFF files.")],
     out: Annotated[Path, typer.Option(help="Folder of the manifests.")],
 ) -> None:
-    """Write ten manifests."""
+    """Write eleven manifests."""
     for kind in SETTINGS_OF_KIND:
         for region in REGIONS:
             plan(kind, region, 9, out, {}, "--config", f"configs/{region}.yaml")
         plan(kind, "camera", 2, out, OTHER_CAMERA)
         for part, file in ELEVATION_MODELS.items():
             plan(kind, part, 1, out, {}, "--dem", str(elevation_models / file))
+    plan("detect", "oblique", 6, out, OBLIQUE)
 
 
 if __name__ == "__main__":

@@ -20,11 +20,13 @@ from perilune_render.flight.plan import make_plan
 from perilune_render.provenance.recipe import config_of
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.names import frame_path
+from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.validation.validate import validate
 
 FOLDER = Path(__file__).parent.parent / "data_manifests"
 NAMES = sorted(path.parent.name for path in FOLDER.glob("*/dataset.json"))
 PARTS = ("highland", "mare", "camera", "npb", "npc")
+"""Parts of the benchmark for both kinds. `benchmark-detect-oblique` has no counterpart for navigation."""
 REAL = os.environ.get("PERILUNE_REAL_DEM")
 LEFT_OUT = {
     "paper-detect": "ab9d3a3410fd2316ef245586c5eee6cd86a3ed18525f9c17f5bca51dda905949",
@@ -56,7 +58,8 @@ def test_all_are_here():
     kinds = ("detect", "nav")
     of_presets = [f"{p}-{k}" for p in ("small", "paper", "large") for k in kinds]
     benchmark = [f"benchmark-{k}-{part}" for k in kinds for part in PARTS]
-    assert sorted([*of_presets, *benchmark, "shipped-detect", "shipped-nav", "south-pole-detect"]) == NAMES
+    others = ["benchmark-detect-oblique", "shipped-detect", "shipped-nav", "south-pole-detect"]
+    assert sorted([*of_presets, *benchmark, *others]) == NAMES
     counts = {name: open_dataset(FOLDER / name).info.counts for name in NAMES}
     assert {open_dataset(FOLDER / name).info.licence for name in NAMES} == {"CC-BY-4.0"}, "as LICENSE says"
     assert [counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds] == [343, 49, 343, 49]
@@ -84,7 +87,7 @@ def test_no_two_manifests_share_terrain_but_the_papers():
     for name in NAMES:
         for content in open_dataset(FOLDER / name).table("scenes", ["content_sha256"])["content_sha256"].to_pylist():
             owners[content].add(name)
-    assert len(owners) == 343 + 49 + 24 + 6 + 64 + 16 + 1 + 1 + 2 * 22
+    assert len(owners) == 343 + 49 + 24 + 6 + 64 + 16 + 1 + 1 + 2 * 22 + 6
     assert [names for names in owners.values() if len(names) > 1] == [{"paper-detect", "paper-nav"}]
 
 
@@ -99,6 +102,19 @@ def test_the_benchmark_has_test_frames_under_low_and_high_suns(kind):
     assert min(altitude) < 220 and max(altitude) > 1480
 
 
+def test_the_oblique_part_has_all_tilts_and_directions():
+    part = open_dataset(FOLDER / "benchmark-detect-oblique")
+    assert (part.info.counts.scenes, part.info.counts.frames) == (6, 240)
+    assert part.table("frames", ["split"])["split"].unique().to_pylist() == ["test"]
+    axes = [matrix_from_quaternion(each)[2] for each in part.table("frames")["rotation_wxyz"].to_pylist()]
+    tilt_deg = np.degrees(np.arccos(-np.array(axes)[:, 2]))
+    counts, _ = np.histogram(tilt_deg, [15, 30, 40, 50, 65])
+    assert counts.sum() == 240 and counts.min() >= 30
+    towards = np.degrees(np.arctan2(np.array(axes)[:, 0], np.array(axes)[:, 1]))
+    quarters, _ = np.histogram(towards, [-180, -90, 0, 90, 180])
+    assert quarters.min() >= 30
+
+
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in LEFT_OUT])
 def test_frames_that_were_left_out_come_back(name, whole):
     """To the last bit; with the libraries of constraints.txt also the same dataset.json, which holds all hashes."""
@@ -107,7 +123,7 @@ def test_frames_that_were_left_out_come_back(name, whole):
     assert hashlib.sha256(json.dumps(rows).encode()).hexdigest() == LEFT_OUT[name]
 
 
-OF_PRESETS = [n for n in NAMES if n.startswith(("small", "large-detect", "shipped-nav"))]
+OF_PRESETS = [n for n in NAMES if n.startswith(("small", "large-detect", "shipped-nav", "benchmark-detect-oblique"))]
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in OF_PRESETS])

@@ -7,7 +7,7 @@ from pydantic import Field, field_validator, model_validator
 from perilune_render.config.cameras import CameraConfig, CameraName, MountedCameraConfig
 from perilune_render.config.derived import CounterfactualConfig, SurveyConfig
 from perilune_render.config.outputs import FlashLidarConfig, HazardConfig
-from perilune_render.config.scene import SceneConfig
+from perilune_render.config.scene import HIGHEST_M, SceneConfig
 from perilune_render.config.terrain import TerrainConfig
 from perilune_render.config.values import (
     Altitude,
@@ -31,6 +31,9 @@ MAX_TRAJECTORIES, MAX_FRAMES = 200_000, 10_000_000
 the first frame is rendered."""
 MAX_MEASUREMENTS = 10_000_000
 """Largest number of measurements of one instrument along one trajectory."""
+MAX_OFF_NADIR_DEG = 80.0
+"""Largest tilt of the body from a level attitude, degrees. The axis of a camera along -Z_B then still meets the
+ground."""
 _MIN_LIMIT_SIGMAS = 3.0
 """Smallest `max_perturbation_mps2`, in standard deviations of the acceleration on an axis. About half of all drawn
 perturbations stay below this limit; the others are drawn again."""
@@ -52,7 +55,14 @@ class FlightConfig(Section):
     position_sigma_m: Deviation = 8.0
     """Standard deviation of the position from the nominal parabola, per axis, metres."""
     attitude_sigma_deg: Annotated[float, Field(ge=0, le=90)] = 0.3
-    """Standard deviation of the attitude from a level attitude, per axis, degrees."""
+    """Standard deviation of the attitude from the nominal attitude, per axis, degrees. The nominal attitude is level,
+    or tilted by off_nadir_deg."""
+    off_nadir_deg: Annotated[Span, Within(0, MAX_OFF_NADIR_DEG)] = Span(low=0.0, high=0.0)
+    """Angle between the camera's axis and straight down, drawn for each trajectory, degrees. Above 0, the ground is
+    curved and extends to the horizon, as with dataset.scene.horizon."""
+    off_nadir_azimuth_deg: Annotated[Span, Within(-720, 720)] = Span(low=0.0, high=0.0)
+    """Direction in which the camera is tilted, clockwise from the direction of flight, drawn for each trajectory,
+    degrees. At 0 (pitched about the cross-track axis) it looks ahead, at 180 it looks back."""
     correlation_time_s: Seconds = 3.0
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
     attitude_correlation_time_s: Seconds | None = None
@@ -75,6 +85,18 @@ class FlightConfig(Section):
                 f"acceleration on each axis, sqrt(3) position_sigma_m / correlation_time_s^2"
             )
         return self
+
+    @model_validator(mode="after")
+    def _low_enough_for_a_horizon(self) -> "FlightConfig":
+        highest = HIGHEST_M - 3 * self.position_sigma_m
+        if self.is_oblique and self.start_altitude_m > highest:
+            raise ValueError(f"start_altitude_m of at most {highest:g}, since off_nadir_deg is above 0")
+        return self
+
+    @property
+    def is_oblique(self) -> bool:
+        """Whether trajectories may be tilted, so that frames may show the horizon."""
+        return self.off_nadir_deg.high > 0
 
     @property
     def attitude_correlation_s(self) -> float:
@@ -371,10 +393,12 @@ class DatasetConfig(Section):
     def ground_flight(self, kind: str) -> FlightConfig:
         """Flight settings that determine the ground of `detect` or `nav`.
 
-        With `shared_terrain`, each standard deviation is the larger of the two kinds' values.
+        With `shared_terrain`, each standard deviation is the larger of the two kinds' values, and the tilt is the wider
+        of their tilts.
         """
         if not self.shared_terrain:
             return self.kind(kind).flight
         first, second = self.detect.flight, self.nav.flight
         widest = {name: max(getattr(first, name), getattr(second, name)) for name in _SPREAD_FIELDS}
-        return first.model_copy(update=widest)
+        tilt = max(first.off_nadir_deg, second.off_nadir_deg, key=lambda span: span.high)
+        return first.model_copy(update={**widest, "off_nadir_deg": tilt})

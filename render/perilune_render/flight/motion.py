@@ -73,6 +73,8 @@ class Motion:
     """Perturbation of the position, three axes of unit variance."""
     attitude_process: SmoothProcess
     """Perturbation of the attitude, three axes of unit variance."""
+    rotation_site_from_nominal: Array | None = None
+    """Nominal attitude, the rotation (3, 3) from O_B to O_L without perturbation; None if it is level."""
 
     def path_at(self, time_s: Array) -> tuple[Array, Array, Array]:
         """Positions (N, 3), metres, velocities, metres per second, and accelerations, O_L, at times (N,).
@@ -97,8 +99,9 @@ class Motion:
 
     def rotation_site_from_body_at(self, time_s: Array) -> Array:
         """Rotations from O_B to O_L (N, 3, 3) at times (N,)."""
-        tilt = self.attitude_sigma_rad * self.attitude_process.at(time_s)[0]
-        return np.stack([matrix_from_rotation_vector(v) for v in tilt])
+        turn = self.attitude_sigma_rad * self.attitude_process.at(time_s)[0]
+        rotation = np.stack([matrix_from_rotation_vector(v) for v in turn])
+        return rotation if self.rotation_site_from_nominal is None else rotation @ self.rotation_site_from_nominal
 
     def rotation_camera_from_site_at(self, time_s: Array) -> Array:
         """Rotations from O_L to O_C (N, 3, 3) at times (N,)."""
@@ -118,12 +121,26 @@ def draw_motion(config: FlightConfig, seed: int) -> Motion:
     )
     sigmas = config.position_sigma_m, float(np.radians(config.attitude_sigma_deg))
     correlation_s = np.repeat([config.correlation_time_s, config.attitude_correlation_s], 3)
-    limit = config.max_perturbation_mps2
+    limit, attitude = config.max_perturbation_mps2, _drawn_attitude(config, azimuth, seed)
     for number in range(_MAX_DRAWS):
         process = SmoothProcess.draw(correlation_s, rng)
-        motion = Motion(nominal, *sigmas, process.part(slice(0, 3)), process.part(slice(3, 6)))
+        motion = Motion(nominal, *sigmas, process.part(slice(0, 3)), process.part(slice(3, 6)), attitude)
         if limit is None or motion.largest_perturbation_mps2() <= limit:
             return motion
         rng = stream(seed, "flight", number)
     expected = "a larger limit, a smaller position_sigma_m, or a longer correlation_time_s"
     raise UserError("configuration", "flight.max_perturbation_mps2", limit, expected)
+
+
+def _drawn_attitude(config: FlightConfig, azimuth_deg: float, seed: int) -> Array | None:
+    """Draw the nominal attitude of a trajectory that comes from `azimuth_deg`; None for a flight without tilt.
+
+    The body is turned from the level attitude about a horizontal axis. Tilt and direction have separate random streams.
+    """
+    if not config.is_oblique:
+        return None
+    angle, around = config.off_nadir_deg, config.off_nadir_azimuth_deg
+    off_nadir = np.radians(stream(seed, "off_nadir").uniform(angle.low, angle.high))
+    heading = np.radians(azimuth_deg + 180 + stream(seed, "off_nadir_azimuth").uniform(around.low, around.high))
+    towards = np.array([-np.sin(heading), -np.cos(heading), 0.0])
+    return matrix_from_rotation_vector(off_nadir * np.cross([0.0, 0.0, -1.0], towards))

@@ -78,6 +78,10 @@ def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
 
     Raises UserError as `view_envelope` does.
     """
+    if flight.is_oblique:
+        lens = max((each.exr_camera for each in rig.values()), key=lambda camera: max(camera.fx_px, camera.fy_px))
+        flights = [each.flight_settings(flight) for each in rig.values()]
+        return horizon_envelope(lens, max(flights, key=lambda each: each.position_sigma_m))
     views = [view_envelope(each.levelled(), each.flight_settings(flight)) for each in rig.values()]
     return views[0] if len(views) == 1 else _joined(views)
 
@@ -103,9 +107,11 @@ def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
 def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
     """The views of a camera on all trajectories of a flight.
 
-    Trajectories are up to three standard deviations from the nominal trajectory. Raises UserError if frames could show
-    the horizon.
+    Trajectories are up to three standard deviations from the nominal trajectory. Views of an oblique flight extend to
+    the horizon. Raises UserError if frames of another flight could show the horizon.
     """
+    if flight.is_oblique:
+        return horizon_envelope(camera, flight)
     angle = view_angle(camera, flight)
     if angle > _WIDEST_RAD:
         wide = f"frames reach {np.degrees(angle):.0f} degrees from straight down"

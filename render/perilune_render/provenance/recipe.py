@@ -18,6 +18,8 @@ DEFAULT_ENGINE = "cycles"
 """Engine that recipes do not record, so that recipes of older versions stay equal."""
 _SINCE = ("blur_poses", "row_time_s")
 """Sensor settings that are recorded only if they differ from the defaults, so that older recipes stay equal."""
+_TILT = ("off_nadir_deg", "off_nadir_azimuth_deg")
+"""Settings of a flight that are recorded only if it is tilted."""
 _SENSORS = {
     "star_tracker_rate_hz": ("star_tracker_sigma_arcsec", "star_tracker_outages_s"),
     "doppler_rate_hz": ("doppler_beams", "doppler_beam_angle_deg", "doppler_speed_sigma_mps", "doppler_range_sigma_m"),
@@ -80,6 +82,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     if config.scene is not None and not config.scene.horizon:
         del plain["scene"]["horizon"]
     for each in (kind, _OTHER[kind]):
+        if not config.kind(each).flight.is_oblique:
+            for name in _TILT:
+                del plain[each]["flight"][name]
         for rate, names in _SENSORS.items():
             if not plain[each]["instruments"][rate]:
                 for name in (rate, *names):

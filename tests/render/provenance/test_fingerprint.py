@@ -73,7 +73,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_shared.labels.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
         ("perilune_shared.geometry.ellipse", "_N_FITTED", {"imaging"}),
         ("perilune_shared.geometry.camera", "_MAX_UNDISTORTION_ERROR", set(ROOTS)),
-        ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging", "outputs"}),
+        ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "renderer", "rays", "imaging", "outputs"}),
     ],
 )
 def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, expected):

@@ -18,9 +18,13 @@ REGIONS = {
     "camera": "other camera",
     "npb": "elevation model",
     "npc": "elevation model",
+    "oblique": "oblique",
 }
 """Group in which the results of each dataset are listed, by the last word of the dataset's name. npb and npc are the
 elevation models NPB_1km.tif and NPC_2km.tif."""
+APART = "oblique"
+"""Region that was added after results had been published: its results are listed apart, and the overall figures exclude
+it, so that they stay comparable. It has no dataset of navigation."""
 _POSE = ("position_m", "rotation_wxyz", "sun_direction")
 
 
@@ -37,20 +41,25 @@ class Part:
 
     @property
     def region(self) -> str:
-        """highland, mare, other camera or elevation model."""
+        """highland, mare, other camera, elevation model or oblique."""
         return REGIONS[self.name.rpartition("-")[2]]
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether the overall figures exclude this dataset."""
+        return self.region == APART
 
 
 def part_names(kind: str) -> list[str]:
     """Names of the datasets of a kind, `detect` or `nav`."""
-    return [f"benchmark-{kind}-{part}" for part in REGIONS]
+    return [f"benchmark-{kind}-{part}" for part in REGIONS if kind == "detect" or part != APART]
 
 
 def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
     """Open the benchmark's datasets of a kind in the folder `data`, and compare them with their manifests.
 
-    Raises UserError if there is no such dataset, if a dataset is not finished, or if a scene or a frame differs from
-    the manifest.
+    Datasets that were not rendered are left out. Raises UserError if there is no dataset that the overall figures
+    include, if a dataset is not finished, or if a scene or a frame differs from the manifest.
     """
     store, locked = open_store(data), open_store(manifests)
     parts = []
@@ -62,9 +71,10 @@ def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
             _check_scenes(dataset, manifest)
             _check_frames(dataset, manifest)
             parts.append(Part(name, dataset, manifest.info.counts.frames))
-    if not parts:
-        expected = f"one of {', '.join(part_names(kind))}; see docs/how-to/benchmark.md"
-        raise UserError(store, "benchmark", "no dataset", expected)
+    if all(part.is_apart for part in parts):
+        names = [name for name in part_names(kind) if not name.endswith(f"-{APART}")]
+        found = f"only benchmark-{kind}-{APART}" if parts else "no dataset"
+        raise UserError(store, "benchmark", found, f"one of {', '.join(names)}; see docs/how-to/benchmark.md")
     return parts
 
 

@@ -114,6 +114,46 @@ def test_a_part_of_the_frames_is_scored_and_named(places, tmp_path):
     assert "`benchmark-detect-mare`: **only 4 of 8 frames** of the shared manifest" in page
 
 
+@pytest.mark.usefixtures("no_pictures")
+def test_oblique_views_have_a_row_and_change_no_other_figure(places, make_dataset, tmp_path):
+    """A detector that finds every second label, and no crater in oblique views."""
+    data, manifests = tmp_path / "data", tmp_path / "manifests"
+    shutil.copytree(places[0], data)
+    shutil.copytree(places[1], manifests)
+    table = truth(data, lambda labels: labels.iloc[::2])
+    figures = {}
+    for case in ("before", "after"):
+        if case == "after":
+            name = "benchmark-detect-oblique"
+            made = make_dataset(data / name, "detect", splits={"test": 2}, n_frames=4, seed=23)
+            subset(open_dataset(made), manifests / name, images="none")
+        (tmp_path / case).mkdir()
+        done = submitted((data, manifests), table, tmp_path / case)
+        assert done.returncode == 0, done.stderr
+        figures[case] = json.loads((tmp_path / case / "out/benchmark.json").read_text())
+    before, after = figures["before"], figures["after"]
+    measured = [key for key in before if key.startswith(("headline/", "visible/", "paper/"))]
+    assert len(measured) > 100 and {key: after[key] for key in measured} == {key: before[key] for key in measured}
+    added = {key for key in after if "oblique" in key}
+    assert added == after.keys() - before.keys()
+    assert after["paper/region/oblique/scenes"] == 2 and after["paper/region/oblique/ap50_paper"] == 0
+    assert after["paper/region/oblique/labels"] > 0
+    old, new = ((tmp_path / case / "out/benchmark.md").read_text() for case in figures)
+    assert "`benchmark-detect-oblique`: **not scored**" in old and "| oblique |" not in old
+    assert "`benchmark-detect-oblique`: all frames of the shared manifest" in new and "| oblique | 2 |" in new
+    assert new.count("All other figures of this page exclude `oblique`.") == 2
+
+
+def test_oblique_views_alone_are_refused(places, make_dataset, tmp_path):
+    name = "benchmark-detect-oblique"
+    made = make_dataset(tmp_path / "data" / name, "detect", splits={"test": 1}, n_frames=2, seed=23)
+    subset(open_dataset(made), tmp_path / "manifests" / name, images="none")
+    done = submitted((tmp_path / "data", tmp_path / "manifests"), truth(places[0]), tmp_path)
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error"))
+    assert done.returncode == 2 and "got only benchmark-detect-oblique, expected one of" in line
+    assert not (tmp_path / "out").exists()
+
+
 def test_frames_that_are_not_those_of_the_manifest_are_refused(places, make_dataset, tmp_path):
     data, manifests = places
     make_dataset(tmp_path / "a/benchmark-detect-mare", "detect", splits={"test": 2}, n_frames=4, seed=5)

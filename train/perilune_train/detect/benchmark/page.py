@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from perilune_train.detect.benchmark.score import MATCH_IOU, SCORING_RULES, SELECTIONS, Score
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.report import bin_tables, spread_cell, spread_note
-from perilune_train.records.benchmark_parts import part_names
+from perilune_train.records.benchmark_parts import APART, part_names
 from perilune_train.records.markdown import number, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
@@ -46,6 +46,8 @@ def page_of(score: Score, about: Sequence[str]) -> str:
     ]
     for selection in SELECTIONS:
         lines += [f"## By region, labels by `{selection}`", "", *_regions(score, selection), ""]
+        if any(region.name == APART for region in score.regions[selection]):
+            lines += [f"All other figures of this page exclude `{APART}`.", ""]
         lines += [f"## By radius, altitude, Sun and freshness, labels by `{selection}`", ""]
         lines += [line.replace("## ", "### ", 1) for line in bin_tables(score.evaluations[selection])]
     return "\n".join(lines)

@@ -56,11 +56,11 @@ class Score:
     """All figures of a set of detections."""
 
     evaluations: dict[str, Evaluation]
-    """Evaluation of all frames, by selection of labels."""
+    """Evaluation of all frames without the region `APART`, by selection of labels."""
     regions: dict[str, list[Region]]
-    """Figures of each region, by selection of labels."""
+    """Figures of each region, `APART` included, by selection of labels."""
     images: list[NDArray[np.uint8]]
-    """The frames (height, width), for pictures."""
+    """The frames of `evaluations` (height, width), for pictures."""
     frames_of: dict[str, tuple[int, int]]
     """Number of frames scored and number of frames of the locked manifest, by part."""
 
@@ -118,23 +118,31 @@ def score(
     detections_by_part: Mapping[str, list[Detections]],
     threshold: float,
 ) -> Score:
-    """Score detections on all parts.
+    """Score detections on all parts; the overall figures exclude the region `APART`.
 
     `detections_by_part` has a list for each part of the benchmark, with one entry per frame. `loaded` is the result of
     `load_parts`. `threshold` is the minimum score of the detections that count in precision, recall and F1.
     """
     evaluations, regions = {}, {}
     splits = loaded[SELECTIONS[0]]
-    facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})
-    of_frame = [part.region for part in parts for _ in range(len(splits[part.name]))]
-    detections = [each for part in parts for each in detections_by_part[part.name]]
-    for selection, by_part in loaded.items():
-        labels: list[FrameLabels] = [each for part in parts for each in by_part[part.name].labels]
+    counted, apart = ([part for part in parts if part.is_apart == is_apart] for is_apart in (False, True))
+    of_frame = [part.region for part in counted for _ in range(len(splits[part.name]))]
+
+    def evaluated(chosen: Sequence[Part], by_part: Mapping[str, DetectSplit]) -> Evaluation:
+        labels: list[FrameLabels] = [each for part in chosen for each in by_part[part.name].labels]
+        detections = [each for part in chosen for each in detections_by_part[part.name]]
+        facts = joined_facts({part.name: facts_of(splits[part.name].frames) for part in chosen})
         radius_px = next(iter(by_part.values())).radius_px
-        evaluation = evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px, MATCH_IOU), SEED)
+        return evaluate_detections(detections, labels, facts, Criteria(threshold, radius_px, MATCH_IOU), SEED)
+
+    for selection, by_part in loaded.items():
+        evaluation = evaluated(counted, by_part)
         evaluations[selection] = evaluation
         regions[selection] = [_region(evaluation, name, of_frame) for name in dict.fromkeys(of_frame)]
-    images = [image for part in parts for image in splits[part.name].frames.images]
+        for part in apart:
+            of_part = evaluated([part], by_part)
+            regions[selection].append(_region(of_part, part.region, [part.region] * len(splits[part.name])))
+    images = [image for part in counted for image in splits[part.name].frames.images]
     return Score(evaluations, regions, images, {part.name: (len(splits[part.name]), part.n_locked) for part in parts})
 
 
