@@ -47,8 +47,8 @@ class Tiling:
 
 
 MIN_COARSE_RADIUS_PX = 6.0
-"""Minimum radius that `detect predict` sets for coarse scales. On rendered validation frames, 4 to 16 px have equal AP within
-0.0005, and craters above 20 px lose recall from 20 px on (docs/notebook/2026-11-28-real-pictures.md)."""
+"""Minimum radius that `detect predict` sets for coarse scales. On rendered validation frames, 4 to 16 px have equal AP
+within 0.0005; from 20 px on, craters above 20 px are lost (docs/notebook/2026-11-28-real-pictures.md)."""
 
 
 def pyramid(height_px: int, width_px: int, tile_px: int, finest: float = 1.0) -> tuple[float, ...]:
