@@ -21,7 +21,7 @@ from perilune_train.cli.options import (
 )
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.finished_run import check_output, config_of_run
-from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.inference.tiling import MIN_COARSE_RADIUS_PX, Tiling
 from perilune_train.shipped.models import shipped_run
 
 app = typer.Typer(
@@ -35,7 +35,7 @@ Scales = Annotated[
     typer.Option(
         "--scale",
         help="Factor by which images are resized before detection. Repeatable; detections at all scales are merged."
-        " [default: the run's scales]",
+        " [default for images: chosen from the size of each image; for a dataset: the run's scales]",
     ),
 ]
 TileSide = Annotated[
@@ -55,6 +55,12 @@ NoData = Annotated[
     ),
 ]
 Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels.")]
+
+
+def tiling_of(config: DetectConfig, scale: list[float] | None, tile: int, overlap: int, box_margin: float) -> Tiling:
+    """Tiling for images by the options of a command. Without scales, a pyramid from the finest scale of the run."""
+    scales, finest = tuple(scale) if scale else None, max(config.evaluation.scales)
+    return Tiling(tile, overlap, scales, box_margin, finest, MIN_COARSE_RADIUS_PX)
 
 
 def check_nodata(value: float | None) -> None:
@@ -206,7 +212,7 @@ def evaluate(
         from perilune_train.detect.images.labelled import Request
 
         folder = out or run / "images"
-        tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
+        tiling = tiling_of(config, scale, tile, overlap, box_margin)
         source = context.get_parameter_source("split")
         chosen = split if source is not None and source.name == "COMMANDLINE" else None
         check_nodata(nodata)
@@ -370,7 +376,7 @@ def predict(
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.images.predict import PredictSettings, predict_images
 
-    tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
+    tiling = tiling_of(config, scale, tile, overlap, box_margin)
     settings = PredictSettings(tiling, min_score, max(min_size, 2 * min_radius_px), nodata, top)
     with replaceable(out, ("detections.parquet",), overwrite=overwrite, inputs=(run, *images)) as folder:
         count = predict_images(images, run, config, folder, settings)

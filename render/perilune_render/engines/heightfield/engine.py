@@ -97,7 +97,8 @@ class HeightfieldEngine:
 
         Some pixels around them are new too. The new pixels equal the pixels of `render` with the same pose and seed.
         """
-        image = Radiance.empty(before.radiance_factor.shape)
+        height, width = before.radiance_factor.shape
+        image = Radiance.empty((height, width))
         image.radiance_factor[:], image.depth_m[:] = before.radiance_factor, before.depth_m
         pose, size = (position_m, rotation_camera_from_site), _SMALL_TILE_PX
         places = np.unique(np.argwhere(wanted) // size, axis=0) * size

@@ -139,10 +139,10 @@ def test_compare_shows_images(run, folder, tmp_path):
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_images_are_prepared_as_in_the_evaluation_of_the_run(folder, tmp_path):
+def test_scales_depend_on_the_run_and_the_image(folder, tmp_path):
     run = store_run(tmp_path / "runs", "evaluation.scales=[1,2]")
     arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out"]
-    for name, given, expected in (("own", (), "1.0 2.0"), ("other", ("--scale", "0.5"), "0.5")):
+    for name, given, expected in (("own", (), "2.0; 2.0 1.0"), ("other", ("--scale", "0.5"), "0.5")):
         result = CliRunner().invoke(app, [*arguments, str(tmp_path / name), *given])
         assert result.exit_code == 0, result.output
         assert json.loads((tmp_path / name / "metrics.json").read_text())["scales"] == expected

@@ -267,6 +267,16 @@ def test_an_old_detector_says_what_it_lacks(tmp_path, capsys):
     assert table[list(ELLIPSE_COLUMNS[3:])].isna().all(axis=None)
 
 
+def test_predict_says_which_scales_it_used(run, tmp_path, capsys):
+    for name, side in (("a.png", 100), ("b.png", 300)):
+        assert cv2.imwrite(str(tmp_path / name), noise(side, side))
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    for number, (scales, said) in enumerate(((None, "1 (1 image); 1, 1/2, 1/4 (1 image)"), ((1.0, 2.0), "1, 2"))):
+        settings = PredictSettings(Tiling(scales=scales), 0.9)
+        predict_images(paths, run, settings_of(run), tmp_path / f"out{number}", settings)
+        assert f"scales: {said}" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_folder_and_a_least_size(run, tmp_path):
     root = tmp_path / "pictures"
     root.mkdir()

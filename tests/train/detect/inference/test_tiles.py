@@ -19,6 +19,7 @@ from perilune_train.detect.inference.tiles import (
     suppress_in_blocks,
     tile_starts,
 )
+from perilune_train.detect.inference.tiling import described_by_image
 from perilune_train.models.ellipse import semi_axes
 
 
@@ -178,6 +179,72 @@ def test_many_boxes_are_suppressed_as_few_are():
     expected = suppress(boxes, scores, 0.3, len(boxes))
     assert 1000 < len(expected) < 5_500
     assert np.array_equal(kept, expected)
+
+
+def test_large_boxes_are_not_compared_with_every_box(monkeypatch):
+    """As `suppress`, although boxes as wide as the image lie over all blocks; the work grows with the boxes only."""
+    rng = np.random.default_rng(7)
+    corner, sides = rng.uniform(0, 5000, (30_000, 2)), np.exp(rng.uniform(np.log(3), np.log(30), (30_000, 1)))
+    sides[:60] = np.exp(rng.uniform(np.log(200), np.log(5000), (60, 1)))
+    boxes = np.concatenate([corner, corner + sides], axis=1)
+    scores = rng.permutation(30_000) / 30_000 + 1e-5
+    expected = suppress(boxes, scores, 0.3, len(boxes))
+    counts = []
+
+    def counted(some_boxes, *rest):
+        counts.append(len(some_boxes))
+        return suppress(some_boxes, *rest)
+
+    monkeypatch.setattr("perilune_train.detect.inference.tiles.suppress", counted)
+    assert np.array_equal(suppress_in_blocks(boxes, scores, 0.3), expected)
+    assert (sides[expected] > 512).sum() > 10
+    assert sum(counts) < 12 * len(boxes)
+
+
+@pytest.mark.parametrize(
+    ("size", "finest", "expected"),
+    [
+        ((1, 1), 1, (1,)),
+        ((128, 4000), 1, (1,)),
+        ((256, 256), 1, (1, 0.5)),
+        ((1024, 1024), 1, (1, 0.5, 0.25, 0.125)),
+        ((256, 256), 2, (2, 1, 0.5)),
+        ((10_000, 5_000), 1, tuple(0.5**k for k in range(7))),
+    ],
+)
+def test_a_pyramid_ends_with_the_shorter_side_in_half_a_tile(size, finest, expected):
+    assert Tiling(scales=None, finest=finest).scales_of(*size) == expected
+    assert Tiling(scales=(1.0, 2.0)).scales_of(*size) == (1, 2)
+
+
+def test_scales_as_text():
+    assert described_by_image([(2.0, 1.0, 0.5, 0.25)] * 3) == "2, 1, 1/2, 1/4"
+    assert described_by_image([(1.0,), (0.3, 1.0), (1.0,)]) == "1 (2 images); 0.3, 1 (1 image)"
+
+
+def test_a_crater_as_wide_as_the_image_is_found(detector):
+    """A disc of 1000 px in an image of 1024 px: no tile at scale 1 shows more than a part of it."""
+    blobs = Detector(Blobs(), detector.config, "cpu", False)
+    image, truth = discs(1024, 1024, 1024, 500)
+    image[-1, :30] = 0  # a second grey level in the corner tiles
+    found = detect_image(blobs, image, Tiling(scales=None))
+    assert iou_matrix(found.boxes, truth).max() > 0.95
+    assert iou_matrix(detect_image(blobs, image, Tiling(scales=(1.0, 0.5))).boxes, truth).max(initial=0) < 0.7
+
+
+@pytest.mark.parametrize(
+    ("scales", "radius", "expected"),
+    [((1.0, 0.5), 8, 1), ((1.0, 0.5), 20, 2), ((0.5,), 8, 1), ((2.0, 1.0), 8, 2)],
+)
+def test_small_boxes_of_a_reduced_image_are_left_to_finer_scales(detector, scales, radius, expected):
+    """Discs of 8 px radius have 4 px at half size, below the limit. At IoU 1 nothing is suppressed."""
+    evaluation = detector.config.evaluation.model_copy(update={"nms_iou": 1.0})
+    config = detector.config.model_copy(update={"evaluation": evaluation})
+    image, truth = discs(250, 250, 3 * radius, radius)
+    tiling = Tiling(tile_px=512, scales=scales, min_coarse_radius_px=6)
+    found = detect_image(Detector(Blobs(), config, "cpu", False), image, tiling)
+    assert len(truth) > 3
+    assert len(found.boxes) == expected * len(truth)
 
 
 def test_long_boxes_go_before_suppression(detector):

@@ -36,7 +36,7 @@ from perilune_train.detect.images.predict import table_of
 from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
-from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.inference.tiling import Tiling, described_by_image
 from perilune_train.records.metrics_file import Metrics, write_metrics
 from perilune_train.records.pictures import save_image
 
@@ -117,10 +117,11 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
     )
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
+    scales = [tiling.scales_of(image.height_px, image.width_px) for image in image_set.images]
     about = [
         f"run {code_span(run.resolve().name)}, best weights; {len(images)} images of {code_span(source.name)}",
         f"labels: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
-        f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
+        f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {described_by_image(scales)}"
         + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
         f"threshold {threshold_source}",
         score_meaning(detector.calibration),
@@ -140,7 +141,7 @@ def evaluate_images(run: Path, config: DetectConfig, source: Path, out: Path, se
     figures |= {
         "overlap_px": tiling.overlap_px,
         "box_margin_px": tiling.box_margin_px,
-        "scales": " ".join(map(str, tiling.scales)),
+        "scales": "; ".join(" ".join(map(str, each)) for each in dict.fromkeys(scales)),
     }
     write_metrics(out, figures)
     return figures

@@ -26,7 +26,7 @@ from perilune_train.detect.images.read import grey_of_array, read_grey
 from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import detect_image
-from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.inference.tiling import MIN_COARSE_RADIUS_PX, Tiling
 from perilune_train.shipped.models import shipped_models, shipped_run
 from perilune_train.training.runs import RunFolder
 
@@ -85,7 +85,9 @@ class CraterDetector:
         config = config_of_run(run)
         self.run = run
         self.threshold = chosen_threshold(run)
-        self._tiling = Tiling(scales=tuple(config.evaluation.scales))
+        self._tiling = Tiling(
+            scales=None, finest=max(config.evaluation.scales), min_coarse_radius_px=MIN_COARSE_RADIUS_PX
+        )
         self._detector: Detector = open_run(run, config)
 
     @overload
@@ -97,6 +99,7 @@ class CraterDetector:
 
         An image is a path (PNG, TIFF, JPEG; others with the extra `geo`), a NumPy array (height, width) or (height,
         width, 3), or a Pillow image. Pixels of more than 8 bits are stretched as by `perilune-train detect predict`.
+        The detector runs at several scales, which depend on the size of the image (`pyramid` in tiling.py).
         `threshold` is the minimum score; by default the threshold that the run chose on its validation split. Raises
         UserError if `image` is anything else, or if a file cannot be read.
         """

@@ -31,7 +31,7 @@ from perilune_train.detect.images.sequences import frames_of
 from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
-from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.inference.tiling import Tiling, described_by_image
 
 _SHOWN_DOUBTS = 5
 
@@ -70,9 +70,11 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
     with new_folder(out) as folder, progress_bar() as progress:
         check = progress.add_task("check", total=len(paths), unit="images", note="")
         references: list[Georeference | None] = []
+        scales: list[tuple[float, ...]] = []
         n_tiles = 0
         for path in paths:
             width, height = picture_size(path)
+            scales.append(tiling.scales_of(height, width))
             read_grey(path, nodata)
             references.append(_reference(path))
             n_tiles += count_tiles(height, width, tiling)
@@ -85,6 +87,7 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             )
         if detector.calibration is None:
             say("scores are no probabilities: the run has no calibration; `perilune-train detect calibrate` adds one")
+        say(f"scales: {described_by_image(scales)}")
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes, doubts = [], [], []
         for path, reference in zip(paths, references, strict=True):

@@ -52,7 +52,7 @@ def count_tiles(height_px: int, width_px: int, tiling: Tiling) -> int:
     return sum(
         len(tile_starts(round(height_px * s), tiling.tile_px, tiling.overlap_px))
         * len(tile_starts(round(width_px * s), tiling.tile_px, tiling.overlap_px))
-        for s in tiling.scales
+        for s in tiling.scales_of(height_px, width_px)
     )
 
 
@@ -66,7 +66,8 @@ def detect_image(
     """
     height, width = image.shape
     parts: list[Detections] = []
-    for scale in tiling.scales:
+    scales = tiling.scales_of(height, width)
+    for scale in scales:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         large = scale > 1 and size[0] * size[1] > _MAX_ENLARGED_PIXELS and min(size) >= tiling.tile_px
         scaled = Enlarged(image, *size) if large else resized(image, *size)
@@ -76,6 +77,9 @@ def detect_image(
             if whole.shape != scaled.shape:
                 # Drop craters in the reflected padding.
                 inside = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2 < size).all(axis=1)
+            if scale < min(1, max(scales)):
+                sides_px = np.maximum(detections.boxes[:, 2:] - detections.boxes[:, :2], 0)
+                inside &= np.sqrt(sides_px.prod(axis=1)) / 2 >= tiling.min_coarse_radius_px
             parts.append(detections.take(inside).divided(size[0] / width, size[1] / height))
     every = joined_detections(parts)
     found = every.take(suppress_in_blocks(every.boxes, every.scores, detector.config.evaluation.nms_iou))
@@ -88,19 +92,28 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 
     The time of `suppress` grows with the square of the number of boxes. Many boxes are therefore suppressed block by
     block of the image. Each block also includes the boxes centred within a margin around it: half a block or half the
-    side of the largest box, whichever is larger (the IoU of boxes with centres farther apart is below 0.5). The result
+    side of the largest box, whichever is larger (the IoU of boxes with centres farther apart is below 0.5). Boxes
+    larger than a block are suppressed separately, because a margin for them would put every box into every block; each
+    group also includes the boxes of the other group that are close enough in size to suppress its boxes. The result
     differs from `suppress` only if a long chain of boxes that suppress each other crosses a block.
     """
     if len(boxes) <= _MAX_TOGETHER:
         return suppress(boxes, scores, threshold_iou, len(boxes))
-    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-    margin = max(block_px / 2, float((boxes[:, 2:] - boxes[:, :2]).max()) / 2)
-    kept = []
+    # The IoU of two boxes is at most the ratio of their areas.
+    size, similar = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)), np.sqrt(threshold_iou)
+    is_large = size > block_px
+    among = np.flatnonzero(size > similar * block_px)
+    chosen = among[suppress(boxes[among], scores[among], threshold_iou, len(among))]
+    kept = [chosen[is_large[chosen]]]
+    among = np.flatnonzero(size <= block_px / similar)
+    centre = (boxes[among, :2] + boxes[among, 2:]) / 2
+    margin = max(block_px / 2, float((boxes[among, 2:] - boxes[among, :2]).max(initial=0)) / 2)
     for block in np.unique(np.floor(centre / block_px), axis=0):
         low, high = block * block_px, (block + 1) * block_px
-        near = np.flatnonzero(((centre >= low - margin) & (centre < high + margin)).all(axis=1))
+        near = among[((centre >= low - margin) & (centre < high + margin)).all(axis=1)]
         chosen = near[suppress(boxes[near], scores[near], threshold_iou, len(near))]
-        kept.append(chosen[((centre[chosen] >= low) & (centre[chosen] < high)).all(axis=1)])
+        middle = (boxes[chosen, :2] + boxes[chosen, 2:]) / 2
+        kept.append(chosen[((middle >= low) & (middle < high)).all(axis=1) & ~is_large[chosen]])
     every = np.concatenate(kept)
     return every[np.argsort(-scores[every], kind="stable")]
 
