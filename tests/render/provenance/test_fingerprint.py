@@ -170,7 +170,7 @@ def test_every_library_that_computes_is_recorded():
 
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
-    terrain = {"grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}
+    terrain = {"grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground", "unstamp"}
     assert known == terrain | {
         "pixels",
         "surface",

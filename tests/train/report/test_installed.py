@@ -23,7 +23,8 @@ def shown(tmp_path) -> tuple[Path, Path]:
     # Without the false detections of the trained network.
     found = pd.read_parquet(trained / "detections.parquet")
     found[found["score"] == 0.9].to_parquet(installed / "detections.parquet")
-    write_metrics(installed, {f"test/{key}": 0.9 for key in ("ap50_paper", "precision", "recall", "f1")})
+    figures = {f"test/{key}": 0.9 for key in ("ap50_paper", "precision", "recall", "f1")}
+    write_metrics(installed, {**figures, "test/threshold": 0.5})
     landing = runs / "navigate" / "demo-landing"
     landing.mkdir()
     rows = pd.DataFrame({"scene_id": "s004", "trajectory_id": "t004", "draw": 0, "time_s": [0.0, 1.0]})
