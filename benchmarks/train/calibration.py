@@ -23,7 +23,7 @@ from perilune_train.detect.calibration import fit_calibration, log_features, log
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import FOUND, IGNORED, find_overlaps
-from perilune_train.detect.evaluate.reliability import Judged, draw_reliability, expected_calibration_error
+from perilune_train.detect.evaluate.reliability import ScoredMatches, draw_reliability, expected_calibration_error
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.train.threshold import detect_validation
@@ -115,7 +115,7 @@ def main(
             here = scene == left_out
             mapped[here] = fit(scores[~here], radius[~here], matched[~here])(scores[here], radius[here])
         if name in _DRAWN:
-            draw_reliability(Judged(mapped, matched), out.with_name(f"reliability_{name.split(',')[0]}.png"))
+            draw_reliability(ScoredMatches(mapped, matched), out.with_name(f"reliability_{name.split(',')[0]}.png"))
         result[name] = _errors(mapped, matched, scores >= raw_threshold(folder), varied, radius, scene)
         answer(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in result[name].items()))
     write_text(out, json.dumps(result, indent=2) + "\n")
@@ -135,10 +135,10 @@ def _errors(
         "5-20 px": (radius_px >= 5) & (radius_px < 20),
         "20-50 px": radius_px >= 20,
     }
-    errors = {name: expected_calibration_error(Judged(mapped[part], matched[part])) for name, part in parts.items()}
-    errors["all, equal width"] = expected_calibration_error(Judged(mapped, matched), equal_width=True)
+    errors = {name: expected_calibration_error(ScoredMatches(mapped[part], matched[part])) for name, part in parts.items()}
+    errors["all, equal width"] = expected_calibration_error(ScoredMatches(mapped, matched), equal_width=True)
     of_scene = [
-        expected_calibration_error(Judged(mapped[scene == one], matched[scene == one])) for one in np.unique(scene)
+        expected_calibration_error(ScoredMatches(mapped[scene == one], matched[scene == one])) for one in np.unique(scene)
     ]
     limited = np.clip(mapped, 1e-6, 1 - 1e-6)
     likelihood = np.where(matched, np.log(limited), np.log1p(-limited))

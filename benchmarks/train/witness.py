@@ -7,7 +7,7 @@ differences from the published network:
   frame.
 - A query without a label is not penalised if its box overlaps an ignored label (`WitnessLoss`).
 - Batch norms start at a weight of 1 and are trained: `transformers` draws their weights with a standard deviation of
-  0.01 and freezes those of the backbone, which suits pretrained weights only.
+  0.01 and freezes the batch norms of the backbone, which suits pretrained weights only.
 """
 
 import math

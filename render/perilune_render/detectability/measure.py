@@ -31,6 +31,8 @@ from perilune_shared.geometry.ellipse import Ellipses
 from perilune_shared.labels.selection import read_labels
 from perilune_shared.storage.files import write_bytes, written_aside
 
+WORK_RECORD = "work.json"
+"""File in the folder of parts that says of which measurement the parts are."""
 VERSION = 1
 """Version of the observer; parts of another version are not resumed."""
 SCHEMA = pa.schema(
@@ -80,7 +82,7 @@ def measure(
     Finished batches are stored in the folder `parts`, and a later call with the same arguments uses them. Raises
     UserError if the folder holds parts of other arguments, or if the ground is not the ground of the dataset.
     """
-    _open_parts(parts, labels, plan)
+    work_record = _checked_record(parts, labels, plan)
     task = progress.add_task("detectability", total=len(labels.rows), unit="labels")
     tables = []
     for number, scene in enumerate(plan.scenes):
@@ -101,6 +103,8 @@ def measure(
             taken = rows[rows["crater_id"].isin(batch)]
             if not path.exists():
                 progress.update(task, note=f"{scene.scene_id}: batch {k + 1} of {len(batches)}")
+                # Create the folder only now, so that refused input leaves none.
+                write_bytes(parts / WORK_RECORD, work_record)
                 with written_aside(path) as aside:
                     pq.write_table(work.measured(batch, taken), aside)
             tables.append(_read_part(path, len(taken)))
@@ -167,8 +171,8 @@ def _check_ground(dataset: Dataset, scene: ScenePlan, ground: Scene) -> None:
         raise UserError(dataset.store, f"content_sha256 of {scene.scene_id}", found, expected)
 
 
-def _open_parts(parts: Path, labels: Labels, plan: Plan) -> None:
-    """Create the folder of parts, or check that its parts are of the same work."""
+def _checked_record(parts: Path, labels: Labels, plan: Plan) -> bytes:
+    """The record of this work. Raises UserError if the folder `parts` has the record of other work."""
     digest = hashlib.sha256(pd.util.hash_pandas_object(labels.rows[["frame_id", "crater_id"]]).to_numpy().tobytes())
     work = {
         "version": VERSION,
@@ -177,12 +181,11 @@ def _open_parts(parts: Path, labels: Labels, plan: Plan) -> None:
         "scenes": [scene.seed for scene in plan.scenes],
     }
     content = json.dumps(work).encode()
-    parts.mkdir(parents=True, exist_ok=True)
-    path = parts / "work.json"
+    path = parts / WORK_RECORD
     if path.exists() and path.read_bytes() != content:
         expected = "parts of this dataset, split and version; delete this folder, or choose another --out"
         raise UserError(parts, "parts", "parts of another measurement", expected)
-    write_bytes(path, content)
+    return content
 
 
 def _read_part(path: Path, n_rows: int) -> pa.Table:
@@ -199,4 +202,4 @@ def _read_part(path: Path, n_rows: int) -> pa.Table:
 def parts_of(parts: Path) -> Iterator[Path]:
     """The files that `measure` writes into a folder."""
     yield from sorted(parts.glob("[0-9]*-[0-9]*.parquet"))
-    yield parts / "work.json"
+    yield parts / WORK_RECORD

@@ -76,7 +76,7 @@ def _offsets(
 ) -> tuple[Array, Array, slice, slice]:
     """Offsets of pixels from the centre along and across the Sun, in radii, and the rows and columns of the pixels.
 
-    The pixels are those of the box around the disc of REACH radii.
+    The pixels fill the box around the disc of REACH radii.
     """
     half = REACH * np.hypot(axes_px[:, 0], axes_px[:, 1])
     limits = []

@@ -42,7 +42,7 @@ class Unstamped:
         """The scene without some of its craters, with their rays and boulders removed.
 
         Heights equal the heights of `grow_scene` without these craters, except for rounding to float32. The tables of
-        craters and rims are those of the whole scene.
+        craters and rims still list all craters.
         """
         scene, config = self._scene, self._config
         rows = self._index[np.searchsorted(self._ids, crater_ids)]

@@ -71,7 +71,7 @@ def test_tilt_and_direction_are_drawn_evenly_and_independently():
 
 
 def test_a_tilt_changes_nothing_else_of_a_flight():
-    """Positions and perturbations of the attitude are those of the level flight, about the axes of O_L."""
+    """A tilt changes neither the positions nor the perturbations of the attitude, which are about the axes of O_L."""
     level, tilted = (draw_motion(FlightConfig(**more), 7) for more in ({}, {"off_nadir_deg": 50.0}))
     for a, b in zip(level.path_at(TIMES), tilted.path_at(TIMES), strict=True):
         assert np.array_equal(a, b)

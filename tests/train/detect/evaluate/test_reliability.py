@@ -8,18 +8,18 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.matching import Detections, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.reliability import (
-    Judged,
+    ScoredMatches,
     calibration_errors,
     draw_reliability,
     expected_calibration_error,
-    judged,
+    decided_matches,
     reliability,
 )
 
 
 def test_an_error_by_hand():
     """Two bins of two detections: scores 0.1, 0.3 with no match, 0.6, 0.8 with one match."""
-    found = Judged(np.array([0.8, 0.1, 0.6, 0.3]), np.array([True, False, False, False]))
+    found = ScoredMatches(np.array([0.8, 0.1, 0.6, 0.3]), np.array([True, False, False, False]))
     mean, share, count = reliability(found, bins=2)
     assert mean == pytest.approx([0.2, 0.7]) and share == pytest.approx([0, 0.5]) and count.tolist() == [2, 2]
     assert expected_calibration_error(found, bins=2) == pytest.approx((0.2 + 0.2) / 2)
@@ -30,12 +30,12 @@ def test_true_probabilities_have_a_small_error():
     rng = np.random.default_rng(0)
     scores = rng.random(30_000)
     matched = rng.random(30_000) < scores
-    assert expected_calibration_error(Judged(scores, matched)) < 0.015
-    assert expected_calibration_error(Judged(scores**2, matched)) > 0.1
+    assert expected_calibration_error(ScoredMatches(scores, matched)) < 0.015
+    assert expected_calibration_error(ScoredMatches(scores**2, matched)) > 0.1
 
 
 def test_nothing_has_no_error(tmp_path):
-    nothing = Judged(np.zeros(0), np.zeros(0, bool))
+    nothing = ScoredMatches(np.zeros(0), np.zeros(0, bool))
     assert np.isnan(expected_calibration_error(nothing))
     draw_reliability(nothing, tmp_path / "empty.png")
     assert (tmp_path / "empty.png").stat().st_size > 1000
@@ -61,7 +61,7 @@ def overlaps():
 
 def test_detections_that_labels_cannot_decide_are_left_out(overlaps):
     """Left out: 0.8, which matches below the smallest radius, 0.7 on an ignored label, and 0.4, too small."""
-    found = judged(overlaps, overlaps.match(0.5, (2.0, 50.0)), (2.0, 50.0))
+    found = decided_matches(overlaps, overlaps.match(0.5, (2.0, 50.0)), (2.0, 50.0))
     assert found.scores.tolist() == [0.9, 0.6, 0.5] and found.matched.tolist() == [True, False, False]
     assert found.above(0.6).scores.tolist() == [0.9, 0.6]
 

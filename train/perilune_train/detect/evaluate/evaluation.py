@@ -34,7 +34,7 @@ from perilune_train.detect.evaluate.matching import (
     find_overlaps,
 )
 from perilune_train.detect.evaluate.metrics import figures, figures_of_rule, figures_over_ious
-from perilune_train.detect.evaluate.reliability import Judged, calibration_errors, judged
+from perilune_train.detect.evaluate.reliability import ScoredMatches, calibration_errors, decided_matches
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.spread import Resamples, Spread, draw_resamples, spreads
 
@@ -65,7 +65,7 @@ class Evaluation:
     """Matches at match_iou by the edge scoring rule (matching.py)."""
     by_iou: list[Matches]
     """Matches at each of COCO_IOUS."""
-    judged: Judged
+    decided_matches: ScoredMatches
     """Detections that the labels can decide, for calibration errors (reliability.py)."""
     calibration_errors: dict[str, float]
     """Expected calibration errors by the keys of `reliability.NAMES`."""
@@ -188,7 +188,7 @@ def evaluate_detections(
         matches,
         at_edge,
         by_iou,
-        judged(overlaps, matches, radius_px),
+        decided_matches(overlaps, matches, radius_px),
         calibration_errors(overlaps, matches, radius_px, threshold),
         figures_by_bin(overlaps, matches, facts, criteria, resamples),
         spreads(statistics, matches.selected_frame, resamples),

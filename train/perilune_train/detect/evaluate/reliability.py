@@ -30,7 +30,7 @@ NAMES = {
 
 
 @dataclass(frozen=True)
-class Judged:
+class ScoredMatches:
     """Scores of detections, and whether each matches a label."""
 
     scores: Array
@@ -38,27 +38,27 @@ class Judged:
     matched: NDArray[np.bool_]
     """Whether each detection matches a label (D,)."""
 
-    def above(self, threshold: float) -> "Judged":
+    def above(self, threshold: float) -> "ScoredMatches":
         """The detections with a score of at least `threshold`."""
         strong = self.scores >= threshold
-        return Judged(self.scores[strong], self.matched[strong])
+        return ScoredMatches(self.scores[strong], self.matched[strong])
 
 
-def judged(overlaps: Overlaps, matches: Matches, radius_px: tuple[float, float]) -> Judged:
+def decided_matches(overlaps: Overlaps, matches: Matches, radius_px: tuple[float, float]) -> ScoredMatches:
     """Detections that the labels can decide by the usual rule; `radius_px` is the evaluated range of radii."""
     radius = overlaps.radius_px()
     inside = (radius >= radius_px[0]) & (radius <= radius_px[1]) & ~overlaps.off_image
     decided = inside & (matches.outcome != IGNORED)
-    return Judged(matches.scores[decided], matches.outcome[decided] == FOUND)
+    return ScoredMatches(matches.scores[decided], matches.outcome[decided] == FOUND)
 
 
 def calibration_errors(
     overlaps: Overlaps, matches: Matches, radius_px: tuple[float, float], threshold: float
 ) -> dict[str, float]:
     """The errors of NAMES by key; NaN without detections."""
-    usual = judged(overlaps, matches, radius_px)
-    any_label = Judged(matches.scores, matches.label != NO_LABEL)
-    strict = Judged(matches.scores, matches.outcome == FOUND)
+    usual = decided_matches(overlaps, matches, radius_px)
+    any_label = ScoredMatches(matches.scores, matches.label != NO_LABEL)
+    strict = ScoredMatches(matches.scores, matches.outcome == FOUND)
     return {
         "ece": expected_calibration_error(usual),
         "ece_equal_width": expected_calibration_error(usual, equal_width=True),
@@ -68,7 +68,7 @@ def calibration_errors(
     }
 
 
-def reliability(detections: Judged, equal_width: bool = False, bins: int = BINS) -> tuple[Array, Array, Array]:
+def reliability(detections: ScoredMatches, equal_width: bool = False, bins: int = BINS) -> tuple[Array, Array, Array]:
     """Mean score, share of matches, and number of detections of each bin that is not empty (B,).
 
     Bins hold equal numbers of detections in order of score; with `equal_width`, each is 1 / `bins` of the range 0 to 1.
@@ -87,7 +87,7 @@ def reliability(detections: Judged, equal_width: bool = False, bins: int = BINS)
     )
 
 
-def expected_calibration_error(detections: Judged, equal_width: bool = False, bins: int = BINS) -> float:
+def expected_calibration_error(detections: ScoredMatches, equal_width: bool = False, bins: int = BINS) -> float:
     """Mean over detections of |mean score - share of matches| of the detection's bin; NaN without detections.
 
     Naeini, Cooper and Hauskrecht, 2015, "Obtaining Well Calibrated Probabilities Using Bayesian Binning".
@@ -96,7 +96,7 @@ def expected_calibration_error(detections: Judged, equal_width: bool = False, bi
     return float(np.average(np.abs(mean - share), weights=count)) if len(count) else float("nan")
 
 
-def draw_reliability(detections: Judged, path: Path) -> None:
+def draw_reliability(detections: ScoredMatches, path: Path) -> None:
     """Draw the share of matches against the mean score of both kinds of bins, and a histogram of the scores."""
     figure = Figure(figsize=(5.2, 5.6), layout="constrained")
     axes, below = figure.subplots(2, 1, height_ratios=[3, 1], sharex=True)

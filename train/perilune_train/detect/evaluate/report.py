@@ -43,7 +43,7 @@ def write_evaluation(
     dashed = {f"IoU {evaluation.match_iou:g}, {name}": curve(matches) for name, matches in others.items()}
     draw_curves(_with_ap(curves), folder / "precision_recall.png", dashed=_with_ap(dashed))
     write_curve(folder / CURVE_FILE, curve(evaluation.matches))
-    draw_reliability(evaluation.judged, folder / "reliability.png")
+    draw_reliability(evaluation.decided_matches, folder / "reliability.png")
     draw_bins(evaluation.bins, folder / "bins.png")
     draw_frames(evaluation, images, folder / "detections.png")
 

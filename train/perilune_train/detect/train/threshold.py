@@ -15,7 +15,7 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections, Overlaps, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
-from perilune_train.detect.evaluate.reliability import Judged, expected_calibration_error, judged
+from perilune_train.detect.evaluate.reliability import ScoredMatches, expected_calibration_error, decided_matches
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import detect_split
 from perilune_train.records.metrics_file import Metrics
@@ -46,10 +46,10 @@ class ValidationDetections:
         threshold, rule = curve(matches).operating_threshold(settings.min_precision)
         return threshold, f"{rule} on {self.frames}"
 
-    def judged(self, settings: EvaluationSettings) -> Judged:
-        """The detections that the labels can decide (`reliability.judged`)."""
+    def decided_matches(self, settings: EvaluationSettings) -> ScoredMatches:
+        """The detections that the labels can decide (`reliability.decided_matches`)."""
         overlaps = self._overlaps(settings)
-        return judged(overlaps, overlaps.match(settings.match_iou, self.radius_px), self.radius_px)
+        return decided_matches(overlaps, overlaps.match(settings.match_iou, self.radius_px), self.radius_px)
 
     def _overlaps(self, settings: EvaluationSettings) -> Overlaps:
         sizes = np.tile(self.size_px, (len(self.detections), 1))
@@ -85,11 +85,11 @@ def calibration_entries(found: ValidationDetections, settings: EvaluationSetting
     `raw_threshold` is the threshold of these scores. Without enough detections (`fit_calibration`), the only entry says
     so.
     """
-    decided = found.judged(settings)
+    decided = found.decided_matches(settings)
     calibration = fit_calibration(decided.scores, decided.matched)
     if calibration is None:
         return {"calibration": "none: too few detections, or scores without information"}
-    after = Judged(calibration.probabilities(decided.scores), decided.matched)
+    after = ScoredMatches(calibration.probabilities(decided.scores), decided.matched)
     return {
         "calibration": "beta",
         "calibration/log_score": calibration.log_score,
