@@ -135,10 +135,13 @@ def _errors(
         "5-20 px": (radius_px >= 5) & (radius_px < 20),
         "20-50 px": radius_px >= 20,
     }
-    errors = {name: expected_calibration_error(ScoredMatches(mapped[part], matched[part])) for name, part in parts.items()}
+    errors = {
+        name: expected_calibration_error(ScoredMatches(mapped[part], matched[part])) for name, part in parts.items()
+    }
     errors["all, equal width"] = expected_calibration_error(ScoredMatches(mapped, matched), equal_width=True)
     of_scene = [
-        expected_calibration_error(ScoredMatches(mapped[scene == one], matched[scene == one])) for one in np.unique(scene)
+        expected_calibration_error(ScoredMatches(mapped[scene == one], matched[scene == one]))
+        for one in np.unique(scene)
     ]
     limited = np.clip(mapped, 1e-6, 1 - 1e-6)
     likelihood = np.where(matched, np.log(limited), np.log1p(-limited))

@@ -10,9 +10,9 @@ from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.reliability import (
     ScoredMatches,
     calibration_errors,
+    decided_matches,
     draw_reliability,
     expected_calibration_error,
-    decided_matches,
     reliability,
 )
 

@@ -81,7 +81,9 @@ def test_detections_stay_and_their_scores_are_probabilities(old, calibrated, spl
         assert np.array_equal(before.boxes, after.boxes)
         assert np.array_equal(calibration_of(run).probabilities(before.scores), after.scores)
         assert np.array_equal(before.scores >= chosen_threshold(old), after.scores >= chosen_threshold(run))
-    error = detect_validation(open_run(run, config_of_run(run)), split, mapped).decided_matches(config_of_run(run).evaluation)
+    error = detect_validation(open_run(run, config_of_run(run)), split, mapped).decided_matches(
+        config_of_run(run).evaluation
+    )
     assert abs(error.scores.mean() - error.matched.mean()) < 0.02
 
 

@@ -15,7 +15,7 @@ from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections, Overlaps, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
-from perilune_train.detect.evaluate.reliability import ScoredMatches, expected_calibration_error, decided_matches
+from perilune_train.detect.evaluate.reliability import ScoredMatches, decided_matches, expected_calibration_error
 from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import detect_split
 from perilune_train.records.metrics_file import Metrics
