@@ -42,6 +42,7 @@ USES = (
     use("perilune-render regenerate", "--manifest data/detect --verify --sample 1"),
     use("perilune-render survey", "--manifest data/nav --out survey --pixel-m 3"),
     use("perilune-render counterfactual", "--manifest data/detect --out without --frames-per-trajectory 1"),
+    use("perilune-render detectability", "--dataset data/detect --out detectability.parquet --frames-per-trajectory 1"),
     use("perilune-render frames", "--preset tiny --poses poses.csv --out frames", *_SCENE),
     use("perilune-render preview", "--preset tiny --out preview.png", *QUICK),
     use("perilune-render ground", "--preset tiny --out scene.glb", *QUICK),
@@ -68,6 +69,7 @@ USES = (
     use("perilune-train config"),
     use("perilune-train models"),
     use("perilune-train detect train", "--dataset drawn/detect", *_TINY),
+    use("perilune-train detect calibrate", "--dataset drawn/detect --run runs/detect/tiny", code=2),
     use("perilune-train detect evaluate", "--dataset drawn/detect --run runs/detect/tiny --out evaluated"),
     use("perilune-train detect predict", "preview.png --out predicted"),
     use(

@@ -20,7 +20,7 @@ MAINS: dict[str, Callable[[], None]] = {
 }
 RESUMED = {
     "perilune-render dataset", "perilune-render develop", "perilune-render survey", "perilune-render counterfactual",
-    "perilune-render frames",
+    "perilune-render frames", "perilune-render detectability",
 }  # fmt: skip
 """The same command resumes, or leaves a finished dataset unchanged."""
 RUNS = {
