@@ -48,11 +48,13 @@ def state(kind: str = "detector") -> dict:
     return dict(build(NAVIGATOR if kind == "warp" else STACK).state_dict())
 
 
-def elliptic(numbers: int, value: float = 0.0) -> dict:
-    """Weights of ellipse outputs, `numbers` for each cell."""
-    layers = {8: 32, 16: 64, 32: 128}
-    weights = {f"ellipse_heads.{stride}.weight": torch.full((numbers, n, 1, 1), value) for stride, n in layers.items()}
-    return weights | {f"ellipse_heads.{stride}.bias": torch.full((numbers,), value) for stride in layers}
+def elliptic(numbers: int, value: float | None = None) -> dict:
+    """Weights of a detector of ellipses whose last layers have `numbers` outputs, all `value` if it is given."""
+    weights = dict(YOLOv3(torch.ones(3, 3, 2), **DETECTOR | {"ellipses": True}).state_dict())
+    for key, old in weights.items():
+        if key.startswith("ellipse_heads.") and ".1." in key:
+            weights[key] = old[:numbers].clone() if value is None else torch.full_like(old[:numbers], value)
+    return weights
 
 
 def saved(architecture: object = DETECTOR, weights: object = None, **more: object) -> bytes:
@@ -203,17 +205,17 @@ CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
     "strides of 2": (lambda: saved(DETECTOR | {"strides": [2, 4, 8]}), "strides [8, 16, 32] or [4, 8, 16]"),
     "ellipses are text": (lambda: saved(DETECTOR | {"ellipses": "\x1b[31myes"}), "architecture.ellipses"),
     "ellipses of 2": (lambda: saved(DETECTOR | {"ellipses": 2}), "architecture.ellipses"),
-    "ellipses without weights": (lambda: saved(DETECTOR | {"ellipses": True}), "ellipse_heads.16.bias: got nothing"),
+    "ellipses without weights": (lambda: saved(DETECTOR | {"ellipses": True}), "ellipse_heads.16"),
     "weights of ellipses without the setting": (
-        lambda: saved(weights=state() | {"ellipse_heads.8.bias": torch.zeros(15)}),
-        "ellipse_heads.8.bias: got (15,), expected no such tensor",
+        lambda: saved(weights=state() | {"ellipse_heads.8.1.bias": torch.zeros(15)}),
+        "ellipse_heads.8.1.bias: got (15,), expected no such tensor",
     ),
     "weights of other ellipses": (
-        lambda: saved(DETECTOR | {"ellipses": True}, state() | elliptic(5)),
-        "ellipse_heads.16.bias: got (5,), expected (15,)",
+        lambda: saved(DETECTOR | {"ellipses": True}, elliptic(5)),
+        "ellipse_heads.16.1.bias: got (5,), expected (15,)",
     ),
     "deviations that are NaN": (
-        lambda: saved(DETECTOR | {"ellipses": True}, state() | elliptic(15, float("nan"))),
+        lambda: saved(DETECTOR | {"ellipses": True}, elliptic(15, float("nan"))),
         "numbers are not finite",
     ),
     "no ellipses in a setting of the wrong name": (
@@ -395,6 +397,6 @@ def test_good_weights_pass(tmp_path: Path) -> None:
     assert isinstance(network.state_dict(), OrderedDict)
     # Weights that state no `ellipses`, as of 0.1.0, have none; others say that they have them.
     assert not loaded.ellipses and loaded.detect_ellipses(torch.zeros(1, 3, 32, 32))[2] is None
-    content = saved(DETECTOR | {"ellipses": True}, state() | elliptic(15))
+    content = saved(DETECTOR | {"ellipses": True}, elliptic(15))
     (tmp_path / "ellipses.ckpt").write_bytes(content)
     assert detector.load_detector(tmp_path / "ellipses.ckpt").ellipses

@@ -72,6 +72,11 @@ class AugmentSettings(Section):
     noise: Annotated[float, Field(ge=0, le=100)] = 1.0
     """Largest standard deviation of the added Gaussian noise, in grey levels of 0 to 255. Rendered frames already
     contain the sensor's noise."""
+    levels: Fraction = 0.0
+    """Fraction of the frames that are reduced to 12 to 64 grey levels, as in files that use a small part of their
+    range. The logarithm of the number is uniformly distributed."""
+    jpeg: Fraction = 0.0
+    """Fraction of the frames that are compressed by JPEG, at a quality between 30 and 95."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "AugmentSettings":
@@ -98,7 +103,7 @@ class LossSettings(Section):
     """Weight of L_obj."""
     lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
-    lambda_ellipse: Weight = 0.5
+    lambda_ellipse: Weight = 5.0
     """Weight of the loss of the ellipses' correlations, used with `ellipses`."""
     lambda_sigma: Weight = 0.05
     """Weight of the loss of the ellipses' standard deviations, used with `ellipses`."""

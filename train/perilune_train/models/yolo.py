@@ -28,8 +28,10 @@ class YOLOv3(nn.Module):
     objectness. The heads may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than
     6 px. The neck then still starts at stride 32, with one 1 x 1 convolution. `width` scales backbone and neck.
 
-    With `ellipses`, a second output layer of each head predicts 5 further numbers per anchor: the shape of the ellipse
-    in the box, and standard deviations (models/ellipse.py). The first 5 numbers and their weights do not change.
+    With `ellipses`, a second head on each stride, of the same form, predicts 5 further numbers per anchor: the shape of
+    the ellipse in the box, and standard deviations (models/ellipse.py). The first 5 numbers and their weights do not
+    change. Both heads share the branch, but not its last 3 x 3 block: with a shared block, the direction of an ellipse
+    was not learned.
     """
 
     anchors: Tensor
@@ -74,7 +76,9 @@ class YOLOv3(nn.Module):
         self.ellipse_heads = nn.ModuleDict()
         if ellipses:
             for stride in self.strides:
-                self.ellipse_heads[str(stride)] = _ellipse_output(2 * scaled(16 * stride, width))
+                channels = scaled(16 * stride, width)
+                output = _ellipse_output(2 * channels)
+                self.ellipse_heads[str(stride)] = nn.Sequential(conv_block(channels, 2 * channels, 3), output)
 
     @property
     def ellipses(self) -> bool:
@@ -102,12 +106,9 @@ class YOLOv3(nn.Module):
             x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
             if stride in self.branches:
                 x = self.branches[stride](x)
+                raw = _per_anchor(self.heads[stride](x))
                 if stride in self.ellipse_heads:
-                    head = self.heads[stride][0](x)  # type: ignore[index]
-                    both = self.heads[stride][1](head), self.ellipse_heads[stride](head)  # type: ignore[index]
-                    raw = torch.cat([_per_anchor(part) for part in both], dim=-1)
-                else:
-                    raw = _per_anchor(self.heads[stride](x))
+                    raw = torch.cat([raw, _per_anchor(self.ellipse_heads[stride](x))], dim=-1)
                 outputs.insert(0, raw.float())
             if stride in self.laterals:
                 above = self.laterals[stride](x)

@@ -173,7 +173,9 @@ def test_augmentation_off_changes_nothing(split):
     np.testing.assert_array_equal(selected, labels.selected)
 
 
-@pytest.mark.parametrize("setting", [{"gain": 0.5}, {"gamma": 0.5}, {"blur_px": 3.0}, {"noise": 5.0}])
+@pytest.mark.parametrize(
+    "setting", [{"gain": 0.5}, {"gamma": 0.5}, {"blur_px": 3.0}, {"noise": 5.0}, {"levels": 1.0}, {"jpeg": 1.0}]
+)
 def test_each_augmentation_changes_the_pixels_alone(split, setting):
     image, labels, pixels, boxes, selected = changed(split, PLAIN.model_copy(update=setting), 1)
     assert np.abs(pixels - image).mean() > 0.3
@@ -221,6 +223,18 @@ def test_stretching_clips_the_given_share_at_most(split):
     assert 0.1 < shares[:, 0].max() <= 0.2
     assert 0.1 < shares[:, 1].max() < 0.25
     assert np.ptp(shares, axis=0).min() > 0.05
+
+
+def test_reduced_grey_levels_and_compression_affect_their_fraction_of_the_frames(split):
+    image, counts, errors = split.frames.images[0], [], []
+    for seed in range(40):
+        few = changed(split, PLAIN.model_copy(update={"levels": 0.5}), seed)[2]
+        counts.append(len(np.unique(few)))
+        compressed = changed(split, PLAIN.model_copy(update={"jpeg": 0.5}), seed)[2]
+        errors.append(np.abs(compressed - image).mean())
+    reduced = np.array(counts) <= 64
+    assert 10 <= reduced.sum() <= 30 and np.ptp(np.array(counts)[reduced]) > 10
+    assert 10 <= (np.array(errors) == 0).sum() <= 30 and max(errors) < 12
 
 
 def test_one_scale_for_all_frames(split):

@@ -37,7 +37,7 @@ def test_loss_by_hand():
     raw = torch.zeros(1, 3, 4, 4, 10)
     found = ellipse_loss([raw], targets_of(one_label(0.5)), ANCHORS, STRIDES, LossSettings())
     # Three positive predictors: one has the label's box, the others are 8 px away (IoU 0) and learn the correlation.
-    correlation = 0.5 - 0.1 / 2
+    correlation = 0.5**2
     sigma = math.sqrt(8) * math.exp(-2)
     axes = [4 - 4 * math.sqrt(1.5), 4 - 4 * math.sqrt(0.5)]
     likelihood = sum((error / sigma) ** 2 / 2 + math.log(sigma) for error in (0, 0, *axes))

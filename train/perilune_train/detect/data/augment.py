@@ -11,6 +11,10 @@ from perilune_train.detect.config import AugmentSettings
 from perilune_train.detect.data.ignored import MARGIN
 
 Array = NDArray[np.float64]
+_LEVELS = 12, 64
+"""Smallest and largest number of grey levels of a reduced frame."""
+_QUALITY = 30, 95
+"""Lowest and highest quality of a compressed frame."""
 
 
 def turn(image: NDArray, outlines: Array, kind: int) -> tuple[NDArray, Array]:
@@ -94,4 +98,17 @@ def augment(
     noise = rng.uniform(0, settings.noise)
     if noise > 0:
         pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
-    return pixels, outlines, selected
+    return stored(pixels, settings, rng), outlines, selected
+
+
+def stored(pixels: NDArray[np.float32], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Grey levels (height, width) after the losses of files: fewer grey levels, and compression by JPEG."""
+    # Draw numbers only for effects that are used, so that other settings give the same frames as before.
+    if settings.levels and rng.random() < settings.levels:
+        step = 255 / (np.round(np.exp(rng.uniform(*np.log(_LEVELS)))) - 1)
+        pixels = (np.rint(np.clip(pixels, 0, 255) / step) * step).astype(np.float32)
+    if settings.jpeg and rng.random() < settings.jpeg:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(_QUALITY[0], _QUALITY[1] + 1))]
+        _, content = cv2.imencode(".jpg", np.clip(np.rint(pixels), 0, 255).astype(np.uint8), quality)
+        pixels = np.asarray(cv2.imdecode(content, cv2.IMREAD_GRAYSCALE), np.float32)
+    return pixels

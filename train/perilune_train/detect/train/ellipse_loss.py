@@ -1,7 +1,6 @@
 """Loss of the ellipse outputs of the detector: correlation of the ellipse in the box, and standard deviations."""
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from perilune_train.detect.config import LossSettings
@@ -13,8 +12,6 @@ from perilune_train.models.yolo import OUTPUTS, decode
 _MIN_IOU = 0.5
 """Predictors whose boxes overlap the label less do not train the standard deviations, which describe detections that
 match a label."""
-_SMOOTH_CORRELATION = 0.1
-"""Error of a correlation at which its loss changes from quadratic to linear."""
 
 
 def ellipse_loss(
@@ -22,7 +19,8 @@ def ellipse_loss(
 ) -> tuple[Tensor, Tensor]:
     """L_ellipse and L_sigma of raw outputs (N, 3, h, w, 10) per scale, averaged over positive predictors as L_ciou.
 
-    L_ellipse is the smooth L1 distance between the predicted correlation and the label's.
+    L_ellipse is the squared distance between the predicted correlation and the label's. The smooth L1 distance did not
+    work: most craters are seen from almost above, so its minimum for an uncertain network is a correlation of 0.
 
     L_sigma is the Gaussian negative log-likelihood, without its constant, of four errors: of the centre's x and y, and
     of the semi-major and the semi-minor axis, pixels. It is 0 if the box and the label box have an IoU below 0.5. The
@@ -40,7 +38,7 @@ def ellipse_loss(
         shape, labels, true_correlations = chosen[:, OUTPUTS:], assignment.boxes, assignment.correlations
         boxes = decode(chosen, torch.stack([column, row], 1), own_anchors[anchor], stride).detach()
         correlations = decode_correlation(shape)
-        distances = F.smooth_l1_loss(correlations, true_correlations, reduction="none", beta=_SMOOTH_CORRELATION)
+        distances = (correlations - true_correlations).square()
         centre_error = (boxes[:, :2] + boxes[:, 2:] - labels[:, :2] - labels[:, 2:]) / 2
         axis_error = semi_axes(boxes, correlations.detach()) - semi_axes(labels, true_correlations)
         sigmas = decode_sigmas(shape, boxes)
