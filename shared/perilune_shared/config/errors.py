@@ -52,6 +52,8 @@ _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "ma
 
 
 _KEY = "[key]"
+_FEW = 3
+"""Largest number of settings that a message lists if it names none of them."""
 """Last part of pydantic's location if a key of a mapping is wrong, not the value."""
 
 
@@ -112,6 +114,8 @@ def got_of(fault: ErrorDetails) -> str:
     if fault["type"] == "value_error" and isinstance(value, Mapping):
         words = set(re.findall(r"\w+", expected_of(fault)))
         named = [f"{key} {formatted(each)}" for key, each in value.items() if key in words]
+        if not named and len(value) <= _FEW and not any(isinstance(each, Mapping | list) for each in value.values()):
+            named = [f"{key} {formatted(each)}" for key, each in value.items()]
         return ", ".join(named) if named else "settings that do not fit together"
     return formatted(value)
 

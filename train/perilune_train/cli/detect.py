@@ -19,9 +19,9 @@ from perilune_train.cli.options import (
     RunsFolder,
     Settings,
 )
-from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.config import MIN_COARSE_RADIUS_PX, DetectConfig
 from perilune_train.detect.finished_run import check_output, config_of_run
-from perilune_train.detect.inference.tiling import MIN_COARSE_RADIUS_PX, Tiling
+from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.shipped.models import shipped_run
 
 app = typer.Typer(

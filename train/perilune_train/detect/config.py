@@ -14,6 +14,12 @@ COARSEST_STRIDE = 32
 """The sides of the network's input are multiples of this number of pixels."""
 
 
+MIN_COARSE_RADIUS_PX = 6.0
+"""Minimum radius of a box at a coarse scale. The finer scale finds smaller craters better, and reduced images add false
+positives of a few pixels. On rendered validation frames, 4 to 16 px have equal AP within 0.0005; from 20 px on, craters
+above 20 px are lost (docs/notebook/2026-11-28-real-pictures.md)."""
+
+
 class LabelSettings(Selection):
     """Selection of the craters to find.
 
@@ -123,6 +129,9 @@ class EvaluationSettings(Section):
     """Factors by which frames are resized before inference; detections at all scales are merged. Scales 1 and 2
     together find more of the smallest craters but cost five times as much. Validation during training uses scale 1
     only."""
+    min_coarse_radius_px: Annotated[float, Field(ge=0, le=1000)] = MIN_COARSE_RADIUS_PX
+    """Minimum radius sqrt(w h) / 2 of a box in a frame that was reduced (scale below 1), in pixels of the reduced
+    frame, if detection also runs at a finer scale."""
     match_iou: Annotated[float, Field(gt=0, lt=1)] = 0.5
     """Minimum IoU of a detection and a label for a match."""
     nms_iou: Annotated[float, Field(gt=0, lt=1)] = 0.45

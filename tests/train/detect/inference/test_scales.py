@@ -92,6 +92,23 @@ def test_a_small_crater_is_seen_at_the_scale_that_enlarges_it_and_a_large_one_on
     assert both[0].boxes[0] == pytest.approx([60, 60, 65, 65], abs=0.6)
 
 
+class CoarseOnly(OneSpot):
+    """As OneSpot, but finds nothing in frames of 128 px."""
+
+    def detect_ellipses(self, images):
+        boxes, scores, _ = super().detect_ellipses(images)
+        return boxes, scores * (images.shape[-1] < 128), None
+
+
+@pytest.mark.parametrize(("scales", "least", "count"), [("0.5", 6, 1), ("0.5,1", 3, 1), ("0.5,1", 6, 0)])
+def test_a_reduced_frame_gives_large_craters_only_if_a_finer_scale_is_used(scales, least, count):
+    """In the reduced frame, the crater has a radius of 4.5 px."""
+    frames = spot(128, 128, (30, 30, 50, 46))[None]
+    settings = f"detect.evaluation.scales=[{scales}]", f"detect.evaluation.min_coarse_radius_px={least}"
+    (found,) = detect_at_scales(cpu(CoarseOnly(), *settings), frames)
+    assert len(found.scores) == count
+
+
 def test_several_scales_go_through_one_suppression(tmp_path):
     """Of a real network: the same as both looks put together by hand."""
     run = store_run(tmp_path)

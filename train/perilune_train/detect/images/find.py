@@ -26,7 +26,7 @@ from perilune_train.detect.images.read import grey_of_array, read_grey
 from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import detect_image
-from perilune_train.detect.inference.tiling import MIN_COARSE_RADIUS_PX, Tiling
+from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.shipped.models import shipped_models, shipped_run
 from perilune_train.training.runs import RunFolder
 
@@ -86,7 +86,9 @@ class CraterDetector:
         self.run = run
         self.threshold = chosen_threshold(run)
         self._tiling = Tiling(
-            scales=None, finest=max(config.evaluation.scales), min_coarse_radius_px=MIN_COARSE_RADIUS_PX
+            scales=None,
+            finest=max(config.evaluation.scales),
+            min_coarse_radius_px=config.evaluation.min_coarse_radius_px,
         )
         self._detector: Detector = open_run(run, config)
 

@@ -75,19 +75,24 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
     """Detections of frames (N, height, width), one entry per frame, in pixels of the frames.
 
     The network runs once for each of `detect.evaluation.scales`; one suppression merges the detections of all scales.
+    Small boxes of reduced frames are dropped (`detect.evaluation.min_coarse_radius_px`).
     """
     height, width = frames.shape[1:]
+    settings = detector.config.evaluation
     boxes, scores, shapes = [], [], []
-    for factor in detector.config.evaluation.scales:
+    for factor in settings.scales:
         to_height, to_width = scaled_size(height, width, factor)
         found, confidence, shape = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
         ratios = torch.tensor([to_width / width, to_height / height], device=detector.device)
         boxes.append(found / ratios.repeat(2))
+        if factor < min(1.0, max(settings.scales)):
+            radius_px = (found[..., 2:] - found[..., :2]).clamp(min=0).prod(-1).sqrt() / 2
+            confidence = confidence * (radius_px >= settings.min_coarse_radius_px)
         scores.append(confidence)
         if shape is not None:
             shapes.append(shape if factor == 1 else resized_shapes(shape, found, boxes[-1], ratios))
     every_shape = torch.cat(shapes, 1) if shapes else None
-    merged = detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation, every_shape)
+    merged = detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), settings, every_shape)
     return [detector.calibrated(of_frame) for of_frame in merged]
 
 

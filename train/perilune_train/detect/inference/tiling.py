@@ -46,11 +46,6 @@ class Tiling:
             raise UserError("--box-margin", "", self.box_margin_px, "0 to 10")
 
 
-MIN_COARSE_RADIUS_PX = 6.0
-"""Minimum radius that `detect predict` sets for coarse scales. On rendered validation frames, 4 to 16 px have equal AP
-within 0.0005; from 20 px on, craters above 20 px are lost (docs/notebook/2026-11-28-real-pictures.md)."""
-
-
 def pyramid(height_px: int, width_px: int, tile_px: int, finest: float = 1.0) -> tuple[float, ...]:
     """Scales for an image of any size: `finest`, half of it, ... down to the whole shorter side in half a tile.
 
