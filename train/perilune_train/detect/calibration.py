@@ -14,13 +14,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import expit
 
 Array = NDArray[np.float64]
 MIN_EACH = 50
 """Smallest number of matched detections, and of false ones, from which a calibration is fitted."""
 _SMALLEST, _LARGEST = 1e-12, 1 - 2.0**-25
 """Scores are limited to this range: the network's scores are float32, whose largest value below 1 is 1 - 2^-24."""
-_STEPS, _CONVERGED = 100, 1e-10
+_GRADIENT = 1e-10
+"""Gradient of the mean log-likelihood at which a fit ends."""
 
 
 @dataclass(frozen=True)
@@ -79,23 +82,18 @@ def log_features(scores: NDArray[Any]) -> Array:
 
 
 def logistic_fit(features: Array, target: Array) -> Array:
-    """Coefficients (K,) of the logistic regression of targets (N,) on features (N, K), by Newton's method."""
+    """Coefficients (K,) of the logistic regression of targets (N,) on features (N, K), by maximum likelihood."""
 
-    def loss(coefficients: Array) -> float:
+    def loss(coefficients: Array) -> tuple[float, Array]:
         logit = features @ coefficients
-        return float(np.sum(np.logaddexp(0, logit) - target * logit))
+        value = np.sum(np.logaddexp(0, logit) - target * logit)
+        return float(value) / len(target), features.T @ (expit(logit) - target) / len(target)
 
-    coefficients = np.zeros(features.shape[1])
-    now = loss(coefficients)
-    for _ in range(_STEPS):
-        probability = 1 / (1 + np.exp(-(features @ coefficients)))
-        gradient = features.T @ (probability - target)
-        weight = np.maximum(probability * (1 - probability), 1e-12)
-        step = np.linalg.lstsq(features.T @ (features * weight[:, None]), gradient, rcond=None)[0]
-        # Halve the step until the loss falls: full steps can overshoot where the curvature is small.
-        while (after := loss(coefficients - step)) > now and np.abs(step).max() > _CONVERGED:
-            step = step / 2
-        coefficients, now = coefficients - step, min(after, now)
-        if np.abs(step).max() <= _CONVERGED:
-            break
-    return coefficients
+    def curvature(coefficients: Array) -> Array:
+        probability = expit(features @ coefficients)
+        weight = probability * (1 - probability) / len(target)
+        return np.asarray(features.T @ (features * weight[:, None]))
+
+    start = np.zeros(features.shape[1])
+    fit = minimize(loss, start, jac=True, hess=curvature, method="trust-exact", options={"gtol": _GRADIENT})
+    return np.asarray(fit.x)
