@@ -30,7 +30,7 @@ _RAYS_AT_ONCE = 8192
 """Largest number of rays in a tile of several rows. The photometry of this many rays fits into the cache of a core."""
 _SMALL_TILE_PX = 16
 """Width and height of the tiles in which parts of an image are rendered again, pixels."""
-_LIT = 1e-4
+LIT = 1e-4
 """Radiance factor above which a pixel counts as sunlit."""
 _RAYS_PER_VERTEX = 0.3
 """Rays per ground vertex after which the horizon is computed. For fewer rays, this would take longer than it saves."""
@@ -165,7 +165,7 @@ class HeightfieldEngine:
             first = tile[0].start, tile[1].start
             see(ground, rocks, self.tops, view, Tile(first, moves, suns, image.depth_m, image.normal, angles))
             seen = reflected(self._law, angles).mean(axis=0)
-            image.radiance_factor[tile], image.sunlit[tile] = seen, seen > _LIT
+            image.radiance_factor[tile], image.sunlit[tile] = seen, seen > LIT
 
         if self._threads is not None:
             list(self._threads.map(cast, tiles))

@@ -4,6 +4,7 @@ The compiled Hapke law runs the operations of `perilune_render.imaging.photometr
 calls the C library functions that NumPy calls, so the results are equal to the bit.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS
 from perilune_render.imaging.photometry import (
     HAPKE,
+    LUNAR_LAMBERT_SCALE,
     MIN_SINE_SQUARED,
     HapkeParameters,
     chi_of,
@@ -19,7 +21,8 @@ from perilune_render.imaging.photometry import (
 )
 from perilune_render.provenance.kernels import njit
 
-_ONE, _TWO, _MIN_SINE_SQUARED = np.float32(1), np.float32(2), np.float32(MIN_SINE_SQUARED)
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_MIN_SINE_SQUARED, _TURN = np.float32(MIN_SINE_SQUARED), np.float32(2 * np.pi)
 
 
 class _Factors(NamedTuple):
@@ -90,23 +93,83 @@ def reflected(law: str, angles: np.ndarray) -> np.ndarray:
     return factor
 
 
+@njit(**INLINED)
+def disc_place(radius_rad, first, second):
+    """Point of the Sun's disc at unit distance from two uniform numbers, as `disc_places`."""
+    length, angle = math.tan(radius_rad * math.sqrt(first)), _TURN * second
+    return length * math.cos(angle), length * math.sin(angle)
+
+
 @njit(**WITHOUT_COUNTS)
 def _fill_disc(drawn, radius_rad, points):
     n_samples, height, width, _ = drawn.shape
-    turn = np.float32(2 * np.pi)
     for s in range(n_samples):
         for i in range(height):
             for j in range(width):
-                length, angle = np.tan(radius_rad * np.sqrt(drawn[s, i, j, 0])), turn * drawn[s, i, j, 1]
-                points[s, i, j, 0], points[s, i, j, 1] = length * np.cos(angle), length * np.sin(angle)
+                points[s, i, j, 0], points[s, i, j, 1] = disc_place(radius_rad, drawn[s, i, j, 0], drawn[s, i, j, 1])
 
 
 @njit(**INLINED)
 def _slopes(f, cosine):
     """Compiled copy of `photometry._slopes`."""
-    sine = np.sqrt(max(cosine * cosine * -_ONE + _ONE, _MIN_SINE_SQUARED))
+    sine = math.sqrt(max(cosine * cosine * -_ONE + _ONE, _MIN_SINE_SQUARED))
     exponent = cosine / sine * f.exponent_1
-    return sine, np.exp(exponent), np.exp(exponent * exponent * f.exponent_2)
+    return sine, math.exp(exponent), math.exp(exponent * exponent * f.exponent_2)
+
+
+@njit(**INLINED)
+def hapke_factor(f, mu0, mu, cos_phase):
+    """Compiled copy of `photometry.hapke` for float32 numbers; `f` are the constants of a parameter set."""
+    cos_l, cos_s = min(mu0, mu), max(mu0, mu)
+    sin_l, e1_l, e2_l = _slopes(f, cos_l)
+    sin_s, e1_s, e2_s = _slopes(f, cos_s)
+    open_l, open_s = _TWO - e1_l, _TWO - e1_s
+    cos_psi = min(max((cos_phase - mu0 * mu) / (sin_l * sin_s), -_ONE), _ONE)
+    psi = math.acos(cos_psi)
+    seen_as_one = math.exp(math.tan(psi * np.float32(0.499999)) * -_TWO)
+    per_both = f.slope / max(psi * e1_s * f.psi + open_l, np.float32(1e-4))
+    common = (cos_psi * np.float32(-0.5) + np.float32(0.5)) * e2_s
+    larger = sin_l * (e2_l - common) * per_both + cos_l
+    smaller = sin_s * (cos_psi * e2_l + common) * per_both + cos_s
+    alone_l = sin_l * e2_l / open_l * f.slope + cos_l
+    alone_s = sin_s * e2_s / open_s * f.slope + cos_s
+    shadowing = f.per_chi / (alone_l * (seen_as_one * (cos_s - alone_s) + alone_s))
+    larger, smaller = larger * f.chi, smaller * f.chi
+    total, product = larger + smaller, larger * smaller
+    multiple = (total * f.total_above + product * f.product_above) / (
+        product * f.product_below + (total * f.total_below + _ONE)
+    )
+    phase = (cos_phase * -f.lobes + f.lobe_sum) ** np.float32(-1.5) * f.backward + (
+        cos_phase * f.lobes + f.lobe_sum
+    ) ** np.float32(-1.5) * f.forward
+    half_tangent = math.sqrt(_TWO / min(cos_phase + _ONE, _TWO) - _ONE)
+    surge = f.surge / (half_tangent + f.h_s) + _ONE
+    return product / total * (shadowing * f.albedo) * (phase * surge + multiple)
+
+
+LAW_NUMBERS = {name: number for number, name in enumerate([*HAPKE, "lommel_seeliger", "lunar_lambert", "lambert"])}
+"""Number of each law for `factor_of`."""
+_N_HAPKE = len(HAPKE)
+_HALF_TURN = np.float32(180 / np.pi)
+
+
+def factors_of(law: str) -> _Factors:
+    """Constants of a law for `factor_of`; zeros for a law without constants."""
+    return _factors(HAPKE[law]) if law in HAPKE else _Factors(*[np.float32(0)] * len(_Factors._fields))
+
+
+@njit(**INLINED)
+def factor_of(law, f, mu0, mu, cos_phase):
+    """`photometry.reflectance_factor` for float32 numbers; `law` is a number of LAW_NUMBERS."""
+    if law < _N_HAPKE:
+        return hapke_factor(f, mu0, mu, cos_phase)
+    if law == _N_HAPKE:
+        return np.float32(0.1) / (mu0 + mu)
+    if law == _N_HAPKE + 1:
+        g = math.acos(min(max(cos_phase, -_ONE), _ONE)) * _HALF_TURN
+        share = max(_ONE + g * (np.float32(-0.019) + g * (np.float32(2.42e-4) + g * np.float32(-1.46e-6))), _ZERO)
+        return np.float32(LUNAR_LAMBERT_SCALE) * (_TWO * share / (mu0 + mu) + (_ONE - share))
+    return np.float32(0.12)
 
 
 @njit(**WITHOUT_COUNTS)
@@ -116,30 +179,4 @@ def _hapke(f, angles, result):
     The radiance factor is the product of `photometry.hapke`, the albedo and the cosine of incidence (0 in shadow).
     """
     for k in range(len(result)):
-        mu0, mu, cos_phase = angles[0, k], angles[1, k], angles[2, k]
-        cos_l, cos_s = min(mu0, mu), max(mu0, mu)
-        sin_l, e1_l, e2_l = _slopes(f, cos_l)
-        sin_s, e1_s, e2_s = _slopes(f, cos_s)
-        open_l, open_s = _TWO - e1_l, _TWO - e1_s
-        cos_psi = min(max((cos_phase - mu0 * mu) / (sin_l * sin_s), -_ONE), _ONE)
-        psi = np.arccos(cos_psi)
-        seen_as_one = np.exp(np.tan(psi * np.float32(0.499999)) * -_TWO)
-        per_both = f.slope / max(psi * e1_s * f.psi + open_l, np.float32(1e-4))
-        common = (cos_psi * np.float32(-0.5) + np.float32(0.5)) * e2_s
-        larger = sin_l * (e2_l - common) * per_both + cos_l
-        smaller = sin_s * (cos_psi * e2_l + common) * per_both + cos_s
-        alone_l = sin_l * e2_l / open_l * f.slope + cos_l
-        alone_s = sin_s * e2_s / open_s * f.slope + cos_s
-        shadowing = f.per_chi / (alone_l * (seen_as_one * (cos_s - alone_s) + alone_s))
-        larger, smaller = larger * f.chi, smaller * f.chi
-        total, product = larger + smaller, larger * smaller
-        multiple = (total * f.total_above + product * f.product_above) / (
-            product * f.product_below + (total * f.total_below + _ONE)
-        )
-        phase = (cos_phase * -f.lobes + f.lobe_sum) ** np.float32(-1.5) * f.backward + (
-            cos_phase * f.lobes + f.lobe_sum
-        ) ** np.float32(-1.5) * f.forward
-        half_tangent = np.sqrt(_TWO / min(cos_phase + _ONE, _TWO) - _ONE)
-        surge = f.surge / (half_tangent + f.h_s) + _ONE
-        factor = product / total * (shadowing * f.albedo) * (phase * surge + multiple)
-        result[k] = factor * angles[3, k] * angles[4, k]
+        result[k] = hapke_factor(f, angles[0, k], angles[1, k], angles[2, k]) * angles[3, k] * angles[4, k]

@@ -13,10 +13,11 @@ r"""What each ray of an image sees: the hit, its shading, and whether the Sun re
 
 - `begin_m` and `only_part` find the height at which all rays of a block may begin, and the part of the mesh below it;
 - `_read_ahead` prefetches the memory that the rays will need;
-- `_see` casts the ray of one sample (1), shades its hit by `ground_at` or `rock_normal` (2), moves the start of a
-  grazing shadow ray by `lift_at` (3), and casts the shadow ray (4), unless the hit is surely lit.
+- `sample_seen` casts the ray of one sample (1), shades its hit by `ground_at` or `rock_normal` (2), moves the start of
+  a grazing shadow ray by `lift_at` (3), and casts the shadow ray (4), unless the hit is surely lit.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -74,7 +75,7 @@ class Tile(NamedTuple):
     sampled point of the disc, 0 in shadow."""
 
 
-class _Block(NamedTuple):
+class Block(NamedTuple):
     """Start of all rays of a block of pixels."""
 
     begin_m: float
@@ -92,7 +93,7 @@ def _dot(ax, ay, az, bx, by, bz):
 def _normal(vertices, k):
     """Unit normal of a vertex, pointing upwards."""
     x, y = float(vertices[k, 0]), float(vertices[k, 1])
-    return x, y, np.sqrt(max(1 - x * x - y * y, 0.0))
+    return x, y, math.sqrt(max(1 - x * x - y * y, 0.0))
 
 
 @njit(inline="always", **WITHOUT_COUNTS)
@@ -127,13 +128,13 @@ def ground_at(ground, facet, x, y):
     v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, area, v, w = _corners(ground, facet, x, y)
     u = 1 - v - w
     fx, fy, fz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, area
-    size = 1 / np.sqrt(fx * fx + fy * fy + fz * fz)
+    size = 1 / math.sqrt(fx * fx + fy * fy + fz * fz)
     ax, ay, az = _normal(vertices, v0)
     bx, by, bz = _normal(vertices, v1)
     cx, cy, cz = _normal(vertices, v2)
     nx, ny, nz = u * ax + v * bx + w * cx, u * ay + v * by + w * cy, u * az + v * bz + w * cz
     albedo = u * abs(vertices[v0, 3]) + v * abs(vertices[v1, 3]) + w * abs(vertices[v2, 3])
-    length = 1 / np.sqrt(nx * nx + ny * ny + nz * nz)
+    length = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
     return nx * length, ny * length, nz * length, albedo, fx * size, fy * size, fz * size
 
 
@@ -178,19 +179,19 @@ def rock_normal(rocks, k, face):
         m[4] * px + m[7] * py + m[10] * pz,
         m[5] * px + m[8] * py + m[11] * pz,
     )
-    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
     return nx / length, ny / length, nz / length
 
 
 @njit(**INLINED)
-def _see(ground, rocks, view, tile, block, sample):
-    """Cast the ray of one sample, (s, row, column) in the tile, and its shadow ray (module docstring).
+def sample_seen(ground, rocks, view, block, place, disc):
+    """Cast the ray at image coordinates `place` (u, v), and its shadow ray to the point `disc` (p, q) of the disc.
 
-    Returns the height of the hit, metres; without a hit, the height at which the ray begins.
+    Returns three tuples: the height at which the next ray may begin, metres, and the depth of the hit; the unit shading
+    normal; and what `Tile.angles` stores. The height is the height of the hit, or `block.begin_m` without a hit.
     """
-    (s, i, j), horizon, angles, sun, plane = sample, view.horizon, tile.angles, view.sun, view.plane
-    u, v = _coordinates(tile, s, i, j)
-    dx, dy, dz = _direction(view.basis, u, v)
+    horizon, sun, plane = view.horizon, view.sun, view.plane
+    dx, dy, dz = _direction(view.basis, place[0], place[1])
     ray = Ray(view.origin[0], view.origin[1], view.origin[2], dx, dy, dz, NO_FACET)
     begin = max((block.begin_m - ray.z) / dz, 0.0) if block.begin_m < np.inf else 0.0
     # 1. The view ray.
@@ -207,40 +208,52 @@ def _see(ground, rocks, view, tile, block, sample):
         albedo = 1.0
     elif t < np.inf:
         nx, ny, nz, albedo, fx, fy, fz = ground_at(ground, facet, x, y)
+    # Direction l to a point of the Sun's disc; photometry uses the centre of the disc.
+    p, q = disc
+    lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
+    lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
+    to_disc = 1 / math.sqrt(lx * lx + ly * ly + lz * lz)
+    lx, ly, lz = lx * to_disc, ly * to_disc, lz * to_disc
+    per_length = 1 / math.sqrt(dx * dx + dy * dy + dz * dz)
+    cosine = nx * lx + ny * ly + nz * lz
+    mu0 = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
+    mu = max(-(nx * dx + ny * dy + nz * dz) * per_length, 1e-4)
+    cos_phase = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) * per_length
+    lit = 0.0
+    if cosine > 0:
+        surely = False
+        # 3. A shadow ray that grazes the ground begins above the facet, as in Cycles.
+        if facet.rock < 0:
+            on_facet = fx * lx + fy * ly + fz * lz
+            share = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
+            share = min(max(share, 0.0), 1.0)
+            if share > 0:
+                mx, my, mz = lift_at(ground, facet, x, y)
+                x, y, z = x + share * mx, y + share * my, z + share * mz
+            else:
+                surely = surely_lit(horizon, x, y, z)
+        # 4. The shadow ray; its parameter is -inf if it reaches ground that is surely lit.
+        shadow_ray = Ray(x, y, z, lx, ly, lz, facet)
+        if surely or abs(first_hit(ground, rocks, horizon, shadow_ray, (_LIFT, np.inf))[0]) == np.inf:
+            lit = cosine
+    return (hit_z, t), (nx, ny, nz), (mu0, mu, cos_phase, albedo, lit)
+
+
+@njit(**INLINED)
+def _see(ground, rocks, view, tile, block, sample):
+    """Write what one sample, (s, row, column) in the tile, sees into the arrays of the tile.
+
+    Returns the height of the hit, metres; without a hit, the height at which the ray begins.
+    """
+    s, i, j = sample
+    disc = tile.disc[s, i, j, 0], tile.disc[s, i, j, 1]
+    (hit_z, t), normal, angles = sample_seen(ground, rocks, view, block, _coordinates(tile, s, i, j), disc)
     if s == 0:
         row, column = tile.first[0] + i, tile.first[1] + j
         tile.depth[row, column] = t
-        tile.normal[row, column, 0], tile.normal[row, column, 1], tile.normal[row, column, 2] = nx, ny, nz
-    # Direction l to a point of the Sun's disc; photometry uses the centre of the disc.
-    p, q = tile.disc[s, i, j, 0], tile.disc[s, i, j, 1]
-    lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
-    lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
-    to_disc = 1 / np.sqrt(lx * lx + ly * ly + lz * lz)
-    lx, ly, lz = lx * to_disc, ly * to_disc, lz * to_disc
-    per_length = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-    cosine = nx * lx + ny * ly + nz * lz
-    angles[0, s, i, j] = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
-    angles[1, s, i, j] = max(-(nx * dx + ny * dy + nz * dz) * per_length, 1e-4)
-    angles[2, s, i, j] = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) * per_length
-    angles[3, s, i, j] = albedo
-    angles[4, s, i, j] = 0.0
-    if cosine <= 0:
-        return hit_z
-    # 3. A shadow ray that grazes the ground begins above the facet, as in Cycles.
-    if facet.rock < 0:
-        on_facet = fx * lx + fy * ly + fz * lz
-        share = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
-        share = min(max(share, 0.0), 1.0)
-        if share > 0:
-            mx, my, mz = lift_at(ground, facet, x, y)
-            x, y, z = x + share * mx, y + share * my, z + share * mz
-        elif surely_lit(horizon, x, y, z):
-            angles[4, s, i, j] = cosine
-            return hit_z
-    # 4. The shadow ray; its parameter is -inf if it reaches ground that is surely lit.
-    shadow_ray = Ray(x, y, z, lx, ly, lz, facet)
-    if abs(first_hit(ground, rocks, horizon, shadow_ray, (_LIFT, np.inf))[0]) == np.inf:
-        angles[4, s, i, j] = cosine
+        tile.normal[row, column, 0], tile.normal[row, column, 1], tile.normal[row, column, 2] = normal
+    for k in range(5):
+        tile.angles[k, s, i, j] = angles[k]
     return hit_z
 
 
@@ -320,4 +333,4 @@ def see(ground, rocks, tops, view, tile):
             for i in range(row, last_row):
                 for j in range(column, last_column):
                     for s in range(n_samples):
-                        near_m = _see(ground, rocks, view, tile, _Block(begin, part), (s, i, j))
+                        near_m = _see(ground, rocks, view, tile, Block(begin, part), (s, i, j))
