@@ -133,6 +133,7 @@ def check_code(recipe: Recipe, *, with_dem: bool) -> None:
     current = all_versions(
         with_dem=with_dem,
         engine=recipe.config.get("render", {}).get("engine", "cycles"),
+        device=recipe.config.get("render", {}).get("device", "cpu"),
         outputs="hazard" in recipe.config or "flash_lidar" in recipe.config,
     )
     recorded, current = (_without_releases(versions) for versions in (recipe.versions, current))

@@ -35,6 +35,7 @@ from perilune_render.terrain.cache import cached_scene
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.interrupts import interrupts_held
 from perilune_shared.console.progress import Progress
+from perilune_shared.console.terminal import say
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
@@ -139,9 +140,8 @@ def _of_scene(
         raise UserError(where, "recipes", f"no {scene['recipe']}", f"the recipe of {scene['scene_id']}")
     trajectories = _trajectories(dataset, scene["scene_id"], rows)
     config = config_of(recipe, where, sources.dem, sources.catalogue)
-    ground_config = _ground_config(recipe, config, where)
+    ground_config = _on_this_machine(_ground_config(recipe, config, where), where)
     rig, exr_rig = rig_of(config), rig_of(ground_config)
-    check_installed(ground_config.render.engine)
     _check_cameras(dataset, rows, rig)
     with interrupts_held():
         ground = cached_scene(ground_config, view_of(ground_config, exr_rig, recipe.kind), scene["seed"])
@@ -177,6 +177,18 @@ def _of_scene(
                 advance()
     warn_of_dark_frames(scene["scene_id"], dark, len(rows), scene["sun_elevation_deg"])
     return outcomes
+
+
+def _on_this_machine(config: DatasetConfig, where: str) -> DatasetConfig:
+    """The configuration with the device `cpu` if the recipe has `cuda` and this machine has no CUDA device."""
+    try:
+        check_installed(config.render.engine, config.render.device)
+    except UserError:
+        if config.render.device != "cuda":
+            raise
+        say(f"{where}: its frames were rendered on a CUDA device and are rendered on the processor here: bytes differ")
+        return config.model_copy(update={"render": config.render.model_copy(update={"device": "cpu"})})
+    return config
 
 
 def _trajectories(dataset: Dataset, scene_id: str, rows: list[dict]) -> dict[str, dict]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.engines.frame_source import Engine
-from perilune_render.provenance.versions import check_installed
+from perilune_render.provenance.versions import check_installed, device_of
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
@@ -25,6 +25,10 @@ def open_engine(
     Use the engine as a context manager. The engine `heightfield` builds the surface of the scene unless `surface` is
     given. Raises UserError if the engine cannot be loaded or cannot render the light of the configuration.
     """
+    if device_of(config.render) == "cuda":
+        from perilune_render.engines.heightfield.gpu import CudaEngine
+
+        return CudaEngine(scene, config, camera, sun, surface)
     if config.render.engine == "heightfield":
         from perilune_render.engines.heightfield.engine import HeightfieldEngine
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from perilune_render.config.dataset import DatasetConfig, SensorConfig
 from perilune_render.config.terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig
-from perilune_render.provenance.versions import all_versions, ground_versions
+from perilune_render.provenance.versions import all_versions, device_of, ground_versions
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.names import Kind
@@ -38,6 +38,7 @@ def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool =
         else all_versions(
             with_dem=with_dem,
             engine=config.render.engine,
+            device=device_of(config.render),
             outputs=config.hazard is not None or config.flash_lidar is not None,
         )
     )
@@ -76,6 +77,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
         del plain["terrain"]["elevation"]["rims"]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
+    plain["render"]["device"] = device_of(config.render)
+    if plain["render"]["device"] == "cpu":
+        del plain["render"]["device"]
     for name in _SINCE:
         if plain["sensor"][name] == SensorConfig.model_fields[name].default:
             del plain["sensor"][name]

@@ -6,6 +6,7 @@ from importlib import metadata
 
 import perilune_render
 import perilune_shared
+from perilune_render.config.dataset import RenderConfig
 from perilune_render.provenance import processor
 from perilune_render.provenance.caches import kept_fingerprint
 from perilune_shared.errors import UserError
@@ -42,10 +43,19 @@ LIBRARIES = {
 """Recorded name and distribution of each library that affects results, by import name."""
 RAYS = (*RENDERING[:2], "perilune_render.engines.heightfield.engine:HeightfieldEngine")
 """Code that plans trajectories and renders radiance with the engine `heightfield`."""
+RAYS_CUDA = (*RENDERING[:2], "perilune_render.engines.heightfield.gpu:CudaEngine")
+"""Code that plans trajectories and renders radiance with the engine `heightfield` on a GPU."""
 OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune_render.outputs.hazard:hazard_tiff")
 """Code that makes hazard maps and images of the flash lidar."""
-_NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING, "outputs": OUTPUTS}
-_RECORDED = {"rays": "renderer"}
+_NAMES = {
+    "generator": GROUND,
+    "renderer": RENDERING,
+    "rays": RAYS,
+    "rays_cuda": RAYS_CUDA,
+    "imaging": IMAGING,
+    "outputs": OUTPUTS,
+}
+_RECORDED = {"rays": "renderer", "rays_cuda": "renderer"}
 """Names in a recipe of versions that have a different name in this module."""
 
 
@@ -62,18 +72,38 @@ def imaging_versions() -> dict[str, str]:
     return _versions(("imaging",), False)
 
 
-def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = False) -> dict[str, str]:
+def all_versions(
+    *, with_dem: bool, engine: str = "cycles", device: str = "cpu", outputs: bool = False
+) -> dict[str, str]:
     """Versions of all code that determines frames and labels, and with `outputs` the additional outputs.
 
     Raises UserError if the engine is not installed.
     """
-    check_installed(engine)
-    names = ("generator", "rays" if engine == "heightfield" else "renderer", "imaging")
+    check_installed(engine, device)
+    rays = "rays_cuda" if device == "cuda" else "rays"
+    names = ("generator", rays if engine == "heightfield" else "renderer", "imaging")
     return _versions((*names, "outputs") if outputs else names, with_dem or outputs)
 
 
-def check_installed(engine: str) -> None:
-    """Raise UserError for the engine `cycles` if Blender's module is missing."""
+def device_of(render: RenderConfig) -> str:
+    """The device that renders, cpu or cuda; `auto` is cuda if there is a CUDA device."""
+    if render.device != "auto":
+        return render.device
+    return "cuda" if _cuda_found() else "cpu"
+
+
+def _cuda_found() -> bool:
+    # numba looks for the driver, so ask it only for a device that is not the processor.
+    from numba import cuda
+
+    return bool(cuda.is_available())
+
+
+def check_installed(engine: str, device: str = "cpu") -> None:
+    """Raise UserError for `cycles` without Blender's module, and for the device `cuda` without a CUDA device."""
+    if device == "cuda" and not _cuda_found():
+        expected = "cpu or auto, or a GPU of NVIDIA with its driver and `pip install 'perilune-render[cuda]'`"
+        raise UserError("configuration", "dataset.render.device", "cuda, but no CUDA device is found", expected)
     if engine == "cycles" and importlib.util.find_spec("bpy") is None:
         found = "cycles, without Blender's module bpy"
         expected = "heightfield, or on Python 3.11 `pip install 'perilune-render[blender]'`"

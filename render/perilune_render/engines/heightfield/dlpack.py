@@ -39,12 +39,14 @@ _ManagedTensor._fields_ = [("tensor", _Tensor), ("context", ctypes.c_void_p), ("
 _Destructor = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _LENT: dict[int, Any] = {}
 """Tensors that a consumer may still use, and what keeps their memory, by the address of the tensor."""
-_new_capsule = ctypes.pythonapi.PyCapsule_New
-_new_capsule.restype, _new_capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, _Destructor]
-_is_unused = ctypes.pythonapi.PyCapsule_IsValid
-_is_unused.restype, _is_unused.argtypes = ctypes.c_int, [ctypes.c_void_p, ctypes.c_char_p]
-_address_in = ctypes.pythonapi.PyCapsule_GetPointer
-_address_in.restype, _address_in.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_char_p]
+# Functions of their own: the attributes of ctypes.pythonapi are shared, and other libraries change their argument types.
+_new_capsule = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.c_char_p, _Destructor)(
+    ("PyCapsule_New", ctypes.pythonapi)
+)
+_is_unused = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char_p)(("PyCapsule_IsValid", ctypes.pythonapi))
+_address_in = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
 _NAME = b"dltensor"
 
 

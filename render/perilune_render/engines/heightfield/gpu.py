@@ -30,6 +30,7 @@ from perilune_render.engines.heightfield.shade import Block, View, sample_seen
 from perilune_render.engines.heightfield.surface import Surface
 from perilune_render.flight.sub_poses import Pose
 from perilune_render.imaging.radiance import Radiance
+from perilune_render.provenance.versions import check_installed
 from perilune_render.streams import stream
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
@@ -147,7 +148,7 @@ class CudaEngine(HeightfieldEngine):
     """
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array, surface: Surface | None = None):
-        check_device()
+        check_installed("heightfield", "cuda")
         super().__init__(scene, config, camera, sun, surface=surface)
         size = sum(part.nbytes for part in (*self.surface.ground, *self.surface.rocks) if isinstance(part, np.ndarray))
         self._check_memory(size + self.bytes_of(1))
@@ -243,17 +244,6 @@ class CudaEngine(HeightfieldEngine):
         if needed > free:
             found, expected = f"cuda, with {free / 2**20:.0f} MiB free", f"{needed / 2**20:.0f} MiB, or cpu"
             raise UserError("configuration", "dataset.render.device", found, expected)
-
-
-def device_found() -> bool:
-    """Whether numba finds a CUDA device."""
-    return bool(cuda.is_available())
-
-
-def check_device() -> None:
-    """Raise UserError if numba finds no CUDA device."""
-    if not device_found():
-        raise UserError("configuration", "dataset.render.device", "cuda, but no CUDA device is found", "cpu or auto")
 
 
 def _on_device(arrays: Any) -> Any:
