@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-suspect bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results traces trace-inputs release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results traces trace-inputs release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -305,6 +305,9 @@ bench-other-ground: setup-dev # rims and the installed detector over ground of a
 
 bench-engines: setup-dev # speed of both engines, and agreement of their radiance, depth and labels; writes runs/bench/engines.json
 	@$(BIN)/python -m benchmarks.scene.engines
+
+bench-gpu: setup-dev # agreement of a CUDA device with the processor, and its frames per second; writes runs/bench/gpu.json
+	@scripts/bench_gpu.sh
 
 bench-serve: setup-dev # frames per second of the image server, and its memory over 20,000 frames; writes runs/bench/serve.json
 	@$(BIN)/python -m benchmarks.scene.serve

@@ -174,6 +174,7 @@ def test_compiled_functions_are_found_in_every_module():
     assert known == terrain | {
         "pixels",
         "surface",
+        "draws",
         "rocks",
         "cast",
         "cell",

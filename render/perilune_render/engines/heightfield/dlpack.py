@@ -39,7 +39,7 @@ _ManagedTensor._fields_ = [("tensor", _Tensor), ("context", ctypes.c_void_p), ("
 _Destructor = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _LENT: dict[int, Any] = {}
 """Tensors that a consumer may still use, and what keeps their memory, by the address of the tensor."""
-# Functions of their own: the attributes of ctypes.pythonapi are shared, and other libraries change their argument types.
+# New objects, since the functions in ctypes.pythonapi are shared and other libraries change their argument types.
 _new_capsule = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.c_char_p, _Destructor)(
     ("PyCapsule_New", ctypes.pythonapi)
 )

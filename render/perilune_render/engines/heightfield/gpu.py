@@ -246,6 +246,14 @@ class CudaEngine(HeightfieldEngine):
             raise UserError("configuration", "dataset.render.device", found, expected)
 
 
+def device_name() -> str:
+    """Name of the CUDA device; `simulator` in numba's simulator."""
+    if config.ENABLE_CUDASIM:
+        return "simulator"
+    name = cuda.get_current_device().name
+    return name.decode() if isinstance(name, bytes) else str(name)
+
+
 def _on_device(arrays: Any) -> Any:
     """The named tuple with its arrays in the memory of the device."""
     return type(arrays)(*(_sent(part) if isinstance(part, np.ndarray) else part for part in arrays))
