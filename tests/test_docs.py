@@ -261,7 +261,7 @@ def test_generated_pages_have_every_command_column_and_key():
 
 def test_every_source_of_terrain_and_light_is_in_the_table():
     table = (DOCS / "reference/sources.md").read_text(encoding="utf-8")
-    folders = (TOP / "render/perilune_render" / name for name in ("terrain", "imaging/photometry.py"))
+    folders = TOP / "render/perilune_render/terrain", TOP / "shared/perilune_shared/photometry.py"
     files = [path for each in folders for path in ([each] if each.is_file() else each.rglob("*.py"))]
     cited = {doi for path in files for doi in re.findall(r"doi (10\.[\w./()-]+)", path.read_text(encoding="utf-8"))}
     assert len(cited) >= 7 and {doi for doi in cited if doi.rstrip(").") not in table} == set()

@@ -17,11 +17,11 @@ from perilune_render.config.dataset import LightConfig, RenderConfig
 from perilune_render.engines.blender import bpy
 from perilune_render.engines.blender.renderer import configure, render_through
 from perilune_render.engines.blender.stage import aim, mesh_from_arrays, sunlit_stage, surface_material
-from perilune_render.imaging.photometry import radiance_factor
 from perilune_shared.console.terminal import progress_bar
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array, sun_direction
+from perilune_shared.photometry import radiance_factor
 
 PHASE_DEG = (0, 0.5, 1, 2, 5, 10, 20, 30, 45, 60, 75, 90, 105, 120, 135, 140)
 EMISSION_DEG = np.arange(0, 61, 5)

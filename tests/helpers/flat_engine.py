@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.imaging.radiance import Radiance
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.photometry import radiance_factor
 
 
 class FlatEngine:

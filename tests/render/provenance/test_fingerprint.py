@@ -63,7 +63,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.terrain.craters.rims", "_N_RIM", {"generator"}),
         ("perilune_render.engines.blender.stage", "_EARTH_ANGULAR_DIAMETER_DEG", {"renderer"}),
         ("perilune_render.engines.blender.renderer", "_FAR_M", {"renderer"}),
-        ("perilune_render.imaging.photometry", "MIN_SINE_SQUARED", {"renderer", "rays"}),
+        ("perilune_shared.photometry", "MIN_SINE_SQUARED", {"renderer", "rays"}),
         ("perilune_render.engines.heightfield.shade", "_TERMINATOR", {"rays"}),
         ("perilune_render.imaging.sensor", "_FAINT_E", {"imaging"}),
         ("perilune_render.config.dataset", "_SPREAD_FIELDS", set(ROOTS)),

@@ -6,13 +6,13 @@ from mathutils import Matrix
 
 from perilune_render.config.dataset import DatasetConfig, LightConfig
 from perilune_render.engines.blender.nodes import Symbol, at_least, dot
-from perilune_render.imaging.photometry import reflectance_factor
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array, earth_direction
+from perilune_shared.photometry import reflectance_factor
 
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Axes of Blender's camera: y up, looking along -z."""

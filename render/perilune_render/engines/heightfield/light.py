@@ -1,6 +1,6 @@
 """Light at the points that rays hit: points on the Sun's disc, and photometry, compiled for speed.
 
-The compiled Hapke law runs the operations of `perilune_render.imaging.photometry` in the same order, in float32, and
+The compiled Hapke law runs the operations of `perilune_shared.photometry` in the same order, in float32, and
 calls the C library functions that NumPy calls, so the results are equal to the bit.
 """
 
@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from perilune_render.engines.heightfield.surface import INLINED, WITHOUT_COUNTS
-from perilune_render.imaging.photometry import (
+from perilune_render.provenance.kernels import njit
+from perilune_shared.photometry import (
     HAPKE,
     LUNAR_LAMBERT_SCALE,
     MIN_SINE_SQUARED,
@@ -19,7 +20,6 @@ from perilune_render.imaging.photometry import (
     reflectance_factor,
     slope_of,
 )
-from perilune_render.provenance.kernels import njit
 
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 _MIN_SINE_SQUARED, _TURN = np.float32(MIN_SINE_SQUARED), np.float32(2 * np.pi)

@@ -14,13 +14,13 @@ from tests.sampling import every
 
 from perilune_render.config.dataset import LightConfig, RenderConfig
 from perilune_render.engines.blender.renderer import Renderer
-from perilune_render.imaging.photometry import LAWS, radiance_factor
 from perilune_render.labels.frame_labels import RimCircles, crater_index, label_frame
 from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
+from perilune_shared.photometry import LAWS, radiance_factor
 
 CAMERA = Camera(96, 64, 110.0, 110.0, 50.0, 30.0)
 TILTED = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector(np.radians([12, -20, 30]))

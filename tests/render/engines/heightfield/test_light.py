@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from perilune_render.engines.heightfield.light import disc_places, reflected
-from perilune_render.imaging.photometry import LAWS, reflectance_factor
+from perilune_shared.photometry import LAWS, reflectance_factor
 
 
 def angles_of_samples():

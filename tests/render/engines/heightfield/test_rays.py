@@ -13,7 +13,6 @@ from perilune_render.engines.heightfield.engine import HeightfieldEngine, rays_o
 from perilune_render.engines.heightfield.horizon import NOWHERE, horizon_of
 from perilune_render.engines.heightfield.query import first_hits
 from perilune_render.flight.view import view_envelope
-from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.poses.plan import scene_seed
 from perilune_render.terrain.envelope import ViewEnvelope
@@ -21,6 +20,7 @@ from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.photometry import radiance_factor
 
 SUN = sun_direction(60, 30)
 

@@ -9,9 +9,11 @@ plane and if Sun and observer are on opposite sides of the normal.
 `perilune_render.engines.heightfield.light` has a compiled copy of Hapke's law. A test checks that the results of both
 are equal to the bit.
 
-Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
-that `perilune_render.engines.blender.nodes` can call them with symbols and build shader nodes from the same code.
-Sources: docs/reference/sources.md.
+    mu0, mu, phase_rad = np.cos(0.5), 1.0, 0.5                       # a view from the zenith
+    radiance_factor("hapke_mare", mu0, mu, np.cos(phase_rad))        # I/F, 0.0515
+
+The functions use only arithmetic and NumPy's ufuncs, so that `perilune_render.engines.blender.nodes` can call them with
+symbols and build shader nodes from the same code. Sources: docs/reference/sources.md.
 """
 
 from collections.abc import Callable
