@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors cgroups photometry threads config console run_record content storage pictures geometry client dataset labels "
-        "validation editing export cli"
+        "errors cgroups photometry threads config console run_record content storage pictures geometry client dataset "
+        "labels validation editing export cli"
     ),
     "shared/perilune_shared/console": "interrupts terminal progress usage command_line",
     "shared/perilune_shared/config": "yaml_text errors resolve page",
