@@ -30,8 +30,7 @@ class YOLOv3(nn.Module):
 
     With `ellipses`, a second head on each stride, of the same form, predicts 5 further numbers per anchor: the shape of
     the ellipse in the box, and standard deviations (models/ellipse.py). The first 5 numbers and their weights do not
-    change. Both heads share the branch, but not its last 3 x 3 block: with a shared block, the direction of an ellipse
-    was not learned.
+    change. Both heads share the branch.
     """
 
     anchors: Tensor
