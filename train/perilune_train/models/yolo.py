@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -81,6 +82,12 @@ class YOLOv3(nn.Module):
                 self.ellipse_heads[str(stride)] = nn.Sequential(conv_block(channels, 2 * channels, 3), output)
 
     @property
+    def n_features(self) -> int:
+        """Number of features of an image that `detect_with_features` returns."""
+        outputs = (cast(nn.Conv2d, branch[-1].conv) for branch in self.branches.values())  # type: ignore[index, union-attr]
+        return sum(output.out_channels for output in outputs)
+
+    @property
     def ellipses(self) -> bool:
         """Whether the network predicts ellipses with standard deviations."""
         return len(self.ellipse_heads) > 0
@@ -98,7 +105,8 @@ class YOLOv3(nn.Module):
         features, masks = self.backbone.features_and_masks(images)
         return self._outputs(features), masks
 
-    def _outputs(self, features: list[Tensor]) -> list[Tensor]:
+    def _outputs(self, features: list[Tensor], pooled: list[Tensor] | None = None) -> list[Tensor]:
+        """Raw outputs of the backbone's features; appends the mean features (N, C) of each branch to `pooled`."""
         outputs: list[Tensor] = []
         above = None
         for index in range(len(_STRIDES) - 1, _STRIDES.index(self.strides[0]) - 1, -1):
@@ -106,6 +114,8 @@ class YOLOv3(nn.Module):
             x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
             if stride in self.branches:
                 x = self.branches[stride](x)
+                if pooled is not None:
+                    pooled.append(x.float().mean((2, 3)))
                 raw = _per_anchor(self.heads[stride](x))
                 if stride in self.ellipse_heads:
                     raw = torch.cat([raw, _per_anchor(self.ellipse_heads[stride](x))], dim=-1)
@@ -130,8 +140,22 @@ class YOLOv3(nn.Module):
         A shape is the correlation of the ellipse in the box and four standard deviations: of the centre's x and y and
         of the semi-major and the semi-minor axis, pixels. None if the network predicts no ellipses.
         """
+        return self._decoded(self(images))
+
+    @torch.no_grad()
+    def detect_with_features(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """The result of `detect_ellipses`, and features (N, F) of the images, from the same forward pass.
+
+        The features are the means over the image of the maps from which the three heads predict.
+        """
+        pooled: list[Tensor] = []
+        outputs = self._outputs(self.backbone(images), pooled)
+        return *self._decoded(outputs), torch.cat(pooled, dim=1)
+
+    def _decoded(self, outputs: list[Tensor]) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Boxes, scores and shapes of raw outputs, as from `detect_ellipses`."""
         boxes, scores, shapes = [], [], []
-        for raw, anchors, stride in zip(self(images), self.anchors, self.strides, strict=True):
+        for raw, anchors, stride in zip(outputs, self.anchors, self.strides, strict=True):
             boxes.append(decode_grid(raw, anchors, stride).flatten(1, 3))
             scores.append(raw[..., 4].sigmoid().flatten(1))
             if self.ellipses:
