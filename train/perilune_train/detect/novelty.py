@@ -1,18 +1,14 @@
 """Is a frame like the training frames? Distance of a detector's features from those of its training frames.
 
-The features are means over the frame of the detector's feature maps (`YOLOv3.detect_with_features`). Their distance
-from the features of training frames is that of Mahalanobis,
-
-    d^2 = (x - mean)^T covariance^-1 (x - mean)
-
-with the covariance shrunk towards a diagonal matrix (Ledoit and Wolf, 2004, "A well-conditioned estimator for
-large-dimensional covariance matrices"), as in Lee et al., 2018, arXiv 1807.03888, with a single class. The novelty of a
-frame is d divided by a limit that almost all frames of unseen scenes keep: above 1, the frame is unlike the training.
+The features are means over the frame of maps of the network (`YOLOv3.detect_with_features`). Their distance is that of
+Mahalanobis for one class (Lee et al., 2018, arXiv 1807.03888). The covariance has the largest principal components of
+the training frames, and one variance for the directions that remain (Tipping and Bishop, 1999, "Probabilistic Principal
+Component Analysis"), because there are more features than frames can determine. The novelty of a frame is its distance
+divided by a limit that 99 % of the frames of left-out training scenes keep: above 1, the frame is unlike the training.
 """
 
 import base64
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,15 +21,16 @@ from perilune_shared.storage.files import write_text
 
 Array = NDArray[np.float64]
 NOVELTY_FILE = "novelty.json"
-"""File of the statistics in the folder of a run."""
+"""File of the training features in the folder of a run."""
 MAX_SHARE = 0.01
-"""Largest share of frames of unseen scenes above the limit."""
+"""Largest share of frames of left-out training scenes beyond the limit."""
 MIN_FRAMES = 8
 """Smallest number of training frames of a fit."""
+_COMPONENTS, _FRAMES_EACH = 32, 4
+"""Largest number of principal components, and smallest number of frames for each of them."""
 _FOLDS = 6
-_MAX_BYTES = 10_000_000
-_EXPECTED = "written by `perilune-train detect calibrate`"
-
+_MAX_BYTES, _MAX_COMPONENTS = 10_000_000, 1000
+_EXPECTED = "a file that `perilune-train detect calibrate` wrote"
 NO_ALARM = (
     "no alarm for images unlike the training: the run has no features of its training frames; `perilune-train detect "
     "calibrate` adds them"
@@ -42,29 +39,46 @@ NO_ALARM = (
 
 
 @dataclass(frozen=True)
-class TrainingFeatures:
-    """Mean and spread of the features of training frames, and the limit of their distance."""
+class Gaussian:
+    """Distribution of features: principal components, and one variance for all other directions."""
 
     mean: Array
     """Mean of each feature (F,)."""
-    whitening: NDArray[np.float16]
-    """Upper triangular matrix W (F, F): W (x - mean) has uncorrelated elements of variance 1."""
+    deviation: Array
+    """Standard deviation of each feature (F,). All following values are in these units."""
+    directions: Array
+    """Unit vectors of the principal components (K, F)."""
+    variances: Array
+    """Variances of the principal components (K,)."""
+    other_variance: float
+    """Variance of every other direction."""
+
+    def distance(self, features: Array) -> Array:
+        """Mahalanobis distances (N,) of features (N, F)."""
+        standard = (features - self.mean) / self.deviation
+        parts = (standard @ self.directions.T) ** 2
+        rest = np.maximum((standard**2).sum(axis=1) - parts.sum(axis=1), 0)
+        return np.asarray(np.sqrt((parts / self.variances).sum(axis=1) + rest / self.other_variance))
+
+
+@dataclass(frozen=True)
+class TrainingFeatures:
+    """Distribution of the features of training frames, and the limit of the distance from it."""
+
+    gaussian: Gaussian
+    """Distribution of the features."""
     limit: float
     """Largest distance of a familiar frame."""
     n_frames: int
     """Number of training frames of the fit."""
 
-    def distance(self, features: NDArray[Any]) -> Array:
-        """Distances (N,) of features (N, F)."""
-        return np.asarray(np.linalg.norm((features - self.mean) @ self.whitening.astype(np.float64).T, axis=1))
-
-    def novelty(self, features: NDArray[Any]) -> Array:
+    def novelty(self, features: Array) -> Array:
         """Distances (N,) of features (N, F), divided by the limit."""
-        return self.distance(features) / self.limit
+        return self.gaussian.distance(features) / self.limit
 
     def entries(self) -> dict[str, float | int | str | None]:
         """Entries of metrics.json."""
-        return {"novelty/frames": self.n_frames, "novelty/limit": self.limit, "novelty/features": len(self.mean)}
+        return {"novelty/frames": self.n_frames, "novelty/limit": self.limit}
 
 
 def is_novel(novelty: float | None) -> bool:
@@ -74,59 +88,53 @@ def is_novel(novelty: float | None) -> bool:
 
 def novelty_text(novelty: float | None) -> str:
     """Reason of the alarm, in one line."""
-    return (
-        f"unlike the detector's training frames: novelty: got {novelty:.2f}, expected at most 1; craters are unreliable"
-    )
+    return f"novelty: got {novelty:.2f}, expected at most 1: unlike the detector's training, so craters are unreliable"
 
 
-def fit_training_features(plain: Array, changed: Array, scenes: NDArray[Any]) -> TrainingFeatures | None:
-    """Fit the features (N, F) of training frames and of augmented copies; `scenes` (N,) are the frames' scenes.
+def fit_training_features(features: Array, scenes: NDArray[Any]) -> TrainingFeatures | None:
+    """Fit the features (N, F) of training frames; `scenes` (N,) are the frames' scenes.
 
-    The limit comes from scenes that were left out of the fit: at most MAX_SHARE of their plain frames are beyond it.
-    Returns None with fewer than MIN_FRAMES frames or with a single scene.
+    The limit comes from scenes that were left out of a fit: at most MAX_SHARE of their frames are beyond it. Returns
+    None with fewer than MIN_FRAMES frames or with a single scene.
     """
     names = np.unique(scenes)
-    if len(plain) < MIN_FRAMES or len(names) < 2:
+    folds = min(_FOLDS, len(names))
+    if len(features) < MIN_FRAMES or folds < 2:
         return None
-    distances = np.zeros(len(plain))
-    for fold in range(min(_FOLDS, len(names))):
-        left_out = np.isin(scenes, names[fold :: min(_FOLDS, len(names))])
-        mean, whitening = _gaussian(np.concatenate([plain[~left_out], changed[~left_out]]))
-        distances[left_out] = np.linalg.norm((plain[left_out] - mean) @ whitening.T, axis=1)
-    mean, whitening = _gaussian(np.concatenate([plain, changed]))
-    # The smallest distance that at most MAX_SHARE of the frames exceed.
+    distances = np.zeros(len(features))
+    for fold in range(folds):
+        left_out = np.isin(scenes, names[fold::folds])
+        distances[left_out] = fit_gaussian(features[~left_out]).distance(features[left_out])
     limit = np.sort(distances)[::-1][int(MAX_SHARE * len(distances))]
-    return TrainingFeatures(mean, whitening.astype(np.float16), float(limit), len(plain))
+    return TrainingFeatures(fit_gaussian(features), float(limit), len(features))
 
 
-def _gaussian(features: Array) -> tuple[Array, Array]:
-    """Mean (F,), and whitening matrix (F, F) of the shrunk covariance, of features (N, F)."""
-    mean, deviation = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
+def fit_gaussian(features: Array) -> Gaussian:
+    """Fit the distribution of features (N, F)."""
+    n_frames, n_features = features.shape
+    mean = features.mean(axis=0)
+    # Constant features carry no information, and must not divide by 0.
+    deviation = np.maximum(features.std(axis=0), 1e-6 + 1e-3 * np.abs(mean))
     standard = (features - mean) / deviation
-    covariance = shrunk_covariance(standard)
-    return mean, np.linalg.cholesky(np.linalg.inv(covariance)).T / deviation
-
-
-def shrunk_covariance(features: Array) -> Array:
-    """Covariance (F, F) of features (N, F) with mean 0, shrunk by the share of Ledoit and Wolf (2004)."""
-    n, size = features.shape
-    sample = features.T @ features / n
-    target = np.trace(sample) / size * np.eye(size)
-    spread = ((sample - target) ** 2).sum()
-    # Sum over all frames of |x x^T - S|^2 / n^2.
-    error = ((features**2).sum(axis=1) ** 2).sum() / n**2 - (sample**2).sum() / n
-    share = min(1.0, max(0.0, error / spread)) if spread > 0 else 1.0
-    return np.asarray((1 - share) * sample + share * target)
+    variances, directions = np.linalg.eigh(standard.T @ standard / n_frames)
+    variances, directions = np.maximum(variances[::-1], 1e-6), directions[:, ::-1].T
+    count = max(1, min(_COMPONENTS, n_frames // _FRAMES_EACH, n_features - 1))
+    # Single precision, as in the file, so that a stored fit is exactly the fit.
+    kept = directions[:count].astype(np.float32).astype(np.float64)
+    return Gaussian(mean, deviation, kept, variances[:count], float(variances[count:].mean()))
 
 
 def write_training_features(run: Path, features: TrainingFeatures) -> None:
-    """Write novelty.json into the folder of a run; whitening is the upper triangle in half precision, base64."""
-    upper = features.whitening[np.triu_indices(len(features.mean))]
+    """Write novelty.json into the folder of a run; the directions are float32 numbers in base64."""
+    gaussian = features.gaussian
     content = {
         "frames": features.n_frames,
         "limit": features.limit,
-        "mean": [float(f"{value:.7g}") for value in features.mean],
-        "whitening": base64.b64encode(upper.astype("<f2").tobytes()).decode("ascii"),
+        "mean": gaussian.mean.tolist(),
+        "deviation": gaussian.deviation.tolist(),
+        "variances": gaussian.variances.tolist(),
+        "other_variance": gaussian.other_variance,
+        "directions": base64.b64encode(gaussian.directions.astype("<f4").tobytes()).decode("ascii"),
     }
     write_text(run / NOVELTY_FILE, json.dumps(content) + "\n")
 
@@ -143,16 +151,21 @@ def read_training_features(run: Path, n_features: int) -> TrainingFeatures | Non
         raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {_MAX_BYTES}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        mean = np.array(content["mean"], np.float64)
-        upper = np.frombuffer(base64.b64decode(content["whitening"], validate=True), "<f2")
-        limit, n_frames = float(content["limit"]), int(content["frames"])
+        mean, deviation, variances = (
+            np.array(content[key], np.float64).reshape(-1) for key in ("mean", "deviation", "variances")
+        )
+        directions = np.frombuffer(base64.b64decode(content["directions"], validate=True), "<f4").astype(np.float64)
+        other, limit, n_frames = float(content["other_variance"]), float(content["limit"]), int(content["frames"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise UserError(path, "content", repr(error), _EXPECTED) from None
-    if mean.shape != (n_features,) or upper.size != n_features * (n_features + 1) // 2:
-        got = f"shape {mean.shape}, whitening of {upper.size} numbers"
-        raise UserError(path, "mean", got, f"{n_features} features of the run's network; fit it again")
-    if not (np.isfinite(mean).all() and np.isfinite(upper).all() and 0 < limit < math.inf):
-        raise UserError(path, "content", "numbers that are not finite, or no positive limit", _EXPECTED)
-    whitening = np.zeros((n_features, n_features), np.float16)
-    whitening[np.triu_indices(n_features)] = upper
-    return TrainingFeatures(mean, whitening, limit, n_frames)
+    if len(mean) != n_features or len(deviation) != n_features:
+        expected = f"{n_features}, the features of the run's network; `perilune-train detect calibrate` writes the file"
+        raise UserError(path, "mean", f"{len(mean)} numbers", expected)
+    if not 1 <= len(variances) <= _MAX_COMPONENTS or directions.size != len(variances) * n_features:
+        raise UserError(path, "directions", f"{directions.size} numbers", f"{len(variances)} x {n_features}")
+    numbers = np.concatenate([mean, deviation, variances, directions, [other, limit]])
+    positive = np.concatenate([deviation, variances, [other, limit]])
+    if not np.isfinite(numbers).all() or positive.min() <= 0:
+        raise UserError(path, "content", "numbers that are not finite or not positive", _EXPECTED)
+    gaussian = Gaussian(mean, deviation, directions.reshape(len(variances), n_features), variances, other)
+    return TrainingFeatures(gaussian, limit, n_frames)

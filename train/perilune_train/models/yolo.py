@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +15,8 @@ OUTPUTS = 5
 """x, y, width, height, objectness."""
 _STRIDES = (2, 4, 8, 16, 32)
 _MAX_LOG_SCALE = 4.0
+_POOLED_STAGES = 2
+"""Number of the backbone's stages whose maps are features of an image."""
 _PRIOR = 0.01
 """Initial crater probability of every cell, so that the many empty cells do not dominate the first steps."""
 
@@ -84,8 +85,8 @@ class YOLOv3(nn.Module):
     @property
     def n_features(self) -> int:
         """Number of features of an image that `detect_with_features` returns."""
-        outputs = (cast(nn.Conv2d, branch[-1].conv) for branch in self.branches.values())  # type: ignore[index, union-attr]
-        return sum(output.out_channels for output in outputs)
+        branches = [branch[-1].conv.out_channels for branch in self.branches.values()]  # type: ignore[index, union-attr]
+        return sum([*self.backbone.channels[:_POOLED_STAGES], *branches])
 
     @property
     def ellipses(self) -> bool:
@@ -146,10 +147,12 @@ class YOLOv3(nn.Module):
     def detect_with_features(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
         """The result of `detect_ellipses`, and features (N, F) of the images, from the same forward pass.
 
-        The features are the means over the image of the maps from which the three heads predict.
+        The features are means over the image: of the backbone's maps at strides 2 and 4, and of the maps from which the
+        three heads predict.
         """
-        pooled: list[Tensor] = []
-        outputs = self._outputs(self.backbone(images), pooled)
+        maps = self.backbone(images)
+        pooled = [part.float().mean((2, 3)) for part in maps[:_POOLED_STAGES]]
+        outputs = self._outputs(maps, pooled)
         return *self._decoded(outputs), torch.cat(pooled, dim=1)
 
     def _decoded(self, outputs: list[Tensor]) -> tuple[Tensor, Tensor, Tensor | None]:
