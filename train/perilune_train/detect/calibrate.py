@@ -14,7 +14,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.finished_run import raw_threshold
 from perilune_train.detect.inference.detector import open_detector
-from perilune_train.detect.novelty import MIN_FRAMES, write_training_features
+from perilune_train.detect.novelty import write_training_features
 from perilune_train.detect.train.familiar import training_features
 from perilune_train.detect.train.threshold import calibration_entries, detect_validation
 from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
@@ -27,7 +27,7 @@ def calibrate_run(run: Path, config: DetectConfig, address: Address) -> Metrics:
 
     Replaces earlier fits. The threshold moves with the scores, so the run reports the same detections as before. Other
     figures and tables of the run stay as they are. Raises UserError, and changes nothing, if the run was not trained
-    and selected on the terrain of these frames, or if there are too few detections or training frames.
+    and selected on the terrain of these frames, or if there are too few detections. Too few training frames leave the run without the alarm, and an entry says so.
     """
     threshold = raw_threshold(run)
     dataset = open_single(address)
@@ -38,15 +38,11 @@ def calibrate_run(run: Path, config: DetectConfig, address: Address) -> Metrics:
     entries = calibration_entries(found, config.evaluation, threshold)
     if "calibration/threshold" not in entries:
         raise UserError(dataset.store, "calibration", entries["calibration"], "a trained detector and more frames")
-    features = training_features(detector, dataset)
-    if features is None:
-        raise UserError(dataset.store, "train frames", "too few", f"at least {MIN_FRAMES}, of at least two scenes")
-    entries |= features.entries()
     kept = {
         key: value for key, value in read_metrics(run).items() if key.split("/")[0] not in ("calibration", "novelty")
     }
     # Each file is replaced at once; between them, an interrupted command leaves new features and the old calibration.
-    write_training_features(run, features)
+    entries |= write_training_features(run, training_features(detector, dataset))
     write_text(run / METRICS_FILE, json.dumps(kept | entries, indent=2, allow_nan=False) + "\n")
     return entries
 

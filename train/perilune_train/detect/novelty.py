@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
+from perilune_train.records.metrics_file import Metrics
 
 Array = NDArray[np.float64]
 NOVELTY_FILE = "novelty.json"
@@ -76,10 +77,6 @@ class TrainingFeatures:
         """Distances (N,) of features (N, F), divided by the limit."""
         return self.gaussian.distance(features) / self.limit
 
-    def entries(self) -> dict[str, float | int | str | None]:
-        """Entries of metrics.json."""
-        return {"novelty/frames": self.n_frames, "novelty/limit": self.limit}
-
 
 def is_novel(novelty: float | None) -> bool:
     """Whether a frame is unlike the training frames; False if unknown (None or NaN)."""
@@ -124,8 +121,14 @@ def fit_gaussian(features: Array) -> Gaussian:
     return Gaussian(mean, deviation, kept, variances[:count], float(variances[count:].mean()))
 
 
-def write_training_features(run: Path, features: TrainingFeatures) -> None:
-    """Write novelty.json into the folder of a run; the directions are float32 numbers in base64."""
+def write_training_features(run: Path, features: TrainingFeatures | None) -> Metrics:
+    """Write novelty.json into the folder of a run, or remove it without features; returns the entries of metrics.json.
+
+    The directions are float32 numbers in base64.
+    """
+    if features is None:
+        (run / NOVELTY_FILE).unlink(missing_ok=True)
+        return {"novelty": f"none: fewer than {MIN_FRAMES} training frames, or a single scene"}
     gaussian = features.gaussian
     content = {
         "frames": features.n_frames,
@@ -137,6 +140,7 @@ def write_training_features(run: Path, features: TrainingFeatures) -> None:
         "directions": base64.b64encode(gaussian.directions.astype("<f4").tobytes()).decode("ascii"),
     }
     write_text(run / NOVELTY_FILE, json.dumps(content) + "\n")
+    return {"novelty/frames": features.n_frames, "novelty/limit": features.limit}
 
 
 def read_training_features(run: Path, n_features: int) -> TrainingFeatures | None:

@@ -142,9 +142,7 @@ def _run(
     }
     metrics |= selection_entries(config, splits["test"])
     features = training_features(open_detector(run.best, config), dataset)
-    if features is not None:
-        write_training_features(run.root, features)
-        metrics |= features.entries()
+    metrics |= write_training_features(run.root, features)
     metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits, sizes, features)
     mark_files(run.root, WRITTEN, terrain_check.mark)
     metrics |= terrain_check.metrics()

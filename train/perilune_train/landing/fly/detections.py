@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
 from perilune_shared.storage.tables.columns import Kind
 from perilune_shared.storage.tables.limits import DETECTIONS
@@ -22,6 +23,7 @@ from perilune_train.detect.images.read import read_grey
 from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.novelty import NO_ALARM
 from perilune_train.landing.craters.sightings import MAX_SIGHTINGS
 
 Detect = Callable[[Path], Detections]
@@ -62,6 +64,8 @@ def by_network(run: Path) -> Detect:
     """
     config, threshold = flight_config(run), raw_threshold(run)
     detector = replace(open_run(run, config), calibration=None)
+    if detector.training_features is None:
+        say(NO_ALARM)
     tiling = Tiling(_TILE_PX, scales=_SCALES)
     return lambda path: above(detect_image(detector, _grey(path), tiling, lambda n: None), threshold)
 
