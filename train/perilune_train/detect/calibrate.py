@@ -26,8 +26,9 @@ def calibrate_run(run: Path, config: DetectConfig, address: Address) -> Metrics:
     """Fit calibration and training features of a run on its dataset; return the new entries of metrics.json.
 
     Replaces earlier fits. The threshold moves with the scores, so the run reports the same detections as before. Other
-    figures and tables of the run stay as they are. Raises UserError, and changes nothing, if the run was not trained
-    and selected on the terrain of these frames, or if there are too few detections. Too few training frames leave the run without the alarm, and an entry says so.
+    figures and tables of the run stay as they are. With too few training frames, an entry says that there is no alarm.
+    Raises UserError, and changes nothing, if the run was not trained and selected on the terrain of these frames, or if
+    there are too few detections.
     """
     threshold = raw_threshold(run)
     dataset = open_single(address)

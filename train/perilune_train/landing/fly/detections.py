@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from perilune_shared.console.progress import say
+from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
 from perilune_shared.storage.tables.columns import Kind
 from perilune_shared.storage.tables.limits import DETECTIONS
