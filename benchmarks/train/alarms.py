@@ -42,6 +42,7 @@ from perilune_shared.console.command_line import one_command, run_command_line
 from perilune_shared.console.terminal import answer
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.names import SPLITS
+from perilune_train.data.frames import frame_table, load_images
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.matching import match_split
@@ -51,7 +52,6 @@ from perilune_train.detect.images.suspect import suspicion_of
 from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.scales import detect_at_scales
 from perilune_train.detect.novelty import fit_training_features
-from perilune_train.detect.train.familiar import MAX_FRAMES
 from perilune_train.shipped.models import shipped_run
 
 matplotlib.use("Agg")
@@ -205,7 +205,8 @@ def of_candidate(features: dict[str, Array], candidate: str) -> Array:
 def kind_of(recorder: Recorder, folder: Path, name: str, make: Callable[[], DetectSplit | NDArray[np.uint8]]) -> Kind:
     """Look at the frames of a kind, or read what an earlier command saw."""
     path = folder / "parts" / f"{''.join(c if c.isalnum() else '_' for c in name)}.npz"
-    if not path.is_file():
+
+    def measured() -> dict[str, Any]:
         frames, started = make(), time.process_time()
         images = frames.frames.images if isinstance(frames, DetectSplit) else frames
         detections, features = recorder.look(images)
@@ -217,12 +218,11 @@ def kind_of(recorder: Recorder, folder: Path, name: str, make: Callable[[], Dete
             of_frame = np.array([curve(matches.of_frames(numbers == k)).ap_paper() for k in numbers])
         is_calibrated = recorder.detector.calibration is not None
         suspicions = [suspicion_of(*pair, is_calibrated) for pair in zip(images, detections, strict=True)]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        suspected = np.array([reason is not None for reason in suspicions])
-        np.savez(path, ap=ap, of_frame=np.nan_to_num(of_frame), suspected=suspected, **features)
         answer(f"{name}: {len(images)} frames, AP {ap:.3f}, {time.process_time() - started:.1f} s")
-    with np.load(path) as stored:
-        known = {key: stored[key] for key in stored.files}
+        suspected = np.array([reason is not None for reason in suspicions])
+        return {"ap": np.array(ap), "of_frame": np.nan_to_num(of_frame), "suspected": suspected, **features}
+
+    known = _kept(path, measured)
     ap, of_frame, suspected = float(known.pop("ap")), known.pop("of_frame"), known.pop("suspected")
     return Kind(name, ap, of_frame, suspected, known)
 
@@ -286,6 +286,7 @@ def main(
     oblique: Annotated[Path | None, typer.Option(help="Dataset whose val split has oblique frames.")] = None,
     other: Annotated[list[Path] | None, typer.Option(help="Dataset of the test: its first split. Repeatable.")] = None,
     run: Annotated[Path | None, typer.Option(help="Detect run. [default: the installed detector]")] = None,
+    fit_every: Annotated[int, typer.Option(min=1, help="Fit on every n-th training frame.")] = 8,
     every: Annotated[int, typer.Option(min=1, help="Change every n-th validation frame.")] = 16,
     out: Path = Path("runs/bench/alarms"),
 ) -> None:
@@ -299,9 +300,8 @@ def main(
         return kind_of(recorder, out, name, make)
 
     data = open_dataset(dataset)
-    train = load_split(data, "train", config.labels)
-    thinned = every_nth(train, max(1, -(-len(train) // MAX_FRAMES))).frames
-    fitted, scenes = recorder.features(thinned.images), thinned.table["scene_id"].to_numpy()
+    rows = frame_table(data, "train").iloc[::fit_every].reset_index(drop=True)
+    fitted = _kept(out / "parts/training.npz", lambda: recorder.features(load_images(data, rows, "train")))
     val = load_split(data, "val", config.labels)
     small = every_nth(val, every)
     plain = look("validation", lambda: every_nth(val, 2))
@@ -316,7 +316,7 @@ def main(
     result: dict[str, Any] = {"candidates": {}, "kinds": {}}
     novelty: dict[str, Array] = {}
     for candidate in CANDIDATES:
-        fit = fit_training_features(of_candidate(fitted, candidate), scenes)
+        fit = fit_training_features(of_candidate(fitted, candidate), rows["scene_id"].to_numpy())
         assert fit is not None
         scores = {kind.name: fit.novelty(of_candidate(kind.features, candidate)) for kind in [*choice, *test]}
         novelty = novelty or scores
@@ -337,6 +337,15 @@ def main(
     draw(out / "alarms.png", novelty, [*choice, *test])
     result["overhead"] = overhead(detector, small.frames.images[:4])
     write_figures(out / "alarms.json", result)
+
+
+def _kept(path: Path, compute: Callable[[], dict[str, Array]]) -> dict[str, Array]:
+    """Arrays by name, from a file or computed and then stored in it."""
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **compute())  # type: ignore[arg-type]
+    with np.load(path) as stored:
+        return {name: stored[name] for name in stored.files}
 
 
 def _name_of(path: Path) -> str:
