@@ -61,14 +61,16 @@ Array = NDArray[np.float64]
 MIN_AP = 0.6
 """A kind of frames with a lower AP fails."""
 CANDIDATES: dict[str, tuple[str, ...]] = {
-    "backbone 2 and 4, neck": ("stage2", "stage4", "neck4", "neck8", "neck16"),
+    "backbone 2 and 4, neck": ("stage2", "stage4", "neck16", "neck8", "neck4"),
     "neck": ("neck4", "neck8", "neck16"),
     "backbone 2": ("stage2",),
     "backbone 2, 4 and 8": ("stage2", "stage4", "stage8"),
     "backbone 16 and 32": ("stage16", "stage32"),
     "energy of the objectness": ("energy",),
 }
-"""Features of each candidate: means of feature maps, by stride. The first is installed."""
+"""Features of each candidate: means of feature maps, by stride. The first is that of `YOLOv3.detect_with_features`."""
+INSTALLED = "as in the run"
+"""The first candidate as `detect calibrate` fitted it, on more frames."""
 
 
 def motion_blur(length_px: int) -> Variation:
@@ -79,7 +81,7 @@ def motion_blur(length_px: int) -> Variation:
 
 def gain(factor: float) -> Variation:
     """Longer exposure: brighter, and white where it exceeds the range."""
-    return lambda image, rng: rounded(factor * image)
+    return lambda image, rng: rounded(factor * image.astype(np.float32))
 
 
 def contrast(factor: float) -> Variation:
@@ -198,8 +200,9 @@ class Kind:
 
 
 def of_candidate(features: dict[str, Array], candidate: str) -> Array:
-    """Features (N, F) of a candidate."""
-    return np.concatenate([features[name] for name in CANDIDATES[candidate]], axis=1)
+    """Features (N, F) of a candidate, or of the run."""
+    names = CANDIDATES.get(candidate) or next(iter(CANDIDATES.values()))
+    return np.concatenate([features[name] for name in names], axis=1)
 
 
 def kind_of(recorder: Recorder, folder: Path, name: str, make: Callable[[], DetectSplit | NDArray[np.uint8]]) -> Kind:
@@ -314,10 +317,11 @@ def main(
     test += [look(name, lambda d=draw: other_bodies.frames_of(d, 14)) for name, draw in other_bodies.TEST.items()]
     test += [look(_name_of(path), lambda p=path: _all_frames(p, config)) for path in other or []]
     result: dict[str, Any] = {"candidates": {}, "kinds": {}}
+    fits = {name: fit_training_features(of_candidate(fitted, name), rows["scene_id"].to_numpy()) for name in CANDIDATES}
     novelty: dict[str, Array] = {}
-    for candidate in CANDIDATES:
-        fit = fit_training_features(of_candidate(fitted, candidate), rows["scene_id"].to_numpy())
-        assert fit is not None
+    for candidate, fit in {INSTALLED: detector.training_features, **fits}.items():
+        if fit is None:
+            continue
         scores = {kind.name: fit.novelty(of_candidate(kind.features, candidate)) for kind in [*choice, *test]}
         novelty = novelty or scores
         figures = {"choice": compared(scores, choice), "test": compared(scores, [plain, *test])}
