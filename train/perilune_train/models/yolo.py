@@ -85,7 +85,7 @@ class YOLOv3(nn.Module):
     @property
     def n_features(self) -> int:
         """Number of features of an image that `detect_with_features` returns."""
-        branches = [branch[-1].conv.out_channels for branch in self.branches.values()]  # type: ignore[index, union-attr]
+        branches = [branch[-1].conv.out_channels for branch in self.branches.values()]  # type: ignore[index]
         return sum([*self.backbone.channels[:_POOLED_STAGES], *branches])
 
     @property
