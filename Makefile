@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results traces trace-inputs release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results traces trace-inputs release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -369,6 +369,10 @@ bench-suspect: setup-dev # pictures that detect predict suspects not to show the
 bench-robust: setup-dev # AP of the installed detector on validation frames under JPEG, gamma, stretch, few grey levels, blur and noise, one at a time; writes runs/bench/robust.json
 	@test -e data/shipped/detect/dataset.json || { $(BIN)/perilune-render plan --manifest data_manifests/shipped-detect --out data/shipped/plan && $(BIN)/perilune-render dataset --manifest data/shipped/plan --out data/shipped/detect; }
 	@$(BIN)/python -m benchmarks.train.robust data/shipped/detect
+
+bench-alarms: setup-dev # candidates for the alarm "unlike the training": AUC and alarms on changed frames, textures and datasets (OBLIQUE=folder OTHER="folders"); writes runs/bench/alarms/
+	@test -e data/shipped/detect/dataset.json || { $(BIN)/perilune-render plan --manifest data_manifests/shipped-detect --out data/shipped/plan && $(BIN)/perilune-render dataset --manifest data/shipped/plan --out data/shipped/detect; }
+	@$(BIN)/python -m benchmarks.train.alarms data/shipped/detect $(if $(OBLIQUE),--oblique $(call quoted,$(OBLIQUE))) $(foreach folder,$(OTHER),--other $(call quoted,$(folder)))
 
 bench-suppress: setup-dev # time of non-maximum suppression of a batch, compared with OpenCV frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress

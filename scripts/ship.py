@@ -4,9 +4,10 @@
     make benchmark
     python scripts/ship.py card --name crater-detector --benchmark runs/benchmark/crater-detector/benchmark.json
 
-`install` writes train/perilune_train/shipped/NAME/ with weights.safetensors, config.yaml and metrics.json. The weights
-are stored in half precision, or with `--eight-bits` in half of this size; use `--eight-bits` only if the AP on the
-validation split does not fall. The benchmark scores the weights as they are stored. `card` adds benchmark.json and
+`install` writes train/perilune_train/shipped/NAME/ with weights.safetensors, config.yaml, metrics.json and novelty.json
+(features of the training frames; `perilune-train detect calibrate` adds it to a run without it). The weights are stored
+in half precision, or with `--eight-bits` in half of this size; use `--eight-bits` only if the AP on the validation
+split does not fall. The benchmark scores the weights as they are stored. `card` adds benchmark.json and
 card.md to the folder, and writes docs/reference/models/NAME.md, a copy of the card, and NAME-benchmark.md, the page of
 the benchmark.
 """
@@ -28,6 +29,7 @@ from model_card import Shipment, model_card
 from perilune_shared.console.command_line import run_command_line
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
+from perilune_train.detect.novelty import NOVELTY_FILE
 from perilune_train.records.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.shipped.models import BENCHMARK, CARD, WEIGHTS
 from perilune_train.training.half_weights import precision_of, write_bytewise, write_half
@@ -54,7 +56,7 @@ def install(
     folder, source = _folder(name), RunFolder(run)
     content, metrics = load_weights(source.best), read_metrics(run)
     folder.mkdir(parents=True, exist_ok=True)
-    for stale in (BENCHMARK, CARD):
+    for stale in (BENCHMARK, CARD, NOVELTY_FILE):
         (folder / stale).unlink(missing_ok=True)
     (write_bytewise if eight_bits else write_half)(folder / WEIGHTS, content)
     size = (folder / WEIGHTS).stat().st_size / 1e6
@@ -66,6 +68,8 @@ def install(
     public_metrics = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
     write_text(folder / METRICS_FILE, json.dumps(public_metrics, indent=2) + "\n")
     shutil.copyfile(source.config, folder / "config.yaml")
+    if (run / NOVELTY_FILE).is_file():
+        shutil.copyfile(run / NOVELTY_FILE, folder / NOVELTY_FILE)
     print(f"{folder}: {size:.1f} MB; next: score it on the locked benchmark, then `ship.py card`")
 
 

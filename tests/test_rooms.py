@@ -38,8 +38,8 @@ ROOMS = {
     ),
     "train/perilune_train/cli": "options detect navigate explain report main",
     "train/perilune_train/detect": (
-        "config ellipses calibration finished_run data evaluate inference train calibrate evaluate_runs benchmark "
-        "images deploy"
+        "config ellipses calibration finished_run novelty data evaluate inference train calibrate evaluate_runs "
+        "benchmark images deploy"
     ),
     "train/perilune_train/motion": (
         "config geometry data network pose classical metrics covariance train evaluate_runs benchmark deploy"

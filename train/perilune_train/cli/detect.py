@@ -243,16 +243,16 @@ def calibrate(
     dataset: Annotated[
         str | None,
         typer.Option(
-            help="Dataset with the validation frames: a folder, s3://bucket/prefix or gs://bucket/prefix."
+            help="Dataset with the training and validation frames: a folder, s3://bucket/prefix or gs://bucket/prefix."
             " [default: data/<name of the run>/detect]"
         ),
     ] = None,
 ) -> None:
-    """Make the scores of a finished run probabilities: fit their calibration on validation frames.
+    """Make the scores of a finished run probabilities, and add the alarm for images unlike its training frames.
 
-    Training does this at its end; runs of earlier releases need it once. Writes the calibration into metrics.json of
-    the run. The order of detections, AP and the reported detections do not change. Give the dataset on which the run
-    was trained.
+    Training does this at its end; runs of earlier releases need it once. Fits the calibration of the scores on
+    validation frames (metrics.json of the run) and the features of training frames (novelty.json). The order of
+    detections, AP and the reported detections do not change. Give the dataset on which the run was trained.
     """
     config = config_of_run(run)
     # Importing torch takes seconds; check the run first.
@@ -266,6 +266,8 @@ def calibrate(
         f"{run / 'metrics.json'}: expected calibration error on {entries['calibration/frames']} {before:.3f} before, "
         f"{after:.3f} after; the threshold of {raw:.3f} is a probability of {threshold:.3f}"
     )
+    alarm = entries.get("novelty") or f"from the features of {entries['novelty/frames']} training frames"
+    say(f"{run / 'novelty.json'}: alarm for images unlike the training: {alarm}")
 
 
 @app.command("benchmark")

@@ -441,7 +441,14 @@ def fly(
     source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
     from perilune_train.landing.fly.detections import by_network, by_table
-    from perilune_train.landing.fly.run import DescentFiles, disagreement_of, doubts_of, fly_descent, read_descent
+    from perilune_train.landing.fly.run import (
+        DescentFiles,
+        disagreement_of,
+        doubts_of,
+        fly_descent,
+        novelty_of,
+        read_descent,
+    )
 
     optional = ranges, truth, star_tracker, doppler_lidar
     descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, *optional))
@@ -456,8 +463,9 @@ def fly(
     say(f"{out}: {len(table)} frames ({counts}); {written}")
     if n_refused := int(table["n_refused"].sum()):
         say(f"refused {n_refused} ranges, speeds and attitudes that contradict the state: column n_refused by frame")
-    if disagreement := disagreement_of(table):
-        say(f"warning: {disagreement}")
+    for warning in (disagreement_of(table), novelty_of(table)):
+        if warning is not None:
+            say(f"warning: {warning}")
     if (table["status"] == "lost").any():
         for doubt in doubts_of(descent, is_lost=True):
             say(f"a possible cause of the status lost: {imu}: {doubt}")

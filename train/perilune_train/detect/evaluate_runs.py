@@ -25,6 +25,7 @@ from perilune_train.detect.evaluate.split_evaluation import (
     WRITTEN,
     dataset_entries,
     evaluate_split,
+    novel_entries,
     report_head,
     score_meaning,
     selection_entries,
@@ -113,6 +114,7 @@ def evaluate_again(
         selection_entries(config, frames) | dataset_entries(dataset, split, config) | {"dataset/protocol": protocol}
     )
     metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
+    metrics |= novel_entries(detections, f"{split}/")
     metrics[f"{split}/images_per_s"] = round(rate, 2)
     if d_prime is not None:
         by_d_prime = by_detectability(frames, detections, d_prime, chosen, config.evaluation.match_iou)

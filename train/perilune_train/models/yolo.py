@@ -15,6 +15,8 @@ OUTPUTS = 5
 """x, y, width, height, objectness."""
 _STRIDES = (2, 4, 8, 16, 32)
 _MAX_LOG_SCALE = 4.0
+_POOLED_STAGES = 2
+"""Number of the backbone's stages whose maps are features of an image."""
 _PRIOR = 0.01
 """Initial crater probability of every cell, so that the many empty cells do not dominate the first steps."""
 
@@ -80,6 +82,12 @@ class YOLOv3(nn.Module):
                 self.ellipse_heads[str(stride)] = nn.Sequential(conv_block(channels, 2 * channels, 3), output)
 
     @property
+    def n_features(self) -> int:
+        """Number of features of an image that `detect_with_features` returns."""
+        branches = [branch[-1].conv.out_channels for branch in self.branches.values()]  # type: ignore[index]
+        return sum([*self.backbone.channels[:_POOLED_STAGES], *branches])
+
+    @property
     def ellipses(self) -> bool:
         """Whether the network predicts ellipses with standard deviations."""
         return len(self.ellipse_heads) > 0
@@ -97,7 +105,8 @@ class YOLOv3(nn.Module):
         features, masks = self.backbone.features_and_masks(images)
         return self._outputs(features), masks
 
-    def _outputs(self, features: list[Tensor]) -> list[Tensor]:
+    def _outputs(self, features: list[Tensor], pooled: list[Tensor] | None = None) -> list[Tensor]:
+        """Raw outputs of the backbone's features; appends the mean features (N, C) of each branch to `pooled`."""
         outputs: list[Tensor] = []
         above = None
         for index in range(len(_STRIDES) - 1, _STRIDES.index(self.strides[0]) - 1, -1):
@@ -105,6 +114,8 @@ class YOLOv3(nn.Module):
             x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
             if stride in self.branches:
                 x = self.branches[stride](x)
+                if pooled is not None:
+                    pooled.append(x.float().mean((2, 3)))
                 raw = _per_anchor(self.heads[stride](x))
                 if stride in self.ellipse_heads:
                     raw = torch.cat([raw, _per_anchor(self.ellipse_heads[stride](x))], dim=-1)
@@ -129,8 +140,24 @@ class YOLOv3(nn.Module):
         A shape is the correlation of the ellipse in the box and four standard deviations: of the centre's x and y and
         of the semi-major and the semi-minor axis, pixels. None if the network predicts no ellipses.
         """
+        return self._decoded(self(images))
+
+    @torch.no_grad()
+    def detect_with_features(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """The result of `detect_ellipses`, and features (N, F) of the images, from the same forward pass.
+
+        The features are means over the image: of the backbone's maps at strides 2 and 4, and of the maps from which the
+        three heads predict.
+        """
+        maps = self.backbone(images)
+        pooled = [part.float().mean((2, 3)) for part in maps[:_POOLED_STAGES]]
+        outputs = self._outputs(maps, pooled)
+        return *self._decoded(outputs), torch.cat(pooled, dim=1)
+
+    def _decoded(self, outputs: list[Tensor]) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Boxes, scores and shapes of raw outputs, as from `detect_ellipses`."""
         boxes, scores, shapes = [], [], []
-        for raw, anchors, stride in zip(self(images), self.anchors, self.strides, strict=True):
+        for raw, anchors, stride in zip(outputs, self.anchors, self.strides, strict=True):
             boxes.append(decode_grid(raw, anchors, stride).flatten(1, 3))
             scores.append(raw[..., 4].sigmoid().flatten(1))
             if self.ellipses:

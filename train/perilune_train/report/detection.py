@@ -22,6 +22,7 @@ _ROWS = {
     "precision": "precision",
     "recall": "recall",
     "f1": "F1",
+    "novel_share": "share of frames unlike the training",
 }
 _BIN = re.compile(r"(.*?)(radius|altitude|sun)_([0-9.e+]+)_([0-9.e+]+|inf)(?:_(\w+))?/ap50_paper")
 _PANELS = {"radius": "radius (px)", "altitude": "altitude (m)", "sun": "Sun elevation (degrees)"}

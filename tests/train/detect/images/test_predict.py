@@ -27,7 +27,7 @@ EARTH = CRS.from_epsg(4326)
 POLAR = CRS.from_proj4(f"+proj=stere +lat_0=-90 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
 LONGITUDES = CRS.from_proj4(f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs")
 COLUMNS = ["image", "x0_px", "y0_px", "x1_px", "y1_px", "centre_x_px", "centre_y_px", "radius_px", "score"]
-COLUMNS += [*ELLIPSE_COLUMNS, "suspect"]
+COLUMNS += [*ELLIPSE_COLUMNS, "suspect", "novelty"]
 
 
 @pytest.fixture(scope="module")

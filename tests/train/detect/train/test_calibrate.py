@@ -24,6 +24,7 @@ from perilune_train.detect.images.find import load_detector
 from perilune_train.detect.inference.detector import load_detector as load_network
 from perilune_train.detect.inference.detector import open_detector, open_run
 from perilune_train.detect.inference.scales import detect_at_scales
+from perilune_train.detect.novelty import fit_training_features, write_training_features
 from perilune_train.detect.train.threshold import calibration_entries, detect_validation
 from perilune_train.landing.fly.detections import by_network
 from perilune_train.records.metrics_file import read_metrics
@@ -96,6 +97,28 @@ def test_a_second_calibration_replaces_the_first(calibrated, dataset_detect, tmp
     assert read_metrics(run) == metrics
 
 
+def test_predict_says_whether_there_is_an_alarm(old, split, tmp_path):
+    """Without training features one line says so; with those of other frames, one warning."""
+    Image.fromarray(split.frames.images[0]).save(tmp_path / "a.png")
+    with_alarm = tmp_path / "run"
+    shutil.copytree(old, with_alarm)
+    noise = np.random.default_rng(0).integers(0, 256, (12, 128, 128)).astype(np.uint8)
+    features = open_detector(runs.RunFolder(old).best, config_of_run(old)).features(noise)
+    write_training_features(with_alarm, fit_training_features(features, np.arange(12) % 4))
+    tables, notes = [], []
+    for name, run in (("without", old), ("with", with_alarm)):
+        out = tmp_path / name
+        done = in_process.call(main, "detect", "predict", tmp_path / "a.png", "--run", run, "--out", out)
+        assert done.returncode == 0, done.stderr
+        tables.append(pd.read_parquet(out / "detections.parquet"))
+        notes.append(done.stderr)
+    assert tables[0]["novelty"].isna().all() and "no alarm for images unlike the training" in notes[0]
+    assert (tables[1]["novelty"] > 1).all() and tables[1]["novelty"].nunique() == 1
+    assert notes[1].count("warning: a.png: novelty: got ") == 1 and "no alarm" not in notes[1]
+    craters = load_detector(with_alarm)(tmp_path / "a.png")
+    assert craters.novelty == pytest.approx(tables[1]["novelty"][0])
+
+
 def test_predict_says_whether_scores_are_probabilities(old, calibrated, split, tmp_path):
     """The tables have the same craters; only the scores differ."""
     Image.fromarray(split.frames.images[0]).save(tmp_path / "a.png")
@@ -107,7 +130,8 @@ def test_predict_says_whether_scores_are_probabilities(old, calibrated, split, t
         tables.append(pd.read_parquet(out / "detections.parquet"))
         notes.append([line for line in done.stderr.splitlines() if "scores are no probabilities" in line])
     assert len(notes[0]) == 1 and not notes[1]
-    assert len(tables[0]) > 5 and tables[0].drop(columns="score").equals(tables[1].drop(columns="score"))
+    same = [table.drop(columns=["score", "novelty"]) for table in tables]
+    assert len(tables[0]) > 5 and same[0].equals(same[1])
     raw, probability = (table["score"].to_numpy() for table in tables)
     assert np.array_equal(calibration_of(calibrated[0]).probabilities(raw), probability)
     craters = load_detector(calibrated[0])(tmp_path / "a.png")

@@ -13,7 +13,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate.report import write_evaluation
-from perilune_train.detect.evaluate.split_evaluation import score_meaning
+from perilune_train.detect.evaluate.split_evaluation import novel_entries, score_meaning
 from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.records.benchmark_parts import Part, open_parts
 from perilune_train.records.markdown import write_markdown
@@ -59,6 +59,9 @@ def score_run(
     about.append(score_meaning(detector.calibration))
     more: Metrics = {"scored": f"run {run.resolve().name}", "scales": scales}
     more |= {f"images_per_s/{name}": round(rate, 2) for name, rate in rates.items()}
+    more |= novel_entries([each for part in detections.values() for each in part], "")
+    for name, of_part in detections.items():
+        more |= {f"{key}/{name}": value for key, value in novel_entries(of_part, "").items()}
     return _write(out, parts, loaded, _Entry(detections, threshold, about, more, checks))
 
 

@@ -50,6 +50,9 @@ def readme(metadata: dict[str, Any]) -> str:
         f"{metadata['nms_iou']:g}, drop the one with the lower score.",
         "",
         *_probability(metadata),
+        "The graph has no alarm for images unlike the training frames (column `novelty` of `perilune-train detect "
+        "predict`).",
+        "",
         f"{metadata['multiply_adds'] / 1e9:.3f} G multiply-adds per image, {metadata['parameters']:,} parameters.",
         "",
         "| File | SHA-256 |",

@@ -76,6 +76,8 @@ class Detections:
     shapes: Array | None = None
     """Correlation of the ellipse in each box (ellipses.py), and the standard deviations of the ellipse: of the centre's
     x and y, of the semi-major and of the semi-minor axis, pixels (D, 5). None if the detector predicts only boxes."""
+    novelty: float | None = None
+    """How unlike the training frames the frame is (novelty.py), above 1 unlike them all; None if unknown."""
 
     @property
     def ellipses(self) -> Array:
@@ -88,7 +90,7 @@ class Detections:
     def take(self, chosen: NDArray) -> "Detections":
         """The detections with the given rows, or those for which a mask (D,) is True."""
         shapes = None if self.shapes is None else self.shapes[chosen]
-        return Detections(self.boxes[chosen], self.scores[chosen], shapes)
+        return replace(self, boxes=self.boxes[chosen], scores=self.scores[chosen], shapes=shapes)
 
     def moved(self, x_px: float, y_px: float) -> "Detections":
         """The detections with other coordinates: `x_px` and `y_px` are added."""
@@ -102,15 +104,15 @@ class Detections:
         ratios = np.array([ratio_x, ratio_y])
         boxes = self.boxes / np.tile(ratios, 2)
         if self.shapes is None:
-            return Detections(boxes, self.scores)
+            return replace(self, boxes=boxes)
         axes, new_axes = (ellipses_of(part, self.shapes[:, 0])[:, 2:4] for part in (self.boxes, boxes))
         factors = np.divide(new_axes, axes, out=np.ones_like(axes), where=axes > 0)
         sigmas_px = self.shapes[:, 1:] * np.hstack([np.tile(1 / ratios, (len(boxes), 1)), factors])
-        return Detections(boxes, self.scores, np.column_stack([self.shapes[:, 0], sigmas_px]))
+        return replace(self, boxes=boxes, shapes=np.column_stack([self.shapes[:, 0], sigmas_px]))
 
 
 def joined_detections(parts: Sequence[Detections]) -> Detections:
-    """The detections of all parts (at least one) as one list, in the order of the parts."""
+    """The detections of all parts (at least one) as one list, in the order of the parts, without novelty."""
     shapes = [part.shapes for part in parts if part.shapes is not None]
     return Detections(
         np.concatenate([part.boxes for part in parts]),

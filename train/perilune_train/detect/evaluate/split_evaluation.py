@@ -16,6 +16,7 @@ from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import Criteria, Detections, Matches, joined_detections, match_split
+from perilune_train.detect.novelty import is_novel
 from perilune_train.records.metrics_file import Metrics
 from perilune_train.records.provenance import protocol_of
 
@@ -84,6 +85,12 @@ def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> Metri
         "evaluation/split": split,
         "evaluation/scales": " ".join(f"{factor:g}" for factor in config.evaluation.scales),
     }
+
+
+def novel_entries(detections: list[Detections], prefix: str) -> Metrics:
+    """Share of the frames that are unlike the training (novelty.py), for metrics.json; {} if unknown."""
+    known = [of_frame.novelty for of_frame in detections if of_frame.novelty is not None]
+    return {f"{prefix}novel_share": sum(map(is_novel, known)) / len(known)} if known else {}
 
 
 def report_head(

@@ -27,6 +27,7 @@ from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import Detector, open_run
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.novelty import is_novel, novelty_text
 from perilune_train.shipped.models import shipped_models, shipped_run
 from perilune_train.training.runs import RunFolder
 
@@ -42,14 +43,17 @@ class Craters:
 
     table: pd.DataFrame
     """One row per crater: the box `x0_px`, `y0_px`, `x1_px`, `y1_px`, then `centre_x_px`, `centre_y_px`, `radius_px`
-    (half of sqrt(w h)), `score`, `suspect` (the reason of `suspicion`, or empty), and the ellipse columns of the table
-    `labels`. Pixels count from the outer corner of the first pixel. Further columns have the ellipse in other units,
-    and its standard deviations (`semi_major_px`, `semi_minor_px`, `angle_deg`, `sigma_...`). If the detector predicts
-    only boxes, the ellipse is the axis-aligned ellipse inside the box, and the standard deviations are NaN."""
+    (half of sqrt(w h)), `score`, `suspect` (the reason of `suspicion`, or empty), `novelty`, and the ellipse columns of
+    the table `labels`. Pixels count from the outer corner of the first pixel. Further columns have the ellipse in other
+    units, and its standard deviations (`semi_major_px`, `semi_minor_px`, `angle_deg`, `sigma_...`). If the detector
+    predicts only boxes, the ellipse is the axis-aligned ellipse inside the box, and the standard deviations are NaN."""
     image: NDArray[np.uint8]
     """The upright image in 8-bit grey (height, width), before normalisation."""
     suspicion: Suspicion | None = None
     """Why the image may not show regolith at a usable scale; None if nothing is suspicious. A warning tells it too."""
+    novelty: float | None = None
+    """How unlike the training frames the image is: above 1, detections are unreliable, and a warning says so. None if
+    the detector has no features of its training frames."""
 
     def __len__(self) -> int:
         return len(self.table)
@@ -119,8 +123,10 @@ class CraterDetector:
         suspicion, detections = suspicion_of(grey, every, calibrated), above(every, threshold)
         if suspicion is not None:
             say(f"warning: {name}: {suspicion.text}")
-        table = _with_ellipses(flagged(table_of(name, detections), suspicion), detections)
-        return Craters(table, grey, suspicion)
+        if is_novel(every.novelty):
+            say(f"warning: {name}: {novelty_text(every.novelty)}")
+        table = _with_ellipses(flagged(table_of(name, detections), suspicion, every.novelty), detections)
+        return Craters(table, grey, suspicion, every.novelty)
 
     def __repr__(self) -> str:
         where = f"{self._detector.device}, {'bfloat16' if self._detector.bf16 else 'float32'}"

@@ -32,6 +32,7 @@ from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling, described_by_image
+from perilune_train.detect.novelty import NO_ALARM, is_novel, novelty_text
 
 _SHOWN_DOUBTS = 5
 
@@ -87,9 +88,11 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             )
         if detector.calibration is None:
             say("scores are no probabilities: the run has no calibration; `perilune-train detect calibrate` adds one")
+        if detector.training_features is None:
+            say(NO_ALARM)
         say(f"scales: {described_by_image(scales)}")
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
-        tables, shapes, doubts = [], [], []
+        tables, shapes, doubts, novel = [], [], [], []
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
             image = read_grey(path, nodata, quiet=True)
@@ -97,8 +100,10 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             suspicion = suspicion_of(image, detections, detector.calibration is not None)
             if suspicion is not None:
                 doubts.append(f"warning: {path.name}: {suspicion.text}")
+            if is_novel(detections.novelty):
+                novel.append(f"warning: {path.name}: {novelty_text(detections.novelty)}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
-            tables.append(flagged(table_of(path.name, detections), suspicion))
+            tables.append(flagged(table_of(path.name, detections), suspicion, detections.novelty))
             write_overlay(folder / f"{path.name}.overlay.png", image, detections, threshold)
             if reference is not None:
                 located = features(path.name, detections, reference)
@@ -111,10 +116,11 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
         write_csv(table.round(4), folder / "detections.csv")
         if any(reference is not None for reference in references):
             (folder / "detections.geojson").write_text(json.dumps(collection(shapes)) + "\n", encoding="utf-8")
-    for line in doubts[:_SHOWN_DOUBTS]:
-        say(line)
-    if len(doubts) > _SHOWN_DOUBTS:
-        say(f"warning: {len(doubts) - _SHOWN_DOUBTS} more images that may not show the Moon")
+    for lines, what in ((doubts, "may not show the Moon"), (novel, "are unlike the training frames")):
+        for line in lines[:_SHOWN_DOUBTS]:
+            say(line)
+        if len(lines) > _SHOWN_DOUBTS:
+            say(f"warning: {len(lines) - _SHOWN_DOUBTS} more images that {what}")
     return len(table)
 
 
@@ -193,7 +199,7 @@ def table_of(name: str, detections: Detections) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def flagged(table: pd.DataFrame, suspicion: Suspicion | None) -> pd.DataFrame:
-    """Add the column `suspect` to the table of an image: the reason of the suspicion, or an empty text."""
-    reason = "" if suspicion is None else suspicion.reason
-    return table.assign(suspect=pd.Series([reason] * len(table), dtype="str"))
+def flagged(table: pd.DataFrame, suspicion: Suspicion | None, novelty: float | None) -> pd.DataFrame:
+    """Add `suspect` (the reason of the suspicion, or an empty text) and `novelty` (NaN if unknown) to a table."""
+    reason, value = "" if suspicion is None else suspicion.reason, np.nan if novelty is None else novelty
+    return table.assign(suspect=pd.Series([reason] * len(table), dtype="str"), novelty=np.full(len(table), value))

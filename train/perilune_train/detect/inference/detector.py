@@ -1,6 +1,6 @@
 """Load a trained detector, and run its network on a device."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import calibration_of
+from perilune_train.detect.novelty import TrainingFeatures, read_training_features
 from perilune_train.models.architecture import DetectorArchitecture, check_architecture_of, without_memory
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
@@ -40,16 +41,41 @@ class Detector:
     """Number of threads on a CPU, adapted to other work on the machine."""
     calibration: Calibration | None = None
     """Map from the network's scores to probabilities; None leaves the scores as they are."""
+    training_features: TrainingFeatures | None = None
+    """Features of the training frames, from which the novelty of a frame is computed; None if the run has none."""
 
-    @torch.no_grad()
     def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor, Tensor | None]:
         """Boxes (N, K, 4), scores (N, K) and shapes (N, K, 5) of all predictors, for images (N, height, width).
 
         Boxes and shapes are in pixels, as from `YOLOv3.detect_ellipses`.
         """
+        return self._run(self.network.detect_ellipses, images)
+
+    def predict_with_novelty(
+        self, images: NDArray[np.uint8]
+    ) -> tuple[Tensor, Tensor, Tensor | None, list[float] | None]:
+        """The result of `predict`, and the novelty of each image; None if the run has no features of training frames.
+
+        Both come from the same forward pass.
+        """
+        if self.training_features is None:
+            return *self.predict(images), None
+        boxes, scores, shapes, features = self._run(self.network.detect_with_features, images)
+        return boxes, scores, shapes, self.training_features.novelty(features.double().cpu().numpy()).tolist()
+
+    def features(self, images: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """Features (N, F) of images (N, height, width), as from `YOLOv3.detect_with_features`."""
+        size = self.config.batch_size
+        batches = [images[start : start + size] for start in range(0, len(images), size)]
+        parts = [self._run(self.network.detect_with_features, batch)[3] for batch in batches]
+        return torch.cat(parts).double().cpu().numpy()
+
+    @torch.no_grad()
+    def _run(self, function: Callable[[Tensor], Any], images: NDArray[np.uint8]) -> Any:
+        """Apply a function of the network to images (N, height, width)."""
         inputs = network_input(normalised(images), self.config.in_channels).to(self.device)
         with self.threads, torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
-            return self.network.detect_ellipses(inputs)
+            return function(inputs)
 
     def calibrated(self, detections: Detections) -> Detections:
         """The detections, after suppression, with their probabilities as scores."""
@@ -91,9 +117,13 @@ def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:
 
 
 def open_run(run: Path, config: DetectConfig) -> Detector:
-    """Load the best weights and the calibration of a finished run; `config` is the run's, or a changed copy of it.
+    """Load the best weights, the calibration and the training features of a finished run.
+
+    `config` is the run's, or a changed copy of it.
 
     If the run has a calibration, the scores of all detections are probabilities, like its threshold
     (`finished_run.chosen_threshold`). Raises UserError if a file is missing or damaged.
     """
-    return replace(open_detector(runs.RunFolder(run).best, config), calibration=calibration_of(run))
+    detector = open_detector(runs.RunFolder(run).best, config)
+    n_features = detector.network.n_features
+    return replace(detector, calibration=calibration_of(run), training_features=read_training_features(run, n_features))

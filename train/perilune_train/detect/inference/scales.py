@@ -1,6 +1,7 @@
 """Detection on resized frames: enlargement brings small craters to sizes that a network detects better."""
 
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -75,14 +76,19 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
     """Detections of frames (N, height, width), one entry per frame, in pixels of the frames.
 
     The network runs once for each of `detect.evaluation.scales`; one suppression merges the detections of all scales.
-    Small boxes of reduced frames are dropped (`detect.evaluation.min_coarse_radius_px`).
+    Small boxes of reduced frames are dropped (`detect.evaluation.min_coarse_radius_px`). Novelty is known if the
+    detector has training features and scale 1 is among the scales.
     """
     height, width = frames.shape[1:]
     settings = detector.config.evaluation
-    boxes, scores, shapes = [], [], []
+    boxes, scores, shapes, novelty = [], [], [], None
     for factor in settings.scales:
         to_height, to_width = scaled_size(height, width, factor)
-        found, confidence, shape = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
+        inputs = np.stack([resized(frame, to_width, to_height) for frame in frames])
+        if factor == 1:
+            found, confidence, shape, novelty = detector.predict_with_novelty(inputs)
+        else:
+            found, confidence, shape = detector.predict(inputs)
         ratios = torch.tensor([to_width / width, to_height / height], device=detector.device)
         boxes.append(found / ratios.repeat(2))
         if factor < min(1.0, max(settings.scales)):
@@ -93,7 +99,10 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
             shapes.append(shape if factor == 1 else resized_shapes(shape, found, boxes[-1], ratios))
     every_shape = torch.cat(shapes, 1) if shapes else None
     merged = detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), settings, every_shape)
-    return [detector.calibrated(of_frame) for of_frame in merged]
+    return [
+        replace(detector.calibrated(of_frame), novelty=None if novelty is None else novelty[number])
+        for number, of_frame in enumerate(merged)
+    ]
 
 
 def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:

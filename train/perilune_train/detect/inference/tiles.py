@@ -62,17 +62,20 @@ def detect_image(
     """Detections in an image (height, width) of any size, best first.
 
     `advance(n)` is called after every n tiles. For an image of the size of one tile at scale 1, the detections equal
-    the result of `detect_at_scales`.
+    the result of `detect_at_scales`. The novelty of the image is the median over its tiles at scale 1.
     """
     height, width = image.shape
     parts: list[Detections] = []
+    novelty: list[float] = []
     scales = tiling.scales_of(height, width)
     for scale in scales:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         large = scale > 1 and size[0] * size[1] > _MAX_ENLARGED_PIXELS and min(size) >= tiling.tile_px
         scaled = Enlarged(image, *size) if large else resized(image, *size)
         whole = scaled if isinstance(scaled, Enlarged) else padded(scaled, tiling.tile_px)
-        for detections in _detect_tiles(detector, whole, tiling, advance):
+        for detections in _detect_tiles(detector, whole, tiling, advance, with_novelty=scale == 1):
+            if detections.novelty is not None:
+                novelty.append(detections.novelty)
             inside = np.ones(len(detections.scores), bool)
             if whole.shape != scaled.shape:
                 # Drop craters in the reflected padding.
@@ -84,7 +87,8 @@ def detect_image(
     every = joined_detections(parts)
     found = every.take(suppress_in_blocks(every.boxes, every.scores, detector.config.evaluation.nms_iou))
     margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
-    return detector.calibrated(replace(found, boxes=found.boxes + margin))
+    found = replace(found, boxes=found.boxes + margin, novelty=float(np.median(novelty)) if novelty else None)
+    return detector.calibrated(found)
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:
@@ -119,7 +123,12 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 
 
 def _detect_tiles(
-    detector: Detector, image: NDArray[np.uint8] | Enlarged, tiling: Tiling, advance: Callable[[int], object]
+    detector: Detector,
+    image: NDArray[np.uint8] | Enlarged,
+    tiling: Tiling,
+    advance: Callable[[int], object],
+    *,
+    with_novelty: bool,
 ) -> Iterator[Detections]:
     """Detections of each tile, in pixels of the whole image, without boxes that another tile keeps."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
@@ -128,9 +137,13 @@ def _detect_tiles(
     for first in range(0, len(corners), detector.config.batch_size):
         batch = corners[first : first + detector.config.batch_size]
         tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
-        boxes, scores, shapes = detector.predict(tiles)
+        if with_novelty:
+            boxes, scores, shapes, novelty = detector.predict_with_novelty(tiles)
+        else:
+            (boxes, scores, shapes), novelty = detector.predict(tiles), None
         predictions = detections_of(boxes, scores, detector.config.evaluation, shapes)
-        for corner, in_tile in zip(batch, predictions, strict=True):
+        for number, (corner, in_tile) in enumerate(zip(batch, predictions, strict=True)):
+            in_tile = replace(in_tile, novelty=None if novelty is None else novelty[number])
             detections = in_tile.moved(corner[1], corner[0])
             clear = [
                 _clearance(detections.boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])

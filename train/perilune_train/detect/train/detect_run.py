@@ -24,6 +24,7 @@ from perilune_train.detect.evaluate.split_evaluation import (
     dataset_entries,
     evaluate_split,
     match_detections,
+    novel_entries,
     report_head,
     score_meaning,
     selection_entries,
@@ -32,8 +33,10 @@ from perilune_train.detect.evaluate.split_evaluation import (
 from perilune_train.detect.finished_run import calibration_in
 from perilune_train.detect.inference.detector import load_detector, open_detector
 from perilune_train.detect.inference.scales import detect_split, multiply_adds_of_a_frame
+from perilune_train.detect.novelty import TrainingFeatures, write_training_features
 from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.train.distill import Teacher
+from perilune_train.detect.train.familiar import training_features
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.threshold import calibration_entries, detect_validation
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
@@ -138,7 +141,9 @@ def _run(
         "multiply_adds": multiply_adds_of_a_frame(network, config, *splits["test"].frames.images.shape[1:]),
     }
     metrics |= selection_entries(config, splits["test"])
-    metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits, sizes)
+    features = training_features(open_detector(run.best, config), dataset)
+    metrics |= write_training_features(run.root, features)
+    metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits, sizes, features)
     mark_files(run.root, WRITTEN, terrain_check.mark)
     metrics |= terrain_check.metrics()
     write_metrics(run.root, metrics)
@@ -152,11 +157,12 @@ def evaluate(
     dataset: Dataset,
     splits: dict[str, DetectSplit],
     sizes_px: NDArray[np.float64],
+    features: TrainingFeatures | None,
 ) -> Metrics:
     """Evaluate the best weights on val and test; write tables and pictures.
 
     The threshold is chosen, and the calibration of the scores is fitted, on val only. `sizes_px` (S, 2) are the sizes
-    of the training labels.
+    of the training labels; `features` are the features of the training frames.
     """
     detector = open_detector(run.best, config)
     raw_val, _ = detect_split(detector, splits["val"], "val")
@@ -166,7 +172,7 @@ def evaluate(
     calibration = calibration_in(entries, run.metrics)
     if calibration is not None:
         threshold = calibration.probability(threshold)
-    detector = replace(detector, calibration=calibration)
+    detector = replace(detector, calibration=calibration, training_features=features)
     found_val = [detector.calibrated(of_frame) for of_frame in raw_val]
     found_test, rate = detect_split(detector, splits["test"], "test")
     matches = match_detections(splits["val"], found_val, config)
@@ -178,7 +184,7 @@ def evaluate(
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}
-    return metrics | entries | {"test/images_per_s": round(rate, 2)}
+    return metrics | entries | novel_entries(found_test, "test/") | {"test/images_per_s": round(rate, 2)}
 
 
 def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> YOLOv3:

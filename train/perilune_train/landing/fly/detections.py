@@ -1,6 +1,7 @@
 """Crater detections in frames of a descent, from a run's network, a user's function or a table."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from perilune_shared.console.terminal import say
 from perilune_shared.errors import UserError
 from perilune_shared.storage.tables.columns import Kind
 from perilune_shared.storage.tables.limits import DETECTIONS
@@ -18,11 +20,11 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.images.read import read_grey
-from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.detector import open_run
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.detect.novelty import NO_ALARM
 from perilune_train.landing.craters.sightings import MAX_SIGHTINGS
-from perilune_train.training.runs import RunFolder
 
 Detect = Callable[[Path], Detections]
 """Function that detects the craters in an image file. It raises UnreadableFrame if the image cannot be decoded."""
@@ -61,7 +63,9 @@ def by_network(run: Path) -> Detect:
     (`Sightings.noise_px`), and a probability says less about this error.
     """
     config, threshold = flight_config(run), raw_threshold(run)
-    detector = open_detector(RunFolder(run).best, config)
+    detector = replace(open_run(run, config), calibration=None)
+    if detector.training_features is None:
+        say(NO_ALARM)
     tiling = Tiling(_TILE_PX, scales=_SCALES)
     return lambda path: above(detect_image(detector, _grey(path), tiling, lambda n: None), threshold)
 

@@ -12,7 +12,14 @@ import pandas as pd
 from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
 from perilune_train.landing.fly.detections import Detector, by_function, by_network
-from perilune_train.landing.fly.run import DescentFiles, disagreement_of, doubts_of, fly_descent, read_descent
+from perilune_train.landing.fly.run import (
+    DescentFiles,
+    disagreement_of,
+    doubts_of,
+    fly_descent,
+    novelty_of,
+    read_descent,
+)
 from perilune_train.shipped.models import shipped_run
 
 
@@ -56,6 +63,7 @@ def fly(
         say(f"warning: {files.imu}: {doubt}")
     detect = by_network(shipped_run("detect")) if detector is None else by_function(detector)
     table = fly_descent(descent, detect, None if out is None else Path(out))
-    if disagreement := disagreement_of(table):
-        say(f"warning: {disagreement}")
+    for warning in (disagreement_of(table), novelty_of(table)):
+        if warning is not None:
+            say(f"warning: {warning}")
     return table

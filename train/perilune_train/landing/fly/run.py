@@ -15,6 +15,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, quaternion_from_matrix
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.novelty import is_novel
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
@@ -115,12 +116,14 @@ def fly_descent(
     """
     rows: list[dict[str, object]] = []
     faults: dict[int, str] = {}
+    novelty: dict[int, float] = {}
     with contextlib.nullcontext() if out is None else new_folder(out) as folder:
         lander = lander_of(descent)
-        seen = sightings(descent, detect, faults)
+        seen = sightings(descent, detect, faults, novelty)
         mounting = np.array(descent.camera.rotation_camera_from_body)
         for estimate in fly(lander, descent.instruments, descent.frames.time_s, seen):
             row = _row(estimate, descent.frames, mounting, faults.get(estimate.frame, ""))
+            row["novelty"] = novelty.get(estimate.frame, np.nan)
             rows.append(row)
             tell(_line(row))
             if live is not None:
@@ -162,16 +165,21 @@ def lander_of(descent: Descent, recorder: Recorder | None = None) -> Lander:
     return Lander(_start(descent), descent.prior.noise, surroundings_of(descent), recorder=recorder)
 
 
-def sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Iterator[Sightings]:
+def sightings(
+    descent: Descent, detect: Detect, faults: dict[int, str], novelty: dict[int, float] | None = None
+) -> Iterator[Sightings]:
     """Yield the craters of each frame.
 
-    An unreadable frame has no craters, and `faults` receives the error message under the number of the frame.
+    An unreadable frame has no craters, and `faults` receives the error message under the number of the frame. `novelty`
+    receives the novelty of each frame (detect/novelty.py), if the detector knows it.
     """
     for number, path in enumerate(descent.frames.paths):
         try:
             found = detect(path)
         except UnreadableFrame as error:
             faults[number], found = str(error), _NOTHING
+        if novelty is not None and found.novelty is not None:
+            novelty[number] = found.novelty
         yield sightings_of(found, descent.camera.intrinsics()).strongest()
 
 
@@ -236,7 +244,21 @@ def _line(row: dict[str, object]) -> str:
     line += f"  {row['n_matched']:3} craters"
     if row["disagreeing"]:
         line += f"  disagreeing: {row['disagreeing']}"
+    if is_novel(float(str(row["novelty"]))):
+        line += f"  unlike the training: novelty {row['novelty']:.2f}"
     return f"{line}  {row['fault']}" if row["fault"] else line
+
+
+def novelty_of(table: pd.DataFrame) -> str | None:
+    """One line on frames that are unlike the detector's training, from the table of `fly_descent`; None if none."""
+    novel = table[table["novelty"] > 1]
+    if not len(novel):
+        return None
+    return (
+        f"{len(novel)} of {len(table)} frames are unlike the detector's training frames, from "
+        f"{novel['time_s'].iloc[0]:.2f} s (novelty up to {novel['novelty'].max():.2f}, limit 1): its craters are "
+        "unreliable there"
+    )
 
 
 def disagreement_of(table: pd.DataFrame) -> str | None:
