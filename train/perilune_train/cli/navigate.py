@@ -440,22 +440,33 @@ def fly(
         raise UserError("--imu", "options", got, "--imu FILE, or --no-imu to fly without inertial measurements")
     source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
+    from perilune_train.detect.images.suspect import Suspicion
     from perilune_train.landing.fly.detections import by_network, by_table
-    from perilune_train.landing.fly.run import DescentFiles, disagreement_of, doubts_of, fly_descent, read_descent
+    from perilune_train.landing.fly.run import (
+        DescentFiles,
+        disagreement_of,
+        doubts_of,
+        fly_descent,
+        read_descent,
+        suspects_of,
+    )
 
     optional = ranges, truth, star_tracker, doppler_lidar
     descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, *optional))
-    detect = by_table(source, descent.frames.paths) if detections else by_network(source)
+    suspicions: dict[Path, Suspicion] = {}
+    detect = by_table(source, descent.frames.paths) if detections else by_network(source, suspicions)
     for doubt in doubts_of(descent):
         say(f"warning: {imu}: {doubt}")
     inputs = (frames, camera, catalogue, prior, source, *(path for path in (imu, *optional) if path is not None))
     with replaceable(out, ("estimates.parquet", "flight.png"), overwrite=overwrite, inputs=inputs) as folder:
-        table = fly_descent(descent, detect, folder, answer_page, live)
+        table = fly_descent(descent, detect, folder, answer_page, live, suspicions)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
     if n_refused := int(table["n_refused"].sum()):
         say(f"refused {n_refused} ranges, speeds and attitudes that contradict the state: column n_refused by frame")
+    if suspects := suspects_of(table):
+        say(f"warning: {suspects}")
     if disagreement := disagreement_of(table):
         say(f"warning: {disagreement}")
     if (table["status"] == "lost").any():

@@ -18,6 +18,7 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.images.read import read_grey
+from perilune_train.detect.images.suspect import Suspicion, suspicion_of
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.tiles import detect_image
 from perilune_train.detect.inference.tiling import Tiling
@@ -35,6 +36,7 @@ _SCALES, _TILE_PX = (1.0, 2.0), 512
 """Factors by which frames are resized, and the side of a tile: a frame of 256 px at scale 2 is one tile."""
 _FAR_PX = 1e6
 """Largest coordinate of a box, pixels."""
+_NO_CRATERS = Detections(np.zeros((0, 4)), np.zeros(0))
 _MAX_PER_FRAME = 10_000
 """Maximum number of craters in a frame. Matching needs only a few dozen."""
 
@@ -54,27 +56,46 @@ def flight_config(run: Path) -> DetectConfig:
     return config.model_copy(update={"evaluation": evaluation})
 
 
-def by_network(run: Path) -> Detect:
+def by_network(run: Path, suspicions: dict[Path, Suspicion] | None = None) -> Detect:
     """Detect craters with the network of a detect run, at the score threshold chosen by the run.
 
     Scores are the network's, without calibration: the filter derives the error of a centre from them
-    (`Sightings.noise_px`), and a probability says less about this error.
+    (`Sightings.noise_px`), and a probability says less about this error. `suspicions` receives the reason for each
+    frame that may not show regolith.
     """
     config, threshold = flight_config(run), raw_threshold(run)
     detector = open_detector(RunFolder(run).best, config)
     tiling = Tiling(_TILE_PX, scales=_SCALES)
-    return lambda path: above(detect_image(detector, _grey(path), tiling, lambda n: None), threshold)
+
+    def detect(path: Path) -> Detections:
+        image = _grey(path)
+        found = detect_image(detector, image, tiling, lambda n: None)
+        if suspicions is not None:
+            _check_picture(path, image, found, suspicions)
+        return above(found, threshold)
+
+    return detect
 
 
-def by_function(detector: Detector) -> Detect:
+def by_function(detector: Detector, suspicions: dict[Path, Suspicion] | None = None) -> Detect:
     """Detect craters with a user's function.
 
     It takes a grey image, uint8 (height, width), and returns an array (N, 5) of x, y, width, height, score: the centre
     and the size of the box around the rim, pixels from the outer corner of the first pixel, and a score from 0 to 1.
     It may also return a table with the columns x0_px, y0_px, x1_px, y1_px and score, or an object with this table as
     its attribute `table`, such as the craters that `perilune.load_detector()` returns. Other values raise UserError.
+
+    `suspicions` receives the reason for each frame that may not show regolith. Only grey levels are checked, since the
+    scores of a user's function can mean anything.
     """
-    return lambda path: _checked(detector(_grey(path)), path)
+
+    def detect(path: Path) -> Detections:
+        image = _grey(path)
+        if suspicions is not None:
+            _check_picture(path, image, _NO_CRATERS, suspicions)
+        return _checked(detector(image), path)
+
+    return detect
 
 
 def by_table(path: Path, frames: list[Path]) -> Detect:
@@ -106,6 +127,12 @@ def by_table(path: Path, frames: list[Path]) -> Detect:
         _check_count(path, name, len(own))
     boxes = np.column_stack(box)
     return lambda frame: Detections(boxes[rows[frame.name]], scores[rows[frame.name]])
+
+
+def _check_picture(path: Path, image: NDArray[np.uint8], found: Detections, suspicions: dict[Path, Suspicion]) -> None:
+    suspicion = suspicion_of(image, found, calibrated=False)
+    if suspicion is not None:
+        suspicions[path] = suspicion
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:

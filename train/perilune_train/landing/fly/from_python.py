@@ -11,8 +11,16 @@ import pandas as pd
 
 from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
+from perilune_train.detect.images.suspect import Suspicion
 from perilune_train.landing.fly.detections import Detector, by_function, by_network
-from perilune_train.landing.fly.run import DescentFiles, disagreement_of, doubts_of, fly_descent, read_descent
+from perilune_train.landing.fly.run import (
+    DescentFiles,
+    disagreement_of,
+    doubts_of,
+    fly_descent,
+    read_descent,
+    suspects_of,
+)
 from perilune_train.shipped.models import shipped_run
 
 
@@ -32,7 +40,7 @@ def fly(
     Returns:
         One row per frame: `file`, `time_s`, `status` (tracking, coasting or lost), position and velocity in the frame
         O_L (`x_m`, `velocity_x_mps`, ...), attitude (`rotation_w`, ...), standard deviations (`sigma_x_m`, ...),
-        number of matched craters (`n_matched`) and, if truth.csv exists, errors (`error_x_m`, ...,
+        number of matched craters (`n_matched`), why a frame may not show regolith (`suspect`, or empty) and, if truth.csv exists, errors (`error_x_m`, ...,
         `error_attitude_deg`).
 
     Raises:
@@ -54,8 +62,11 @@ def fly(
     descent = read_descent(files)
     for doubt in doubts_of(descent):
         say(f"warning: {files.imu}: {doubt}")
-    detect = by_network(shipped_run("detect")) if detector is None else by_function(detector)
-    table = fly_descent(descent, detect, None if out is None else Path(out))
+    suspicions: dict[Path, Suspicion] = {}
+    detect = by_network(shipped_run("detect"), suspicions) if detector is None else by_function(detector, suspicions)
+    table = fly_descent(descent, detect, None if out is None else Path(out), suspicions=suspicions)
+    if suspects := suspects_of(table):
+        say(f"warning: {suspects}")
     if disagreement := disagreement_of(table):
         say(f"warning: {disagreement}")
     return table

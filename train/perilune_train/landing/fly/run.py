@@ -1,7 +1,7 @@
 """Fly the filter over the files of one descent and write its estimates."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,6 +15,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, quaternion_from_matrix
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.images.suspect import Suspicion
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly
@@ -107,11 +108,13 @@ def fly_descent(
     out: Path | None,
     tell: Callable[[str], None] = lambda line: None,
     live: Path | None = None,
+    suspicions: Mapping[Path, Suspicion] | None = None,
 ) -> pd.DataFrame:
     """Fly the filter over a descent with the craters that `detect` finds; returns one row per frame.
 
     Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`; writes nothing if `out` is None.
     `tell` receives one line of text per frame. `live` is the path of a picture that is redrawn after every frame.
+    `suspicions` are the suspicions that `detect` adds while it runs.
     """
     rows: list[dict[str, object]] = []
     faults: dict[int, str] = {}
@@ -121,7 +124,8 @@ def fly_descent(
         mounting = np.array(descent.camera.rotation_camera_from_body)
         for estimate in fly(lander, descent.instruments, descent.frames.time_s, seen):
             row = _row(estimate, descent.frames, mounting, faults.get(estimate.frame, ""))
-            rows.append(row)
+            suspicion = (suspicions or {}).get(descent.frames.paths[estimate.frame])
+            rows.append(row | {"suspect": suspicion.reason if suspicion else ""})
             tell(_line(row))
             if live is not None:
                 draw_flight(live, with_errors_of(pd.DataFrame(rows), descent.truth))
@@ -237,6 +241,16 @@ def _line(row: dict[str, object]) -> str:
     if row["disagreeing"]:
         line += f"  disagreeing: {row['disagreeing']}"
     return f"{line}  {row['fault']}" if row["fault"] else line
+
+
+def suspects_of(table: pd.DataFrame) -> str | None:
+    """One line about the frames that may not show regolith, from the table of `fly_descent`; None if there are none."""
+    suspects = table[table["suspect"] != ""]
+    if not len(suspects):
+        return None
+    reasons = ", ".join(f"{count} {reason}" for reason, count in suspects["suspect"].value_counts().items())
+    first = suspects["file"].iloc[0]
+    return f"{len(suspects)} of {len(table)} frames may not show regolith ({reasons}; first {first}): column suspect"
 
 
 def disagreement_of(table: pd.DataFrame) -> str | None:
