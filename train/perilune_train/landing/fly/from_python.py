@@ -40,8 +40,8 @@ def fly(
     Returns:
         One row per frame: `file`, `time_s`, `status` (tracking, coasting or lost), position and velocity in the frame
         O_L (`x_m`, `velocity_x_mps`, ...), attitude (`rotation_w`, ...), standard deviations (`sigma_x_m`, ...),
-        number of matched craters (`n_matched`), why a frame may not show regolith (`suspect`, or empty) and, if truth.csv exists, errors (`error_x_m`, ...,
-        `error_attitude_deg`).
+        number of matched craters (`n_matched`), the reason why a frame may not show regolith (`suspect`, or empty)
+        and, if truth.csv exists, errors (`error_x_m`, ..., `error_attitude_deg`).
 
     Raises:
         UserError: A file is missing or invalid, or the detector returns an invalid value.
