@@ -265,8 +265,10 @@ def methods(
     """Run all methods on a split: relative motion, poses from craters (with and without a prior), filter.
 
     Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
-    frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
-    metrics.json (hashes, command, commit, versions). Catalogues, priors and initial states use a fixed random seed.
+    frame and absolute method), deviations.parquet (stated and measured errors of detected centres), altitude.png,
+    flights.png, matches_high.png, matches_low.png, inputs.json and metrics.json (hashes, command, commit, versions).
+    Catalogues, priors and initial states use a fixed random seed. If the detector predicts standard deviations, the
+    filter flies with and without them.
     """
     if split not in SPLITS:
         raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))

@@ -1,6 +1,7 @@
 """Crater detections in frames of a descent, from a run's network, a user's function or a table."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,10 @@ _COLUMNS: dict[str, Kind] = {"image": "text", **dict.fromkeys((*_BOX, "score"), 
 _ROW = ("x", "y", "width", "height", "score")
 _SCALES, _TILE_PX = (1.0, 2.0), 512
 """Factors by which frames are resized, and the side of a tile: a frame of 256 px at scale 2 is one tile."""
+SIGMA_COLUMNS = ("sigma_x_px", "sigma_y_px")
+_MAX_SIGMA_PX = 100.0
+"""Largest standard deviation of a centre in a table, pixels."""
+_SIGMA_TEXT = f"a number above 0, up to {_MAX_SIGMA_PX:g}"
 _FAR_PX = 1e6
 """Largest coordinate of a box, pixels."""
 _NO_CRATERS = Detections(np.zeros((0, 4)), np.zeros(0))
@@ -82,8 +87,9 @@ def by_function(detector: Detector, suspicions: dict[Path, Suspicion] | None = N
 
     It takes a grey image, uint8 (height, width), and returns an array (N, 5) of x, y, width, height, score: the centre
     and the size of the box around the rim, pixels from the outer corner of the first pixel, and a score from 0 to 1.
-    It may also return a table with the columns x0_px, y0_px, x1_px, y1_px and score, or an object with this table as
-    its attribute `table`, such as the craters that `perilune.load_detector()` returns. Other values raise UserError.
+    It may also return a table with the columns x0_px, y0_px, x1_px, y1_px and score, and optionally sigma_x_px and
+    sigma_y_px as in `by_table`, or an object with this table as its attribute `table`, such as the craters that
+    `perilune.load_detector()` returns. Other values raise UserError.
 
     `suspicions` receives the reason for each frame that may not show regolith. Only grey levels are checked, since the
     scores of a user's function can mean anything.
@@ -102,21 +108,30 @@ def by_table(path: Path, frames: list[Path]) -> Detect:
     """Take craters from a CSV or Parquet table, such as detections.parquet from `detect predict`.
 
     The columns are image (file name of the frame), x0_px, y0_px, x1_px, y1_px (the box around the rim, pixels from the
-    outer corner of the first pixel) and score (0 to 1). A frame without rows has no craters. Raises UserError if the
+    outer corner of the first pixel) and score (0 to 1). The optional columns sigma_x_px and sigma_y_px are predicted
+    standard deviations of the centre; a row may lack them. A frame without rows has no craters. Raises UserError if the
     file cannot be read, lacks a column or names an image that is not in the descent. Also raises UserError on a number
-    that is not finite, a box without area, or too many rows for one frame.
+    that is not finite, a box without area, a standard deviation that is not above 0, or too many rows for one frame.
     """
     names = [frame.name for frame in frames]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise UserError(path, "image", f"two frames named {twice}", "frames with different names")
-    table = read_table(path, DETECTIONS, _COLUMNS)
+    table = read_table(path, DETECTIONS, _COLUMNS | dict.fromkeys(SIGMA_COLUMNS, "number"), list(_COLUMNS))
     if not table.n_rows:
         raise UserError(path, "rows", 0, "one row for each crater in a frame")
     box = [table.finite(name, -_FAR_PX, _FAR_PX) for name in _BOX]
     table.check("x1_px", box[2] > box[0], "a number above x0_px")
     table.check("y1_px", box[3] > box[1], "a number above y0_px")
     scores, images = table.finite("score", 0, 1), table.texts("image")
+    _check_pair(path, [name for name in SIGMA_COLUMNS if name in table])
+    sigmas = np.full((len(scores), 2), np.nan)
+    if SIGMA_COLUMNS[0] in table:
+        sigmas = np.column_stack([table.numbers(name) for name in SIGMA_COLUMNS])
+        missing = np.isnan(sigmas)
+        for name, own, other in zip(SIGMA_COLUMNS, sigmas.T, missing.T[::-1], strict=True):
+            table.check(name, _is_sigma(own), _SIGMA_TEXT)
+            table.check(name, np.isnan(own) == other, "both standard deviations of the centre, or neither")
     number = {name: place for place, name in enumerate(names)}
     frame = np.array([*(number.get(word, -1) for word in images.words), -1])[images.codes]
     table.check("image", frame >= 0, f"a frame of the descent, such as {names[0]}")
@@ -125,8 +140,26 @@ def by_table(path: Path, frames: list[Path]) -> Detect:
     rows = {name: order[start:end] for name, (start, end) in zip(names, pairwise(bounds), strict=True)}
     for name, own in rows.items():
         _check_count(path, name, len(own))
-    boxes = np.column_stack(box)
-    return lambda frame: Detections(boxes[rows[frame.name]], scores[rows[frame.name]])
+    found = _with_sigmas(Detections(np.column_stack(box), scores), sigmas)
+    return lambda frame: found.take(rows[frame.name])
+
+
+def _is_sigma(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each value is a standard deviation of a centre, or missing."""
+    return np.isnan(values) | ((values > 0) & (values <= _MAX_SIGMA_PX))
+
+
+def _check_pair(where: object, names: list[str]) -> None:
+    if len(names) == 1:
+        raise UserError(where, "columns", f"{names[0]} alone", f"both of {', '.join(SIGMA_COLUMNS)}, or neither")
+
+
+def _with_sigmas(detections: Detections, sigmas_px: NDArray[np.float64]) -> Detections:
+    """The detections with standard deviations of their centres (D, 2); nothing else of their ellipses is known."""
+    if np.isnan(sigmas_px).all():
+        return detections
+    unknown = np.full((len(sigmas_px), 2), np.nan)
+    return replace(detections, shapes=np.column_stack([np.zeros(len(sigmas_px)), sigmas_px, unknown]))
 
 
 def _check_picture(path: Path, image: NDArray[np.uint8], found: Detections, suspicions: dict[Path, Suspicion]) -> None:
@@ -149,8 +182,11 @@ def _checked(found: Any, path: Path) -> Detections:
     names, expected = (*_BOX, "score") if is_table else _ROW, f"an array (N, 5) of {', '.join(_ROW)}, or a table"
     if is_table and (missing := [name for name in names if name not in found]):
         raise UserError("detector", path.name, f"a table without {missing[0]}", f"the columns {', '.join(names)}")
+    further = [name for name in SIGMA_COLUMNS if is_table and name in found]
+    _check_pair(f"detector: {path.name}", further)
     try:
         values = np.asarray(found[list(names)] if is_table else found, np.float64)
+        sigmas = np.asarray(found[further], np.float64) if further else np.full((len(values), 2), np.nan)
     except (TypeError, ValueError):
         raise UserError("detector", path.name, f"a {type(found).__name__}", expected) from None
     if values.size == 0:
@@ -173,7 +209,12 @@ def _checked(found: Any, path: Path) -> Detections:
             row = int(fits.argmin())
             given = ", ".join(f"{name} {value:g}" for name, value in zip(names, values[row], strict=True))
             raise UserError("detector", f"{path.name}: row {row}", given, wanted)
-    return Detections(boxes, scores)
+    wrong = ~_is_sigma(sigmas).all(axis=1) | (np.isnan(sigmas).sum(axis=1) == 1)
+    if wrong.any():
+        row = int(wrong.argmax())
+        given = ", ".join(f"{name} {value:g}" for name, value in zip(SIGMA_COLUMNS, sigmas[row], strict=True))
+        raise UserError("detector", f"{path.name}: row {row}", given, f"both empty, or each {_SIGMA_TEXT}")
+    return _with_sigmas(Detections(boxes, scores), sigmas)
 
 
 def _check_count(where: object, name: str, count: int) -> None:

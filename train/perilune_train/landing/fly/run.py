@@ -182,11 +182,12 @@ def sightings(descent: Descent, detect: Detect, faults: dict[int, str]) -> Itera
 def sightings_of(found: Detections, camera: Camera) -> Sightings:
     """Convert detections of a camera to the pinhole camera that covers its view.
 
-    Detections without a valid ray are left out.
+    Detections without a valid ray are left out. The standard deviation of a centre changes as the side of its box.
     """
     boxes = np.asarray(found.boxes, np.float64)
+    sigmas_px = None if found.shapes is None else np.asarray(found.shapes[:, 1:3], np.float64)
     if not any(camera.distortion):
-        return Sightings.of_boxes(boxes, found.scores)
+        return Sightings.of_boxes(boxes, found.scores, sigmas_px)
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     pinhole = camera.covering_pinhole()
     left, right = (np.column_stack([boxes[:, side], middle[:, 1]]) for side in (0, 2))
@@ -197,7 +198,9 @@ def sightings_of(found: Detections, camera: Camera) -> Sightings:
     half = np.column_stack([np.linalg.norm(right - left, axis=1), np.linalg.norm(bottom - top, axis=1)]) / 2
     straight = np.column_stack([middle - half, middle + half])
     reached = np.isfinite(straight).all(axis=1)
-    return Sightings.of_boxes(straight[reached], found.scores[reached])
+    if sigmas_px is not None:
+        sigmas_px = (sigmas_px * 2 * half / np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None))[reached]
+    return Sightings.of_boxes(straight[reached], found.scores[reached], sigmas_px)
 
 
 def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Array, fault: str) -> dict[str, object]:
