@@ -65,7 +65,7 @@ def test_predicted_centres_are_those_of_the_ellipses_under_tilt(tilt_deg):
     ellipses = project_circles(CAMERA, points, normals, WORLD.radius_m[seen.index])
     np.testing.assert_allclose(seen.centre_px, np.column_stack([ellipses.cx_px, ellipses.cy_px]), atol=1e-6)
     naive_px = np.linalg.norm(CAMERA.project(points) - seen.centre_px, axis=1)
-    assert len(naive_px) > 3 and naive_px.min() > 0.1, "the image of the centre of the rim is another point"
+    assert len(naive_px) > 3 and np.median(naive_px) > 0.15, "the image of the centre of the rim is another point"
 
 
 @pytest.mark.parametrize(("false_share", "found_share"), [(0.2, 0.8), (1.0, 0.8)])

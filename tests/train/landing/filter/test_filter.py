@@ -12,6 +12,7 @@ from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
 from perilune_train.landing.craters.fix import refine
 from perilune_train.landing.craters.projection import Pose, projected
+from perilune_train.landing.craters.sightings import PREDICTED_STATIC, STATIC_SHARE
 from perilune_train.landing.filter import measurements
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
 from perilune_train.landing.filter.state import N_ERRORS, State
@@ -232,7 +233,9 @@ def test_a_new_crater_has_the_offset_that_its_sighting_predicts():
             continue
         metres = (fix.pose.position_m[2] - catalogue.centre_m[crater, 2]) / CAMERA.fx_px
         predicted = not np.isnan(sigma_px[sighting])
-        own_m = metres * PREDICTED_STATIC * sigma_px[sighting] if predicted else STATIC_SHARE * catalogue.radius_m[crater]
+        own_m = (
+            metres * PREDICTED_STATIC * sigma_px[sighting] if predicted else STATIC_SHARE * catalogue.radius_m[crater]
+        )
         # The camera is level to a degree, so that the depth of a crater is nearly its height below the camera.
         np.testing.assert_allclose(of_crater[crater], np.hypot(1.0, own_m), rtol=0.01)
         kinds.add(predicted)
