@@ -420,7 +420,8 @@ def fly(
         typer.Option(
             help="Craters of another detector, in place of --run: a Parquet or CSV table with image (name of the"
             " frame's file), x0_px, y0_px, x1_px, y1_px (pixels from the outer corner of the first pixel) and score (0"
-            " to 1), as detections.parquet of `detect predict`."
+            " to 1), as detections.parquet of `detect predict`; sigma_x_px and sigma_y_px (standard deviations of the"
+            " centre) are optional."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("flight"),

@@ -158,6 +158,11 @@ def test_boxes_of_a_distorting_lens_become_those_of_a_pinhole():
     match = near.argmin(axis=1)
     assert near.min(axis=1).max() < 0.05
     assert np.abs(found.radius_px / half[inside][match] - 1).max() < 0.03
+    # A predicted deviation is stretched as its box: a tenth of the side remains a tenth of the side.
+    tenth = (boxes[:, 2:] - boxes[:, :2]) / 10
+    shapes = np.column_stack([np.zeros(len(boxes)), tenth, tenth])
+    stretched = sightings_of(Detections(boxes, np.ones(len(boxes)), shapes), camera)
+    np.testing.assert_allclose(stretched.sigma_px, found.radius_px / 5, rtol=0.03)
 
 
 def unpack(dataset, trajectory, out):

@@ -34,7 +34,8 @@ def fly(
         detector: A function that finds craters; the installed detector if None. It takes a grey image, uint8 (height,
             width), and returns an array (N, 5) of x, y, width, height, score: the centre and the size of the box around
             each rim, pixels from the outer corner of the first pixel, and a score from 0 to 1. It may also return what
-            `perilune.load_detector()` returns, or a table with the columns x0_px, y0_px, x1_px, y1_px, score.
+            `perilune.load_detector()` returns, or a table with the columns x0_px, y0_px, x1_px, y1_px, score and,
+            optionally, sigma_x_px and sigma_y_px, the standard deviations of the centre.
         out: New folder for estimates.parquet, estimates.csv and flight.png; nothing is written if None.
 
     Returns:

@@ -125,7 +125,7 @@ def deviations_section(deviations: pd.DataFrame) -> list[str]:
     """The lines about errors of detected centres, from `deviation_table`."""
     if not len(deviations):
         return []
-    rows = [[cell(key, value) for key, value in row.items()] for row in deviations.to_dict("records")]
+    rows = [[cell(str(key), value) for key, value in row.items()] for row in deviations.to_dict("records")]
     return [
         "## Errors of detected centres",
         "",
