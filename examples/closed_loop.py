@@ -161,7 +161,10 @@ class CraterCamera:
         frame = self._scene.frame(position_m, quaternion_from_matrix(rotation), velocity_mps=velocity_mps)
         detections = above(detect_image(self._detector, frame.image, self._tiling), self._threshold)
         boxes = np.asarray(detections.boxes, np.float64)
-        return Sightings.of_boxes(boxes, detections.scores), DrawnFrame(float(position_m[2]), frame.image, boxes)
+        sigmas_px = None if detections.shapes is None else detections.shapes[:, 1:3]
+        return Sightings.of_boxes(boxes, detections.scores, sigmas_px), DrawnFrame(
+            float(position_m[2]), frame.image, boxes
+        )
 
 
 def fly(scene: SceneClient, lander: Lander, camera: CraterCamera | None, seed: int) -> Flight:

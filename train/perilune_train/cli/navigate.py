@@ -265,8 +265,10 @@ def methods(
     """Run all methods on a split: relative motion, poses from craters (with and without a prior), filter.
 
     Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
-    frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
-    metrics.json (hashes, command, commit, versions). Catalogues, priors and initial states use a fixed random seed.
+    frame and absolute method), deviations.parquet (stated and measured errors of detected centres), altitude.png,
+    flights.png, matches_high.png, matches_low.png, inputs.json and metrics.json (hashes, command, commit, versions).
+    Catalogues, priors and initial states use a fixed random seed. If the detector predicts standard deviations, the
+    filter flies with and without them.
     """
     if split not in SPLITS:
         raise UserError("--split", "", split, "one of " + ", ".join(SPLITS))
@@ -418,7 +420,8 @@ def fly(
         typer.Option(
             help="Craters of another detector, in place of --run: a Parquet or CSV table with image (name of the"
             " frame's file), x0_px, y0_px, x1_px, y1_px (pixels from the outer corner of the first pixel) and score (0"
-            " to 1), as detections.parquet of `detect predict`."
+            " to 1), as detections.parquet of `detect predict`; sigma_x_px and sigma_y_px (standard deviations of the"
+            " centre) are optional."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("flight"),
@@ -440,6 +443,7 @@ def fly(
         raise UserError("--imu", "options", got, "--imu FILE, or --no-imu to fly without inertial measurements")
     source = detections or run or shipped_run("detect")
     # torch takes seconds to load.
+    from perilune_train.detect.images.suspect import Suspicion
     from perilune_train.landing.fly.detections import by_network, by_table
     from perilune_train.landing.fly.run import (
         DescentFiles,
@@ -448,22 +452,24 @@ def fly(
         fly_descent,
         novelty_of,
         read_descent,
+        suspects_of,
     )
 
     optional = ranges, truth, star_tracker, doppler_lidar
     descent = read_descent(DescentFiles(frames, camera, catalogue, imu, prior, *optional))
-    detect = by_table(source, descent.frames.paths) if detections else by_network(source)
+    suspicions: dict[Path, Suspicion] = {}
+    detect = by_table(source, descent.frames.paths) if detections else by_network(source, suspicions)
     for doubt in doubts_of(descent):
         say(f"warning: {imu}: {doubt}")
     inputs = (frames, camera, catalogue, prior, source, *(path for path in (imu, *optional) if path is not None))
     with replaceable(out, ("estimates.parquet", "flight.png"), overwrite=overwrite, inputs=inputs) as folder:
-        table = fly_descent(descent, detect, folder, answer_page, live)
+        table = fly_descent(descent, detect, folder, answer_page, live, suspicions)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     say(f"{out}: {len(table)} frames ({counts}); {written}")
     if n_refused := int(table["n_refused"].sum()):
         say(f"refused {n_refused} ranges, speeds and attitudes that contradict the state: column n_refused by frame")
-    for warning in (disagreement_of(table), novelty_of(table)):
+    for warning in (suspects_of(table), disagreement_of(table), novelty_of(table)):
         if warning is not None:
             say(f"warning: {warning}")
     if (table["status"] == "lost").any():

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from tests.train.landing.craters.crater_world import CAMERA, nearby, pose, sighted, world
 
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.ellipse import project_circles
-from perilune_shared.geometry.frames import rotation_vectors
+from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
 from perilune_train.landing.craters.catalogue import CatalogueErrors, with_errors
 from perilune_train.landing.craters.fix import PosePrior, refine
 from perilune_train.landing.craters.locate import locate
-from perilune_train.landing.craters.projection import projected
+from perilune_train.landing.craters.projection import Pose, projected
 from perilune_train.landing.craters.sightings import Sightings
 
 WORLD = world()
@@ -52,6 +53,19 @@ def test_centres_of_large_tilted_circles_leave_no_bias():
     error_m, naive_m = (np.linalg.norm(off(one, true)[:3]) for one in (found, wrong))
     assert error_m < 0.15
     assert naive_m > 3 * error_m
+
+
+@pytest.mark.parametrize("tilt_deg", [30.0, 45.0, 60.0])
+def test_predicted_centres_are_those_of_the_ellipses_under_tilt(tilt_deg):
+    tilt = matrix_from_rotation_vector(np.radians([tilt_deg, 0.0, 0.0]))
+    true = Pose(np.array([0.0, 0.0, 500.0]), ROTATION_CAMERA_FROM_BODY @ tilt.T)
+    seen = projected(WORLD, CAMERA, true, least_radius_px=10.0)
+    points = (WORLD.centre_m[seen.index] - true.position_m) @ true.rotation_camera_from_site.T
+    normals = WORLD.normal[seen.index] @ true.rotation_camera_from_site.T
+    ellipses = project_circles(CAMERA, points, normals, WORLD.radius_m[seen.index])
+    np.testing.assert_allclose(seen.centre_px, np.column_stack([ellipses.cx_px, ellipses.cy_px]), atol=1e-6)
+    naive_px = np.linalg.norm(CAMERA.project(points) - seen.centre_px, axis=1)
+    assert len(naive_px) > 3 and np.median(naive_px) > 0.15, "the image of the centre of the rim is another point"
 
 
 @pytest.mark.parametrize(("false_share", "found_share"), [(0.2, 0.8), (1.0, 0.8)])

@@ -12,6 +12,7 @@ from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
 from perilune_train.landing.craters.fix import refine
 from perilune_train.landing.craters.projection import Pose, projected
+from perilune_train.landing.craters.sightings import PREDICTED_STATIC, STATIC_SHARE
 from perilune_train.landing.filter import measurements
 from perilune_train.landing.filter.propagate import Increments, InertialNoise
 from perilune_train.landing.filter.state import N_ERRORS, State
@@ -211,6 +212,34 @@ def test_heights_of_the_catalogue_are_noise_where_they_are_seen(monkeypatch):
         block = caught["spread"][2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         expected = seen.noise_px[own] ** 2 / weight * np.eye(2) + np.outer(shift[k], shift[k])
         np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-3)
+
+
+def test_a_new_crater_has_the_offset_that_its_sighting_predicts():
+    rng = np.random.default_rng(2)
+    catalogue = replace(world(), position_sigma_m=1.0)
+    true = Pose(np.array([20.0, -30, 700]), MOUNTING)
+    seen = sighted(catalogue, true, rng, false_share=0.0)
+    sigma_px = np.where(np.arange(len(seen)) % 2, np.nan, np.linspace(0.2, 1.5, len(seen)))
+    seen = replace(seen, sigma_px=sigma_px)
+    fix = refine(seen, catalogue, CAMERA, nearby(true, np.zeros(3), np.zeros(3)), true)
+    sigmas = np.repeat([1.0, 0.1, np.radians(0.1), 1e-6, 1e-6], 3)
+    state = State.starting(true.position_m, np.zeros(3), np.eye(3), sigmas, 5.0)
+    found = measurements.crater_innovations(state, fix, seen, catalogue, CAMERA, MOUNTING).state
+    deviation_m = np.sqrt(np.diag(found.covariance)[N_ERRORS::2])
+    of_crater = dict(zip(found.craters.tolist(), deviation_m, strict=True))
+    kinds = set()
+    for crater, sighting in zip(fix.crater.tolist(), fix.sighting.tolist(), strict=True):
+        if crater not in of_crater:
+            continue
+        metres = (fix.pose.position_m[2] - catalogue.centre_m[crater, 2]) / CAMERA.fx_px
+        predicted = not np.isnan(sigma_px[sighting])
+        own_m = (
+            metres * PREDICTED_STATIC * sigma_px[sighting] if predicted else STATIC_SHARE * catalogue.radius_m[crater]
+        )
+        # The camera is level to a degree, so that the depth of a crater is nearly its height below the camera.
+        np.testing.assert_allclose(of_crater[crater], np.hypot(1.0, own_m), rtol=0.01)
+        kinds.add(predicted)
+    assert kinds == {True, False}
 
 
 def part(fix, chosen):

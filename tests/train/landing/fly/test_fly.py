@@ -8,6 +8,7 @@ import pytest
 from tests.helpers import in_process
 from tests.train.landing.fly.descent_files import START_M, TIMES_S, VELOCITY_MPS, options, write_descent
 
+import perilune
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.camera import Camera
 from perilune_train.cli.main import main
@@ -40,7 +41,9 @@ def test_a_line_for_each_frame_and_a_table(plain):
     lines = [line for line in shown.splitlines() if " deg " in line]
     assert [line.split()[0] for line in lines] == ["10.00", "11.00", "12.00"]
     assert "position error" in shown
-    text = pd.read_csv(folder.parent / "flight" / "estimates.csv").fillna({"fault": "", "disagreeing": ""})
+    text = pd.read_csv(folder.parent / "flight" / "estimates.csv").fillna(
+        {"fault": "", "disagreeing": "", "suspect": ""}
+    )
     pd.testing.assert_frame_equal(text, table, check_dtype=False)
     assert (folder.parent / "flight" / "flight.png").stat().st_size > 10_000
     assert (folder.parent / "live.png").is_file()
@@ -99,6 +102,18 @@ def test_without_an_inertial_unit_it_keeps_its_velocity(tmp_path, plain):
     assert table["sigma_x_m"].iloc[-1] > 1.3 * plain[1]["sigma_x_m"].iloc[-1]
 
 
+def test_frames_that_are_not_regolith_are_named_once_a_flight(tmp_path):
+    folder = write_descent(tmp_path / "descent", size_px=160)
+    done = in_process.call(main, "navigate", "fly", *options(folder), "--out", tmp_path / "flight")
+    assert done.returncode == 0, done.stderr
+    assert pd.read_parquet(tmp_path / "flight" / "estimates.parquet")["suspect"].tolist() == ["noise"] * 3
+    warnings = [line for line in done.stderr.splitlines() if "regolith" in line]
+    assert warnings == ["warning: 3 of 3 frames may not show regolith (3 noise; first 0.png): column suspect"]
+    (folder / "catalogue.csv").rename(folder / "catalogue.parquet")
+    by_call = perilune.fly(folder, detector=lambda image: [])
+    assert by_call["suspect"].tolist() == ["noise"] * 3
+
+
 def test_a_damaged_frame_is_flown_over_and_named(tmp_path, plain):
     folder = write_descent(tmp_path / "descent")
     image = folder / "frames" / "1.png"
@@ -143,6 +158,11 @@ def test_boxes_of_a_distorting_lens_become_those_of_a_pinhole():
     match = near.argmin(axis=1)
     assert near.min(axis=1).max() < 0.05
     assert np.abs(found.radius_px / half[inside][match] - 1).max() < 0.03
+    # A predicted deviation is stretched as its box: a tenth of the side remains a tenth of the side.
+    tenth = (boxes[:, 2:] - boxes[:, :2]) / 10
+    shapes = np.column_stack([np.zeros(len(boxes)), tenth, tenth])
+    stretched = sightings_of(Detections(boxes, np.ones(len(boxes)), shapes), camera)
+    np.testing.assert_allclose(stretched.sigma_px, found.radius_px / 5, rtol=0.03)
 
 
 def unpack(dataset, trajectory, out):

@@ -5,14 +5,17 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from tests.helpers import in_process
 from tests.train.landing.fly.descent_files import TIMES_S, options, write_descent
 
 import perilune
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from perilune_train.cli.main import main
 from perilune_train.landing.fly.detections import by_function, by_table
+from perilune_train.landing.fly.run import sightings_of
 
 BOX = ["x0_px", "y0_px", "x1_px", "y1_px"]
 RESULT = ["time_s", "status", "x_m", "y_m", "z_m", "n_matched"]
@@ -78,7 +81,10 @@ def test_the_installed_detector_as_a_function_and_by_default(tmp_path):
     files = perilune.DescentFiles(str(folder / "frames"), *(str(folder / name) for name in names))
     by_default = perilune.fly(files)
     assert by_default["time_s"].tolist() == list(TIMES_S)
-    pd.testing.assert_frame_equal(perilune.fly(files, detector=perilune.load_detector()), by_default)
+    by_call = perilune.fly(files, detector=perilune.load_detector())
+    # The scores of a user's function are not checked, since they can mean anything, and it states no novelty.
+    unlike = ["suspect", "novelty"]
+    pd.testing.assert_frame_equal(by_call.drop(columns=unlike), by_default.drop(columns=unlike))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["descent"]
 
 
@@ -102,10 +108,45 @@ FRAMES = ["0.png", "1.png", "2.png"]
         ({"x1_px": [5.0, -5.0]}, "x1_px: row 1: got -5.0, expected a number above x0_px"),
         ({"y1_px": [2.0, 6.0]}, "y1_px: row 0: got 2.0, expected a number above y0_px"),
         ({"score": [0.5, 1.5]}, "score: row 1: got 1.5, expected a number from 0 to 1"),
+        (
+            {"sigma_x_px": [0.2, 0.0], "sigma_y_px": 0.2},
+            "sigma_x_px: row 1: got 0.0, expected a number above 0, up to 100",
+        ),
+        ({"sigma_x_px": 0.2, "sigma_y_px": [0.2, np.inf]}, "sigma_y_px: row 1: got inf"),
+        ({"sigma_x_px": [0.2, np.nan], "sigma_y_px": 0.2}, "sigma_x_px: row 1: got nothing, expected both"),
+        ({"sigma_y_px": 0.2}, "columns: got sigma_y_px alone, expected both of sigma_x_px, sigma_y_px, or neither"),
     ],
 )
 def test_a_wrong_value_in_a_table_is_refused(tmp_path, change, message):
     check_refused(tmp_path, pd.DataFrame(GOOD | change), message)
+
+
+def test_predicted_deviations_of_a_table_reach_the_filter(tmp_path):
+    path, frames = tmp_path / "found.parquet", [tmp_path / name for name in FRAMES]
+    camera = Camera.from_field_of_view(64, 64, 45.0)
+    table = pd.DataFrame(GOOD | {"sigma_x_px": [0.3, np.nan], "sigma_y_px": [0.4, np.nan]})
+    table.to_parquet(path, index=False)
+    detect = by_table(path, frames)
+    first, second, none = (sightings_of(detect(frame), camera) for frame in frames)
+    assert np.isclose(first.sigma_px[0], np.sqrt(0.125)) and len(none) == 0
+    plain = sightings_of(by_function(lambda image: GOOD_ROW)(write_grey(tmp_path)), camera)
+    assert plain.sigma_px is None
+    # A row without a prediction has the deviations that follow from its radius and score.
+    assert second.noise_px[0] == plain.noise_px[0] != first.noise_px[0]
+    by_call = by_function(lambda image: table.head(1))(write_grey(tmp_path))
+    np.testing.assert_array_equal(by_call.shapes[:, 1:3], [[0.3, 0.4]])
+    # As `detect predict` writes it for a detector that predicts boxes only.
+    table.assign(sigma_x_px=np.nan, sigma_y_px=np.nan).to_parquet(path, index=False)
+    assert by_table(path, frames)(frames[0]).shapes is None
+
+
+GOOD_ROW = [[3.0, 4.0, 4.0, 4.0, 0.5]]
+
+
+def write_grey(folder):
+    path = folder / "grey.png"
+    Image.fromarray(np.zeros((64, 64), np.uint8)).save(path)
+    return path
 
 
 @pytest.mark.parametrize("name", ["image", "y0_px", "score"])
@@ -155,6 +196,10 @@ def test_too_many_rows_are_refused(tmp_path):
         ([[1, 2, 3, 4, 7]], "expected a score from 0 to 1"),
         (np.ones((10_001, 5)), "got 10001 craters, expected at most 10000 in a frame"),
         (pd.DataFrame({"x0_px": [1.0]}), "got a table without y0_px"),
+        (
+            pd.DataFrame([[1, 2, 5, 6, 0.5, 0.2, -1]], columns=[*BOX, "score", "sigma_x_px", "sigma_y_px"]),
+            "row 0: got sigma_x_px 0.2, sigma_y_px -1, expected both empty, or each a number above 0, up to 100",
+        ),
         (pd.DataFrame([["a"] * 5], columns=[*BOX, "score"]), "got a DataFrame"),
     ],
 )

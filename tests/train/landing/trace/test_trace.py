@@ -16,6 +16,7 @@ from tests.helpers import in_process
 from tests.train.landing.fly.descent_files import write_descent
 
 from perilune_train.cli.main import main
+from perilune_train.landing.craters.sightings import PREDICTED_STATIC
 from perilune_train.landing.filter.flight import fly
 from perilune_train.landing.fly.run import lander_of, sightings
 from perilune_train.landing.trace.columns import TABLES
@@ -272,6 +273,24 @@ def test_a_trace_of_files_is_reproduced_from_its_inputs(traced, tmp_path):
     sighted = pd.read_parquet(out / "sightings.parquet")
     assert sighted["radius_px"].to_list() == [110**0.5 / 2, 42**0.5 / 2]
     assert len(pd.read_parquet(out / "frames.parquet")) == 3
+
+
+def test_a_trace_keeps_predicted_deviations(traced, tmp_path):
+    folder = tmp_path / "descent"
+    shutil.copytree(traced[0], folder)
+    found = pd.read_parquet(folder / "detections.parquet").assign(sigma_x_px=[0.5, 0.2], sigma_y_px=[0.7, 0.2])
+    found.to_parquet(folder / "detections.parquet", index=False)
+    done = in_process.call(main, "navigate", "trace", "--descent", folder, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    kept = pd.read_parquet(tmp_path / "out" / INPUTS / "detections.parquet")
+    pd.testing.assert_frame_equal(kept[found.columns], found, check_dtype=False)
+    before, after = (pd.read_parquet(out / "sightings.parquet") for out in (traced[1], tmp_path / "out"))
+    assert after["score"].to_list() == before["score"].to_list() == [0.6, 0.9]
+    np.testing.assert_allclose(after["static_px"], PREDICTED_STATIC * np.array([0.2, 0.37**0.5]))
+    assert (after["noise_px"] != before["noise_px"]).all()
+    again = in_process.call(main, "navigate", "trace", "--descent", tmp_path / "out" / INPUTS, "--out", tmp_path / "b")
+    assert again.returncode == 0, again.stderr
+    assert in_process.call(main, "navigate", "check-trace", tmp_path / "out", tmp_path / "b").returncode == 0
 
 
 @pytest.mark.parametrize("name", ["camera.yaml", "detections.parquet", "catalogue.parquet"])

@@ -18,6 +18,10 @@ MAX_SIGHTINGS = 500
 """Largest number of craters of a frame that are matched in flight, which limits the time of a step."""
 _SIZE_SHARE = 0.15
 """Standard deviation of a detected radius, as a share of the radius."""
+PREDICTED_FLOOR_PX, PREDICTED_NOISE, PREDICTED_STATIC = 0.12, 0.62, 0.75
+"""If the detector predicts the standard deviation of a centre: errors that differ from frame to frame have a floor,
+pixels, and a share of this deviation; errors that repeat in every frame have the other share. Measured on the
+validation scenes of `shipped-nav` (docs/notebook/2026-11-28-deviations.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,18 +34,24 @@ class Sightings:
     """Half the geometric mean of each box's width and height (M,), pixels."""
     score: Array
     """Scores (M,)."""
+    sigma_px: Array | None = None
+    """Standard deviation per axis of each centre, as the detector predicts it (M,), pixels: root mean square of x and
+    y. NaN in rows without a prediction; None if there are no predictions."""
 
     @classmethod
-    def of_boxes(cls, boxes: Array, scores: Array) -> "Sightings":
+    def of_boxes(cls, boxes: Array, scores: Array, centre_sigmas_px: Array | None = None) -> "Sightings":
         """Sightings from boxes (M, 4) of x0, y0, x1, y1 in pixels, sorted by decreasing radius.
 
-        Sightings of equal radius keep the order of their boxes.
+        `centre_sigmas_px` (M, 2) are predicted standard deviations of the centres along x and y, pixels; NaN if
+        unknown. Sightings of equal radius keep the order of their boxes.
         """
         scores = np.asarray(scores)
+        sigma_px = None if centre_sigmas_px is None else np.sqrt(np.mean(np.square(centre_sigmas_px), axis=1))
         size = np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None)
         radius = np.sqrt(size.prod(axis=1)) / 2
         order = np.argsort(-radius, kind="stable")
-        return cls((boxes[order, :2] + boxes[order, 2:]) / 2, radius[order], scores[order])
+        centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+        return cls(centre, radius, scores, sigma_px).part(order)
 
     def strongest(self, count: int = MAX_SIGHTINGS) -> "Sightings":
         """The `count` sightings with the highest scores, sorted by decreasing radius."""
@@ -51,7 +61,12 @@ class Sightings:
 
     def part(self, chosen: NDArray[np.bool_] | NDArray[np.integer]) -> "Sightings":
         """The sightings with the given indices or mask."""
-        return Sightings(self.centre_px[chosen], self.radius_px[chosen], self.score[chosen])
+        sigma_px = None if self.sigma_px is None else self.sigma_px[chosen]
+        return Sightings(self.centre_px[chosen], self.radius_px[chosen], self.score[chosen], sigma_px)
+
+    def without_predictions(self) -> "Sightings":
+        """The sightings without predicted standard deviations."""
+        return Sightings(self.centre_px, self.radius_px, self.score)
 
     def __len__(self) -> int:
         return len(self.radius_px)
@@ -60,12 +75,18 @@ class Sightings:
     def noise_px(self) -> Array:
         """Standard deviations per axis (M,), pixels, of the errors that differ from frame to frame."""
         doubt = np.exp(_PER_SCORE * np.clip(_USUAL_SCORE - self.score, -0.2, 0.4))
-        return np.hypot(_FLOOR_PX, _NOISE_SHARE * self.radius_px) * doubt
+        usual = np.hypot(_FLOOR_PX, _NOISE_SHARE * self.radius_px) * doubt
+        if self.sigma_px is None:
+            return usual
+        return np.where(np.isnan(self.sigma_px), usual, np.hypot(PREDICTED_FLOOR_PX, PREDICTED_NOISE * self.sigma_px))
 
     @property
     def static_px(self) -> Array:
         """Standard deviations per axis (M,), pixels, of the errors that repeat in every frame of a crater."""
-        return STATIC_SHARE * self.radius_px
+        usual = STATIC_SHARE * self.radius_px
+        if self.sigma_px is None:
+            return usual
+        return np.where(np.isnan(self.sigma_px), usual, PREDICTED_STATIC * self.sigma_px)
 
     @property
     def size_sigma(self) -> float:

@@ -125,7 +125,13 @@ def crater_innovations(
     unmatched = np.setdiff1d(state.craters, crater)
     unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]
     known = np.concatenate([crater, unmatched])
-    state = state.with_craters(known, np.hypot(catalogue.position_sigma_m, STATIC_SHARE * catalogue.radius_m[known]))
+    static_m = STATIC_SHARE * catalogue.radius_m[known]
+    if sightings.sigma_px is not None:
+        depth_m = (catalogue.centre_m[crater] - fix.pose.position_m) @ fix.pose.rotation_camera_from_site[2]
+        predicted_m = depth_m / camera.fx_px * sightings.static_px[sighting]
+        is_predicted = ~np.isnan(sightings.sigma_px[sighting])
+        static_m[: len(crater)] = np.where(is_predicted, predicted_m, static_m[: len(crater)])
+    state = state.with_craters(known, np.hypot(catalogue.position_sigma_m, static_m))
     seen = projected(catalogue.part(crater), camera, fix.pose, margin_px=np.inf, least_radius_px=0.0)
     by_pose = seen.jacobian()[:, :2]
     expected, pose_by_error = camera_pose(state, rotation_camera_from_body)

@@ -1,7 +1,7 @@
 """Fly the filter over the files of one descent and write its estimates."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,6 +15,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, quaternion_from_matrix
 from perilune_shared.storage.files import new_folder
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.images.suspect import Suspicion
 from perilune_train.detect.novelty import is_novel
 from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.sightings import Sightings
@@ -108,11 +109,13 @@ def fly_descent(
     out: Path | None,
     tell: Callable[[str], None] = lambda line: None,
     live: Path | None = None,
+    suspicions: Mapping[Path, Suspicion] | None = None,
 ) -> pd.DataFrame:
     """Fly the filter over a descent with the craters that `detect` finds; returns one row per frame.
 
     Writes estimates.parquet, estimates.csv and flight.png to the new folder `out`; writes nothing if `out` is None.
     `tell` receives one line of text per frame. `live` is the path of a picture that is redrawn after every frame.
+    `suspicions` are the suspicions that `detect` adds while it runs.
     """
     rows: list[dict[str, object]] = []
     faults: dict[int, str] = {}
@@ -124,7 +127,8 @@ def fly_descent(
         for estimate in fly(lander, descent.instruments, descent.frames.time_s, seen):
             row = _row(estimate, descent.frames, mounting, faults.get(estimate.frame, ""))
             row["novelty"] = novelty.get(estimate.frame, np.nan)
-            rows.append(row)
+            suspicion = (suspicions or {}).get(descent.frames.paths[estimate.frame])
+            rows.append(row | {"suspect": suspicion.reason if suspicion else ""})
             tell(_line(row))
             if live is not None:
                 draw_flight(live, with_errors_of(pd.DataFrame(rows), descent.truth))
@@ -186,11 +190,12 @@ def sightings(
 def sightings_of(found: Detections, camera: Camera) -> Sightings:
     """Convert detections of a camera to the pinhole camera that covers its view.
 
-    Detections without a valid ray are left out.
+    Detections without a valid ray are left out. The standard deviation of a centre changes as the side of its box.
     """
     boxes = np.asarray(found.boxes, np.float64)
+    sigmas_px = None if found.shapes is None else np.asarray(found.shapes[:, 1:3], np.float64)
     if not any(camera.distortion):
-        return Sightings.of_boxes(boxes, found.scores)
+        return Sightings.of_boxes(boxes, found.scores, sigmas_px)
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     pinhole = camera.covering_pinhole()
     left, right = (np.column_stack([boxes[:, side], middle[:, 1]]) for side in (0, 2))
@@ -201,7 +206,9 @@ def sightings_of(found: Detections, camera: Camera) -> Sightings:
     half = np.column_stack([np.linalg.norm(right - left, axis=1), np.linalg.norm(bottom - top, axis=1)]) / 2
     straight = np.column_stack([middle - half, middle + half])
     reached = np.isfinite(straight).all(axis=1)
-    return Sightings.of_boxes(straight[reached], found.scores[reached])
+    if sigmas_px is not None:
+        sigmas_px = (sigmas_px * 2 * half / np.clip(boxes[:, 2:] - boxes[:, :2], 1e-6, None))[reached]
+    return Sightings.of_boxes(straight[reached], found.scores[reached], sigmas_px)
 
 
 def _row(estimate: Estimate, frames: FrameFiles, rotation_camera_from_body: Array, fault: str) -> dict[str, object]:
@@ -259,6 +266,16 @@ def novelty_of(table: pd.DataFrame) -> str | None:
         f"{novel['time_s'].iloc[0]:.2f} s (novelty up to {novel['novelty'].max():.2f}, limit 1): its craters are "
         "unreliable there"
     )
+
+
+def suspects_of(table: pd.DataFrame) -> str | None:
+    """One line about the frames that may not show regolith, from the table of `fly_descent`; None if there are none."""
+    suspects = table[table["suspect"] != ""]
+    if not len(suspects):
+        return None
+    reasons = ", ".join(f"{count} {reason}" for reason, count in suspects["suspect"].value_counts().items())
+    first = suspects["file"].iloc[0]
+    return f"{len(suspects)} of {len(table)} frames may not show regolith ({reasons}; first {first}): column suspect"
 
 
 def disagreement_of(table: pd.DataFrame) -> str | None:

@@ -1,7 +1,7 @@
 """Run the methods that estimate a position relative to the site: single-frame fixes and the filter."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -69,6 +69,16 @@ def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: C
             tables["filter, star tracker in flight"] = flights_with_star_tracker(
                 dataset, descents, catalogues.rough, _START_DEG
             )
+        if any(seen.sigma_px is not None for descent in descents for seen in descent.sightings):
+            unaided = [
+                replace(descent, sightings=[seen.without_predictions() for seen in descent.sightings])
+                for descent in descents
+            ]
+            tables["filter, constant deviations"] = flights(dataset, unaided, catalogues.rough, "tactical", _START_DEG)
+            if "navigation" in grades:
+                tables["filter, star tracker in flight, constant deviations"] = flights_with_star_tracker(
+                    dataset, unaided, catalogues.rough, _START_DEG
+                )
         tables["smoother"] = flights(dataset, descents, catalogues.rough, "tactical", _START_DEG, smooth=True)
     return {name: table for name, table in tables.items() if len(table)}
 

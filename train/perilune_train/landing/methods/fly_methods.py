@@ -20,9 +20,11 @@ from perilune_train.landing.methods.absolute import (
     catalogues_of,
     on_the_same_frames,
 )
-from perilune_train.landing.methods.page import page_of
+from perilune_train.landing.methods.deviations import deviation_table
+from perilune_train.landing.methods.page import deviations_section, page_of, same_frames_section
 from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
+from perilune_train.landing.monte_carlo.detector_errors import matches_of
 from perilune_train.motion.data.trajectories import Trajectory, load_split
 from perilune_train.motion.evaluate_runs import fusion_of, learned_motions
 from perilune_train.motion.metrics.baselines import MethodMotions, baselines
@@ -36,6 +38,7 @@ from perilune_train.training.begin import hashes_of
 from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, TABLE, FRAMES = "methods.md", "navigation.parquet", "frames.parquet"
+DEVIATIONS = "deviations.parquet"
 PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png")
 
 
@@ -47,6 +50,7 @@ def fly_methods(
     `navigator` and `detector` are folders of runs; without a navigator, all methods of relative motion are methods
     without training. `maps` is the folder of a map from `navigate map`. Writes
     methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
+    deviations.parquet (stated and measured errors of detected centres),
     pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`; writes nothing if
     it fails. Raises UserError if a network was fitted to the terrain of the split (unless `evaluated` allows overlap),
     or if the dataset lacks frames.
@@ -82,11 +86,16 @@ def fly_methods(
         if "filter" in errors:
             draw_flights(folder / PICTURES[1], errors["filter"])
         _draw_matches(folder, trajectories[0], descents[0], catalogues.rough[descents[0].ids[0]])
+        deviations = deviation_table([(each, matches_of(each, catalogues.exact[each.ids[0]])) for each in descents])
+        if len(deviations):
+            deviations.to_parquet(folder / DEVIATIONS, index=False)
         drawn = [name for name in PICTURES if (folder / name).is_file()]
         source = f"Dataset {code_span(dataset.info.name)}, split {for_markdown(split)}"
-        write_markdown(folder / PAGE, page_of(source, rows, descents, detection_s, drawn, on_the_same_frames(errors)))
+        sections = [*same_frames_section(on_the_same_frames(errors)), *deviations_section(deviations)]
+        write_markdown(folder / PAGE, page_of(source, rows, descents, detection_s, drawn, sections))
+        tables = [TABLE, FRAMES, *([DEVIATIONS] if len(deviations) else [])]
         for check in checks:
-            mark_files(folder, (PAGE, TABLE, FRAMES, *drawn), str(check.metrics()["terrain/mark"]))
+            mark_files(folder, (PAGE, *tables, *drawn), str(check.metrics()["terrain/mark"]))
         write_text(folder / "inputs.json", json.dumps(hashes_of({"dataset": address, **best}), indent=2) + "\n")
         write_metrics(folder, {"split": split, "seed": "fixed in the code"})
     return rows

@@ -28,6 +28,9 @@ _KNOWS = {
     "filter, star tracker": "as `filter`, with a start of 0.02 degrees",
     "filter, star tracker in flight": "as `filter`, with an attitude at each frame (10, 10 and 60 arc seconds)"
     " and a gyroscope with a bias of 0.5 degrees per hour",
+    "filter, constant deviations": "as `filter`, without the standard deviations that the detector predicts",
+    "filter, star tracker in flight, constant deviations": "as `filter, star tracker in flight`, without the standard"
+    " deviations that the detector predicts",
     "filter, exact catalogue": "as `filter`, with a catalogue without errors",
 }
 _RELATIVE = {
@@ -63,9 +66,12 @@ def page_of(
     descents: list[SeenDescent],
     detection_s: float,
     pictures: Sequence[str],
-    compared: Mapping[str, Mapping[str, float]],
+    sections: Sequence[str],
 ) -> str:
-    """The results page as Markdown; `source` names the dataset and the split, as Markdown."""
+    """The results page as Markdown.
+
+    `source` names the dataset and the split, as Markdown. `sections` are the lines of further sections.
+    """
     scenes = {descent.ids[0] for descent in descents}
     lines = [
         "# Navigation methods",
@@ -87,7 +93,7 @@ def page_of(
         "",
         *_table(rows[rows["kind"] == "absolute"], COLUMNS_ABSOLUTE),
         "",
-        *same_frames_section(compared),
+        *sections,
     ]
     for name in pictures:
         lines += ["", f"![{_CAPTIONS[name]}]({name})", "", f"*{_CAPTIONS[name]}.*"]
@@ -115,6 +121,37 @@ def same_frames_section(compared: Mapping[str, Mapping[str, float]]) -> list[str
     ]
 
 
+def deviations_section(deviations: pd.DataFrame) -> list[str]:
+    """The lines about errors of detected centres, from `deviation_table`."""
+    if not len(deviations):
+        return []
+    rows = [[cell(str(key), value) for key, value in row.items()] for row in deviations.to_dict("records")]
+    return [
+        "## Errors of detected centres",
+        "",
+        "Standard deviations per axis in pixels, as the filter states them and as measured on craters that are matched",
+        "in two consecutive frames, by stated deviation; the last row is of all. Persistent errors repeat in every",
+        "frame of a crater, independent ones differ from frame to frame. The normalised error squared is 1 if the",
+        "stated deviations are right.",
+        "",
+        *table([_DEVIATIONS[key] for key in deviations.columns], rows),
+        "",
+    ]
+
+
+_DEVIATIONS = {
+    "n_pairs": "pairs",
+    "radius_px": "radius, median (px)",
+    "stated_px": "stated",
+    "error_px": "measured",
+    "normalised_error_squared": "normalised error squared",
+    "stated_static_px": "persistent, stated",
+    "static_px": "persistent, measured",
+    "stated_noise_px": "independent, stated",
+    "noise_px": "independent, measured",
+}
+
+
 def _table(rows: pd.DataFrame, columns: dict[str, str]) -> list[str]:
     used = {key: title for key, title in columns.items() if key in rows and rows[key].notna().any()}
     cells = [
@@ -128,6 +165,6 @@ def cell(key: str, value: float) -> str:
     """Format a figure as its column requires."""
     if not math.isfinite(value):
         return "-"
-    if key == "n_frames":
+    if key in ("n_frames", "n_pairs"):
         return f"{value:.0f}"
     return f"{100 * value:.1f} %" if key.endswith("_share") else number(value)

@@ -17,6 +17,7 @@ from perilune_train.detect.inference.scales import detect_at_scales
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.fly.detections import flight_config
+from perilune_train.landing.fly.run import sightings_of
 from perilune_train.motion.data.trajectories import Trajectory
 from perilune_train.training.runs import RunFolder
 
@@ -60,7 +61,7 @@ def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -
                 begun = time.perf_counter()
                 for predicted in detect_at_scales(detector, trajectory.images[start : start + _BATCH]):
                     kept = above(predicted, threshold)
-                    sightings.append(Sightings.of_boxes(kept.boxes, kept.scores).strongest())
+                    sightings.append(sightings_of(kept, trajectory.camera).strongest())
                 seconds += time.perf_counter() - begun
                 progress.advance(bar, len(trajectory.images[start : start + _BATCH]))
             rows = dataset.table("frames", ["time_s", "velocity_mps"], *trajectory.ids).sort_by("time_s")

@@ -5,9 +5,10 @@ in every frame of a crater, and an error that differs from frame to frame. The f
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
@@ -115,6 +116,28 @@ def measured_errors(descents: Sequence[tuple[SeenDescent, list[FrameMatches]]], 
     )
 
 
+def paired_errors(descent: SeenDescent, matches: list[FrameMatches]) -> pd.DataFrame:
+    """Errors of the centres of craters that are matched in consecutive frames of a descent, one row per pair.
+
+    Columns, pixels: error in the later frame (`x_px`, `y_px`) and in the earlier one (`before_x_px`, `before_y_px`),
+    true radius, and stated deviations in the later frame (`noise_px`, `static_px`). The shared error is removed.
+    """
+    parts, before = [np.zeros((0, 7))], None
+    for sightings, match in zip(descent.sightings, matches, strict=True):
+        if len(match.crater) < _MIN_MATCHES:
+            before = None
+            continue
+        error = _Residuals.of(descent, sightings, match).error[:, :2] * match.radius_px[:, None]
+        if before is not None:
+            _, now, then = np.intersect1d(match.crater, before[0], return_indices=True)
+            own = match.sighting[now]
+            stated = [match.radius_px[now], sightings.noise_px[own], sightings.static_px[own]]
+            parts.append(np.column_stack([error[now], before[1][then], *stated]))
+        before = match.crater, error
+    names = ["x_px", "y_px", "before_x_px", "before_y_px", "radius_px", "noise_px", "static_px"]
+    return pd.DataFrame(np.concatenate(parts), columns=names)
+
+
 @dataclass(frozen=True, slots=True)
 class _Residuals:
     """Errors of the matched detections of one frame, without the shared image error."""
@@ -171,5 +194,5 @@ def drawn_sightings(
         noise = errors.size_noise * rng.normal(size=len(match.crater))
         radius[match.sighting] = match.radius_px * np.exp(size[match.crater] + noise)
         order = np.argsort(-radius, kind="stable")
-        found.append(Sightings(centre[order], radius[order], sightings.score[order]))
+        found.append(replace(sightings, centre_px=centre, radius_px=radius).part(order))
     return found

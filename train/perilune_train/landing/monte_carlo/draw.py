@@ -175,10 +175,8 @@ _NOTHING = Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
 def _with_false(sightings: Sightings, size_px: Array, rng: np.random.Generator) -> Sightings:
-    """Add a false sighting for each sighting: equal size and score, at a random position in the image."""
+    """Add a false sighting for each sighting: the size, score and predicted deviation of one, at a random position."""
     shuffled = rng.permutation(len(sightings))
     centre = np.concatenate([sightings.centre_px, rng.uniform(0, size_px, (len(sightings), 2))])
-    radius = np.concatenate([sightings.radius_px, sightings.radius_px[shuffled]])
-    score = np.concatenate([sightings.score, sightings.score[shuffled]])
-    order = np.argsort(-radius, kind="stable")
-    return Sightings(centre[order], radius[order], score[order])
+    twice = sightings.part(np.concatenate([np.arange(len(sightings)), shuffled]))
+    return replace(twice, centre_px=centre).part(np.argsort(-twice.radius_px, kind="stable"))

@@ -17,7 +17,7 @@ from perilune_shared.storage.tables.read import read_table
 from perilune_train.landing.filter.flight import Instruments, fly
 from perilune_train.landing.fly.catalogue import read_catalogue
 from perilune_train.landing.fly.clocks import check_clocks
-from perilune_train.landing.fly.detections import Detect, by_network, by_table
+from perilune_train.landing.fly.detections import SIGMA_COLUMNS, Detect, by_network, by_table
 from perilune_train.landing.fly.run import Descent, DescentFiles, lander_of, read_descent, sightings, surroundings_of
 from perilune_train.landing.fly.settings import UnitErrors, read_camera, read_prior
 from perilune_train.landing.fly.tables import (
@@ -111,7 +111,11 @@ def write_inputs(descent: Descent, detect: Detect, folder: Path) -> None:
     found = [(path.name, detect(path)) for path in descent.frames.paths]
     boxes = _named(np.concatenate([each.boxes for _, each in found]), _BOX)
     boxes.insert(0, "image", np.repeat(names, [len(each.scores) for _, each in found]))
-    write_table(boxes.assign(score=np.concatenate([each.scores for _, each in found])), folder / _DETECTIONS)
+    boxes = boxes.assign(score=np.concatenate([each.scores for _, each in found]))
+    if any(each.shapes is not None for _, each in found):
+        shapes = [np.full((len(each.scores), 5), np.nan) if each.shapes is None else each.shapes for _, each in found]
+        boxes = boxes.assign(**dict(zip(SIGMA_COLUMNS, np.concatenate(shapes)[:, 1:3].T, strict=True)))
+    write_table(boxes, folder / _DETECTIONS)
     (folder / "camera.yaml").write_text(to_yaml_text(descent.camera.model_dump(mode="json")), encoding="utf-8")
     prior = descent.prior.model_dump(mode="json", exclude_none=True)
     # The catalogue has been converted to O_L.
