@@ -54,8 +54,8 @@ def test_detections_are_chosen_in_turn_from_all_frames():
 def test_new_craters_come_before_seen_ones():
     frames = [frame("matched", "matched"), frame("matched", "matched")]
     chosen = chosen_detections(frames, [[1, 2], [1, 3]], {1, 2, 3}, 100)
-    # Every second one is the largest correct detection of a frame.
-    assert chosen[:3:2] == [(0, 0), (0, 1)] and set(chosen) == {(f, k) for f in range(2) for k in range(2)}
+    # Crater 1 of frame 1 is last, since frame 0 shows it too.
+    assert chosen == [(0, 0), (0, 1), (1, 1), (1, 0)]
 
 
 def test_a_patch_is_covered_by_the_mean_around_it():
@@ -206,6 +206,20 @@ def test_without_changed_frames_the_panel_says_so(answered):
     report = gather("demo", "demo", answered.data, answered.runs, AnswerInputs(1))
     (one,) = report.viewer.answers.each
     assert len(one.pictures) == 1 and one.why[-1].startswith("No changed frames were given")
+
+
+def test_the_panel_names_the_changed_frames_that_say_nothing_about_a_detection(answered):
+    viewer = answered.report.viewer
+    partly = [one for one in viewer.answers.each if len(one.pictures) == 2]
+    assert partly
+    for one in partly:
+        assert re.fullmatch(
+            r"Not shown: crater removed and 0\.5 of the crater's depth \((no labelled crater is here|this crater was not "
+            r"changed)\)\.",
+            one.why[-1],
+        )
+    false = [one for one in partly if viewer.frames[one.frame].detections[one.detection].kind == "false"]
+    assert all("no labelled crater" in one.why[-1] for one in false)
 
 
 def test_no_answers_are_computed_by_default(report):

@@ -71,12 +71,23 @@ class ChangedFrames:
     rows: pd.DataFrame
     """Rows of `frame_table`, indexed by frame_id."""
 
-    def image(self, frame_id: str) -> Image8 | None:
-        """The changed frame (height, width); None if it was not rendered."""
-        if frame_id not in self.rows.index:
-            return None
-        row = self.rows.loc[[frame_id]].reset_index()
-        return np.asarray(load_images(self.dataset, row, "test")[0])
+    def images(self, frame_ids: list[str]) -> dict[str, Image8]:
+        """The changed frames (height, width) by frame_id; frames that were not rendered are left out."""
+        rows = self.rows[self.rows.index.isin(frame_ids)].reset_index()
+        return dict(zip(rows["frame_id"], load_images(self.dataset, rows, "test"), strict=True)) if len(rows) else {}
+
+    def reason_not_to_show(self, is_rendered: bool, scene_id: str, crater: int | None) -> str:
+        """Why this version of a frame says nothing about a detection; empty if it does.
+
+        `crater` is the crater_id of the detection's label, None without a label.
+        """
+        if not is_rendered:
+            return "this frame was not rendered"
+        if self.craters is None:
+            return ""
+        if crater is None:
+            return "no labelled crater is here"
+        return "" if (scene_id, crater) in self.craters else "this crater was not changed"
 
 
 def open_changed(dataset: Dataset, inputs: AnswerInputs) -> list[ChangedFrames]:
@@ -226,28 +237,31 @@ def _answers(
     craters: list[list[int | None]],
     explainer: _Explainer,
 ) -> list[Answer]:
-    answers = []
+    answers, numbers, table = [], sorted({frame for frame, _ in places}), frames.split.frames.table
+    names = [table["frame_id"][indices[number]] for number in numbers]
+    versions = [(each, each.images(names)) for each in explainer.changed]
     with progress_bar() as progress:
         bar = progress.add_task("answers", total=len(places), unit="detections", note="")
-        for number in sorted({frame for frame, _ in places}):
+        for number, name in zip(numbers, names, strict=True):
             index = indices[number]
-            image, row = frames.split.frames.images[index], frames.split.frames.table.iloc[index]
+            image, row = frames.split.frames.images[index], table.iloc[index]
             seen = explainer.seen(image, row)
-            versions = [(each, each.image(row["frame_id"])) for each in explainer.changed]
-            shown = [
-                (each, picture, explainer.detect(picture[None])[0]) for each, picture in versions if picture is not None
-            ]
+            found = {
+                k: explainer.detect(images[name][None])[0] for k, (_, images) in enumerate(versions) if name in images
+            }
             sun_px = (seen.true.rotation_camera_from_site @ np.asarray(row["sun_direction"], np.float64))[:2]
             for k in sorted(k for frame, k in places if frame == number):
-                box = frames.found[index].boxes[k]
+                box, crater = frames.found[index].boxes[k], craters[number][k]
                 occlusion = occlude(explainer.detect, image, box)
-                pictures = [_occluded(image, box, occlusion)]
-                crater = craters[number][k]
-                for each, picture, found in shown:
-                    if each.craters is None or (crater is not None and (row["scene_id"], crater) in each.craters):
-                        caption = f"{each.caption}: score {score_at(found, box):.2f}"
-                        pictures.append(_ground(picture, box, occlusion.patches, caption))
-                why = [*sentences_of(occlusion, sun_px), *_on_changes(explainer.changed, len(pictures) - 1, crater)]
+                pictures, missing = [_occluded(image, box, occlusion)], {}
+                for version, (each, images) in enumerate(versions):
+                    reason = each.reason_not_to_show(version in found, row["scene_id"], crater)
+                    if reason:
+                        missing[each.caption] = reason
+                        continue
+                    caption = f"{each.caption}: score {score_at(found[version], box):.2f}"
+                    pictures.append(_ground(images[name], box, occlusion.patches, caption))
+                why = [*sentences_of(occlusion, sun_px), *(_on_missing(missing) if explainer.changed else [_NO_FRAMES])]
                 one = sightings_of(Detections(box[None], np.ones(1)), explainer.dataset.info.camera.intrinsics())
                 position = sentences_on_position(seen, one) if len(one) and len(seen.sightings) else _NO_SIGHTING
                 answers.append(Answer(number, k, tuple(pictures), tuple(why), tuple(position)))
@@ -258,15 +272,15 @@ def _answers(
 _NO_SIGHTING = ["The filter sees no crater in this frame with the settings of a flight."]
 
 
-def _on_changes(changed: list[ChangedFrames], n_shown: int, crater: int | None) -> list[str]:
-    """Why changed frames are not shown; empty if all are."""
-    if not changed:
-        return [_NO_FRAMES]
-    if n_shown == len(changed):
+def _on_missing(reasons: Mapping[str, str]) -> list[str]:
+    """One line on the changed versions that are not shown, from the reason of each; empty if all are shown."""
+    if not reasons:
         return []
-    if crater is None:
-        return ["No labelled crater is here that could be removed."]
-    return ["The other changed frames do not change this crater, or do not include this frame."]
+    by_reason = {
+        reason: " and ".join(caption for caption, other in reasons.items() if other == reason)
+        for reason in dict.fromkeys(reasons.values())
+    }
+    return [f"Not shown: {'; '.join(f'{captions} ({reason})' for reason, captions in by_reason.items())}."]
 
 
 def _occluded(image: Image8, box: NDArray[np.float64], occlusion: Occlusion) -> AnswerPicture:
