@@ -37,7 +37,7 @@ def main(folder: Path) -> None:
     """Write the report of one descent into `folder`, and docs/pictures/report_answers.png."""
     frames = folder / "data/detect"
     settings = [part for setting in _SETTINGS for part in ("--set", f"dataset.{setting}")]
-    _run("perilune-render", "dataset", "--preset", "small", "--kind", "detect", "--out", frames, *settings)
+    _run("perilune-render", "dataset", "--preset", "small", "--kind", "detect", "--out", frames.parent, *settings)
     for name, options in _CHANGES.items():
         given = ("--manifest", frames, "--frames-per-trajectory", "8", *options)
         _run("perilune-render", "counterfactual", "--out", folder / name, *given)

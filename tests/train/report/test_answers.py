@@ -78,10 +78,10 @@ def test_a_patch_is_covered_by_the_mean_around_it():
 def test_occlusion_finds_the_pixels_that_a_score_depends_on():
     box = np.array([20.0, 20.0, 40.0, 40.0])
     image = np.full((64, 64), 100, np.uint8)
-    image[20:28, 28:36] = 20  # dark, above the middle: the patch in row 1, column 2
+    image[18:26, 26:34] = 20  # dark, above the middle: the patch in row 1, column 2
 
     def detect(images):
-        scores = 0.9 - 0.01 * np.abs(images[:, 20:28, 28:36].astype(float) - 20).mean(axis=(1, 2))
+        scores = 0.9 - 0.01 * np.abs(images[:, 18:26, 26:34].astype(float) - 20).mean(axis=(1, 2))
         # A second box with a higher score is elsewhere.
         boxes = np.array([box + 1, box + 30])
         return [Detections(boxes, np.array([score, 0.99])) for score in scores]
@@ -214,8 +214,8 @@ def test_the_panel_names_the_changed_frames_that_say_nothing_about_a_detection(a
     assert partly
     for one in partly:
         assert re.fullmatch(
-            r"Not shown: crater removed and 0\.5 of the crater's depth \((no labelled crater is here|this crater was not "
-            r"changed)\)\.",
+            r"Not shown: crater removed and 0\.5 of the crater's depth \((no labelled crater is here|this crater "
+            r"was not changed)\)\.",
             one.why[-1],
         )
     false = [one for one in partly if viewer.frames[one.frame].detections[one.detection].kind == "false"]

@@ -117,8 +117,8 @@ def open_changed(dataset: Dataset, inputs: AnswerInputs) -> list[ChangedFrames]:
                 raise UserError(option, "depth_share", f"{share:g} in {changed.store}", expected)
             caption = "crater removed" if share == 0 else f"{share:g} of the crater's depth"
             removed = read_removed(address)
-            pairs = zip(removed["scene_id"].astype(str), removed["crater_id"].astype(int), strict=True)
-            craters = frozenset(pairs)
+            rows_of = removed[["scene_id", "crater_id"]].itertuples(index=False)
+            craters = frozenset((str(scene), int(crater)) for scene, crater in rows_of)
         opened.append(ChangedFrames(caption, changed, craters, rows))
     return opened
 
@@ -215,7 +215,7 @@ class _Explainer:
             found += detect_at_scales(self.detector, images[start : start + self.detector.config.batch_size])
         return found
 
-    def seen(self, image: Image8, row: Mapping[str, object]) -> SeenFrame:
+    def seen(self, image: Image8, row: pd.Series) -> SeenFrame:
         """A frame (height, width) as the landing filter sees it, with the row of `frame_table`."""
         camera, scene = self.dataset.info.camera.intrinsics(), str(row["scene_id"])
         if scene not in self.catalogues:
