@@ -52,10 +52,7 @@ _LOWERS, _RAISES = (230, 159, 0), (86, 180, 233)
 _MAX_OPACITY = 190
 _MAX_SIDE_PX = 96
 """Largest side of an embedded square of ground, pixels."""
-_NO_FRAMES = (
-    "No changed frames were given; `perilune-render counterfactual` renders them, and the options --counterfactual, "
-    "--shallower and --turned show them."
-)
+_NO_FRAMES = "No changed frames were given: no --counterfactual, --shallower or --turned."
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,12 +167,12 @@ def with_answers(viewer: Viewer, frames: LabelledFrames, run: Path, dataset: Dat
 def _chosen(n_each: int, total: int, with_changed: bool) -> str:
     if not n_each:
         return "Answers on shading and position were not computed (--answers 0)."
-    parts = ["removed or shallower craters"] if with_changed else []
-    parts += ["the false positives with the highest score", "the largest correct detections"]
+    parts = ["changed craters"] if with_changed else []
+    parts += ["the false positive of a frame with the highest score", "the correct detection with the lowest score"]
     listed = f"{', '.join(parts[:-1])} and {parts[-1]}"
     return (
         f"Shading and position were computed for {n_each} of {total} detections, drawn with thick lines: in turn for "
-        f"{listed} of frames that are far apart."
+        f"{listed}, in frames that are far apart."
     )
 
 
@@ -285,12 +282,13 @@ def _on_missing(reasons: Mapping[str, str]) -> list[str]:
 
 def _occluded(image: Image8, box: NDArray[np.float64], occlusion: Occlusion) -> AnswerPicture:
     """The ground of the frame, with a map of the effect of each patch."""
-    ground = _ground(image, box, occlusion.patches, f"frame: score {occlusion.score:.2f}; orange patches decide")
-    largest = max(float(np.abs(occlusion.decrease).max()), MIN_DECREASE)
+    largest = float(np.abs(occlusion.decrease).max())
+    colours = "; orange: covering lowers it" if largest >= MIN_DECREASE else ""
+    ground = _ground(image, box, occlusion.patches, f"frame: score {occlusion.score:.2f}{colours}")
     pixels = np.zeros((N_PATCHES + 2, N_PATCHES + 2, 4), np.uint8)
     inner = pixels[1:-1, 1:-1]
     inner[..., :3] = np.where(occlusion.decrease[..., None] >= 0, _LOWERS, _RAISES)
-    inner[..., 3] = np.round(_MAX_OPACITY * np.abs(occlusion.decrease) / largest)
+    inner[..., 3] = np.round(_MAX_OPACITY * np.abs(occlusion.decrease) / max(largest, MIN_DECREASE))
     return replace(ground, overlay=picture_uri(Image.fromarray(pixels)))
 
 

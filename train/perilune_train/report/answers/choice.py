@@ -16,11 +16,12 @@ Place = tuple[int, int]
 def chosen_detections(
     frames: Sequence[FramePicture], craters: Sequence[Sequence[int | None]], changed: Collection[int], count: int
 ) -> list[Place]:
-    """At most `count` detections: in turn of a changed crater, the worst false positive, and the largest correct one.
+    """At most `count` detections: in turn a changed crater, a false positive, and a correct detection.
 
     `craters` has the crater_id of each detection's label by frame, None without a label; `changed` has the craters that
-    counterfactual frames change. Craters that were not chosen before come first. A frame has at most one false and one
-    correct detection among the chosen. Consecutive choices are from frames that are far apart.
+    counterfactual frames change. Craters that were not chosen before come first. Of each frame, the false positive with
+    the highest score and the correct detection with the lowest score are considered. Consecutive choices are from
+    frames that are far apart.
     """
     # Multiples of the golden ratio spread any number of first frames evenly over the descent.
     order = np.argsort(np.arange(len(frames)) * _GOLDEN % 1, kind="stable").tolist()
@@ -38,7 +39,7 @@ def chosen_detections(
         right = [k for k, mark in enumerate(detections) if mark.kind == "matched"]
         # Detections are sorted by score.
         false += [(frame, wrong[0])] if wrong else []
-        correct += [(frame, max(right, key=lambda k: detections[k].shape[2] * detections[k].shape[3]))] if right else []
+        correct += [(frame, right[-1])] if right else []
     of_changed.sort(key=lambda ranked: ranked[0])
     queues = ([place for _, place in of_changed], false, correct)
     in_turn = [place for group in zip_longest(*queues) for place in group if place is not None]

@@ -52,7 +52,7 @@
   const here = () => Number(slider.value);
   const answerTo = (frame, detection) =>
     answers.each.find((one) => one.frame === frame && one.detection === detection);
-  const nameOf = (mark) => `Score ${mark[5].toFixed(2)}, ${words[mark[0]]}, ${Math.sqrt(mark[3] * mark[4]).toFixed(0)} px`;
+  const nameOf = (mark) => `Score ${mark[5].toFixed(2)}, ${words[mark[0]]}, ${Math.sqrt(mark[3] * mark[4]).toFixed(0)} px wide`;
   const boxes = () => [...stage.querySelectorAll(".detections rect")];
 
   function button(mark, number) {
