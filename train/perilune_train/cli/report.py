@@ -11,6 +11,8 @@ from perilune_shared.storage.files import is_plain
 
 USUAL_MB = 15
 """Size limit of the page of `small`, MB (1e6 bytes); a larger page opens slowly."""
+USUAL_ANSWERS = 12
+"""Number of detections with answers in the report of a demo."""
 
 
 def report(
@@ -31,14 +33,14 @@ def report(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report. [default: runs/report/<name>]")] = None,
     answers: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=0,
             max=200,
             help="Number of detections in the viewer for which the page shows why they were found, and their effect on"
-            " the position. Each takes seconds.",
+            " the position. Each takes seconds. [default: 12; 0 for --kind paper and benchmark]",
         ),
-    ] = 12,
+    ] = None,
     counterfactual: Annotated[
         str | None,
         typer.Option(help="Dataset of the detection frames without some craters, to show scores without them."),
@@ -65,7 +67,8 @@ def report(
         raise UserError("--name", "", chosen, "a plain name, without folders")
     data = dataset or Path("data") / ("benchmark" if kind == "benchmark" else chosen)
     root = runs or (Path("runs") / chosen if kind == "paper" else Path("runs"))
-    inputs = AnswerInputs(answers, counterfactual, shallower, turned)
+    count = answers if answers is not None else USUAL_ANSWERS if kind == "demo" else 0
+    inputs = AnswerInputs(count, counterfactual, shallower, turned)
     page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen, inputs)
     megabytes = page.stat().st_size / 1e6
     if megabytes > USUAL_MB:
