@@ -67,9 +67,9 @@ class Occlusion:
 
 
 def score_at(detections: Detections, box: Array) -> float:
-    """Highest score of the detections whose IoU with a box is at least 0.5; 0 if there are none."""
+    """Highest score of the detections whose IoU with a box is at least 0.5, to 3 digits as in marks; 0 without one."""
     overlap = iou_matrix(detections.boxes.reshape(-1, 4), box[None])[:, 0]
-    return float(detections.scores[overlap >= _MIN_IOU].max(initial=0.0))
+    return round(float(detections.scores[overlap >= _MIN_IOU].max(initial=0.0)), 3)
 
 
 def covered(image: NDArray[np.uint8], patches: Patches, row: int, column: int) -> NDArray[np.uint8]:
