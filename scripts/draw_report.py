@@ -1,4 +1,4 @@
-"""Draw docs/pictures/report_answers.png: the report after a click on a detection.
+"""Draw docs/pictures/report_answers.jpg: the report after a click on a detection.
 
 python scripts/draw_report.py runs/draw-report
 
@@ -20,7 +20,7 @@ import subprocess
 
 from playwright.sync_api import sync_playwright
 
-PICTURE = Path(__file__).parent.parent / "docs/pictures/report_answers.png"
+PICTURE = Path(__file__).parent.parent / "docs/pictures/report_answers.jpg"
 _SETTINGS = (
     "render.engine=heightfield", "seed=48", "detect.n_scenes=1", "detect.trajectories_per_scene=1",
     "detect.n_frames=8", "detect.val_share=0", "detect.test_share=1", "terrain.spacing_px=1",
@@ -31,10 +31,11 @@ _CHANGES = {
     "shallower": ("--craters-per-scene", "12", "--depth-share", "0.5"),
     "turned": ("--craters-per-scene", "0", "--sun-azimuth-offset-deg", "40"),
 }
+_MOST_ANSWERS = 12
 
 
 def main(folder: Path) -> None:
-    """Write the report of one descent into `folder`, and docs/pictures/report_answers.png."""
+    """Write the report of one descent into `folder`, and docs/pictures/report_answers.jpg."""
     frames = folder / "data/detect"
     settings = [part for setting in _SETTINGS for part in ("--set", f"dataset.{setting}")]
     _run("perilune-render", "dataset", "--preset", "small", "--kind", "detect", "--out", frames.parent, *settings)
@@ -52,15 +53,18 @@ def main(folder: Path) -> None:
     photograph(folder / "report/report.html", PICTURE)
 
 
-def photograph(page: Path, picture: Path, width_px: int = 1400, scheme: str = "light") -> None:
-    """Write a picture of the viewer after a click on the first detection with all answers."""
+def photograph(page: Path, picture: Path) -> None:
+    """Write a JPEG of the viewer with the answers on the first detection that all changed frames show."""
     program = next(found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name)))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        opened = browser.new_page(viewport={"width": width_px, "height": 1000}, color_scheme=scheme)
+        opened = browser.new_page(viewport={"width": 1200, "height": 1000}, color_scheme="light")
         opened.goto(page.resolve().as_uri())
-        opened.click("#next-answer")
-        opened.locator("#viewer").screenshot(path=picture)
+        for _ in range(_MOST_ANSWERS):
+            opened.click("#next-answer")
+            if opened.locator("#answer-pictures figure").count() == 1 + len(_CHANGES):
+                break
+        opened.locator("#viewer").screenshot(path=picture, type="jpeg", quality=80)
         browser.close()
 
 
