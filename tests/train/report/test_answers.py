@@ -205,8 +205,17 @@ def test_a_square_of_ground_has_the_pixels_of_the_frame(answered):
     np.testing.assert_allclose(one.pictures[0].box[2:], np.array([width, height]) / side, atol=1e-3)
 
 
-def test_without_changed_frames_the_panel_says_so(answered):
-    report = gather("demo", "demo", answered.data, answered.runs, AnswerInputs(1))
+def detection_alone(data: Path, runs: Path, folder: Path) -> tuple[Path, Path]:
+    """Folders of the datasets and runs with detection only, whose report takes less time."""
+    (folder / "data").mkdir()
+    (folder / "data/detect").symlink_to(data / "detect")
+    shutil.copytree(runs / "detect", folder / "runs/detect")
+    return folder / "data", folder / "runs"
+
+
+def test_without_changed_frames_the_panel_says_so(answered, tmp_path):
+    data, runs = detection_alone(answered.data, answered.runs, tmp_path)
+    report = gather("demo", "demo", data, runs, AnswerInputs(1))
     (one,) = report.viewer.answers.each
     assert len(one.pictures) == 1 and one.why[-1].startswith("No changed frames were given")
 
@@ -230,26 +239,27 @@ def test_no_answers_are_computed_by_default(report):
     assert answers.each == () and "--answers 0" in answers.chosen and "no calibration" in answers.of_score
 
 
-def test_a_run_without_weights_is_one_line(report_data, report_runs):
-    answers = gather("demo", "demo", report_data, report_runs, AnswerInputs(3)).viewer.answers
+def test_a_run_without_weights_is_one_line(report_data, report_runs, tmp_path):
+    data, runs = detection_alone(report_data, report_runs, tmp_path)
+    answers = gather("demo", "demo", data, runs, AnswerInputs(3)).viewer.answers
     assert answers.each == () and answers.chosen == "No further answers: the run demo has no weights."
 
 
 def test_a_descent_without_detections_is_one_line(answered, tmp_path):
-    runs = Path(shutil.copytree(answered.runs, tmp_path / "runs"))
+    data, runs = detection_alone(answered.data, answered.runs, tmp_path)
     path = runs / "detect/demo-installed/detections.parquet"
     pd.read_parquet(path).iloc[:0].to_parquet(path)
-    answers = gather("demo", "demo", answered.data, runs, AnswerInputs(3)).viewer.answers
+    answers = gather("demo", "demo", data, runs, AnswerInputs(3)).viewer.answers
     assert answers.each == () and answers.chosen == "The detector finds no crater in these frames."
 
 
 def test_scores_of_a_table_older_than_the_calibration_become_probabilities(report_data, report_runs, tmp_path):
-    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    data, runs = detection_alone(report_data, report_runs, tmp_path)
     folder = runs / "detect/demo"
     metrics = json.loads((folder / "metrics.json").read_text())
     fit = {"log_score": 1.0, "log_complement": 1.0, "offset": 1.0, "raw_threshold": 0.5, "threshold": 0.73}
     write_metrics(folder, metrics | {f"calibration/{key}": value for key, value in fit.items()})
-    viewer = gather("demo", "demo", report_data, runs).viewer
+    viewer = gather("demo", "demo", data, runs).viewer
     shown = {mark.shape[4] for each in viewer.frames for mark in each.detections}
     # logit p = logit s + 1
     expected = {round(1 / (1 + np.exp(-(np.log(s / (1 - s)) + 1))), 3) for s in (0.8, 0.9)}
@@ -257,7 +267,7 @@ def test_scores_of_a_table_older_than_the_calibration_become_probabilities(repor
 
 
 def test_ellipses_of_a_run_are_in_the_marks(report_data, report_runs, tmp_path):
-    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    data, runs = detection_alone(report_data, report_runs, tmp_path)
     path = runs / "detect/demo/detections.parquet"
     rows = pd.read_parquet(path)
     # A circle's box and axes agree; the others are axis-aligned ellipses.
@@ -265,7 +275,7 @@ def test_ellipses_of_a_run_are_in_the_marks(report_data, report_runs, tmp_path):
     values = [half.max(axis=1), half.min(axis=1), np.where(half[:, 0] >= half[:, 1], 0.0, 90.0)]
     values += [np.full(len(rows), sigma) for sigma in (0.1, 0.2, 0.3, 0.4)]
     rows.assign(**dict(zip(ELLIPSE_COLUMNS, values, strict=True))).to_parquet(path)
-    viewer = gather("demo", "demo", report_data, runs).viewer
+    viewer = gather("demo", "demo", data, runs).viewer
     marks = [mark for each in viewer.frames for mark in each.detections]
     assert marks and all(mark.ellipse[3:] == (0.1, 0.2, 0.3, 0.4) for mark in marks)
     for mark in marks:
@@ -274,8 +284,10 @@ def test_ellipses_of_a_run_are_in_the_marks(report_data, report_runs, tmp_path):
 
 
 def test_datasets_that_do_not_fit_their_option(answered, tmp_path):
+    data, runs = detection_alone(answered.data, answered.runs, tmp_path)
+
     def given(**options):
-        gather("demo", "demo", answered.data, answered.runs, AnswerInputs(1, **options))
+        gather("demo", "demo", data, runs, AnswerInputs(1, **options))
 
     with pytest.raises(UserError, match=r"--shallower: depth_share: got 0 .*expected another option"):
         given(shallower=answered.inputs.counterfactual)
@@ -290,7 +302,8 @@ def test_datasets_that_do_not_fit_their_option(answered, tmp_path):
 
 
 def test_the_command_takes_the_datasets(answered, tmp_path):
-    given = ["--dataset", answered.data, "--runs", answered.runs, "--name", "demo", "--out", tmp_path / "out"]
+    data, runs = detection_alone(answered.data, answered.runs, tmp_path)
+    given = ["--dataset", data, "--runs", runs, "--name", "demo", "--out", tmp_path / "out"]
     done = report_command(*given, "--answers", 1, "--turned", answered.inputs.turned)
     assert done.returncode == 0, done.stderr
     assert "Sun turned by 40" in (tmp_path / "out/report.html").read_text()

@@ -110,13 +110,14 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path, inputs: AnswerInput
             if frames is None:
                 frames, shown = labelled_frames(split, detections, source, are_probabilities), data
         sections.append(dataset_section(data, f"dataset-{len(sections)}", split))
+    # Compute the answers before the figures, so that wrong inputs are found early.
+    viewer = _viewer(frames, opened)
+    if viewer is not None and frames is not None and shown is not None and opened.detect:
+        viewer = with_answers(viewer, frames, _trained(opened.detect[-1]), shown, inputs)
     # Show results first, then descriptions of the datasets.
     sections = [*_run_sections(folders, opened, frames, runs), *sections]
     if not sections:
         raise UserError(dataset, "report", "no dataset and no finished run", f"the datasets and runs of a {kind}")
-    viewer = _viewer(frames, opened)
-    if viewer is not None and frames is not None and shown is not None and opened.detect:
-        viewer = with_answers(viewer, frames, _trained(opened.detect[-1]), shown, inputs)
     return Report(
         f"{_TITLES[kind]}: {name}",
         tuple(_headlines(opened, folders)),
