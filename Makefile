@@ -175,7 +175,9 @@ explain-causal: detect-frames ## remove single craters from the test scenes, and
 
 # The experiment and the benchmark write to separate folders.
 REPORT ?= demo
-REPORTED = $(if $(filter demo,$(REPORT)),--name $(NAME) --dataset "$(DATA)" --runs "$(RUNS)" --out "$(RUNS)/report/$(NAME)")
+# Changed frames of the test split, if they exist: make explain-causal renders the first and the last.
+CHANGED = $(foreach one,counterfactual:causal shallower:shallower turned:turned,$(if $(wildcard $(DATA)/$(lastword $(subst :, ,$(one)))/dataset.json),--$(firstword $(subst :, ,$(one))) "$(DATA)/$(lastword $(subst :, ,$(one)))"))
+REPORTED = $(if $(filter demo,$(REPORT)),--name $(NAME) --dataset "$(DATA)" --runs "$(RUNS)" --out "$(RUNS)/report/$(NAME)" $(CHANGED))
 report: setup ## write one HTML page on datasets, runs and frames (REPORT=demo|paper|benchmark); writes runs/report/
 	@$(BIN)/perilune-train report --kind $(call quoted,$(REPORT)) $(REPORTED)
 

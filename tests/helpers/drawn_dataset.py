@@ -40,13 +40,20 @@ _PARABOLA = {"start_altitude_m": 1400.0, "end_altitude_m": 400.0, "downrange_m":
 class _Ground:
     """Craters on a plane and its brightness texture; every fourth crater is eroded."""
 
-    def __init__(self, rng: np.random.Generator, count: int, removed: Collection[int] = ()):
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        count: int,
+        removed: Collection[int] = (),
+        depth_share: float = 0.0,
+        sun_offset_deg: float = 0.0,
+    ):
         self.diameter_m = np.sort(np.clip(25.0 * (1 - rng.random(count)) ** -0.6, 25.0, 400.0))[::-1]
         half = _GROUND_TEXELS * _TEXEL_M / 2
         self.xy_m = rng.uniform(-half, half, (count, 2))
         worn = np.arange(count) % 4 == 3
         self.depth_m = self.diameter_m * np.where(worn, 0.01, 0.15)
-        self.depth_m[list(removed)] = 0
+        self.depth_m[list(removed)] *= depth_share
         axis = (np.arange(_GROUND_TEXELS) + 0.5) * _TEXEL_M - half
         height = cv2.GaussianBlur(rng.standard_normal((_GROUND_TEXELS, _GROUND_TEXELS)).astype(np.float32), (0, 0), 2)
         height *= 0.8
@@ -56,7 +63,7 @@ class _Ground:
             r = np.hypot(axis[columns][None] - x, axis[rows][:, None] - y) / (diameter / 2)
             bowl = np.where(r < 1, depth * (r**2 - 0.8), 0.2 * depth * np.maximum(r, 1) ** -4.0)
             height[np.ix_(rows, columns)] += bowl
-        self.sun_azimuth_deg = float(rng.uniform(0, 360))
+        self.sun_azimuth_deg = (float(rng.uniform(0, 360)) + sun_offset_deg) % 360
         self.sun = frames.sun_direction(self.sun_azimuth_deg, _SUN_ELEVATION_DEG)
         slope_y, slope_x = np.gradient(height, _TEXEL_M)
         light = (self.sun[2] - slope_x * self.sun[0] - slope_y * self.sun[1]) / np.sqrt(1 + slope_x**2 + slope_y**2)
@@ -90,17 +97,23 @@ def build_dataset(
     jitter_m: float = 4.0,
     jitter_deg: float = 0.3,
     removed: Mapping[str, Collection[int]] | None = None,
+    depth_share: float = 0.0,
+    sun_offset_deg: float = 0.0,
 ) -> Path:
     """Write a dataset with a number of trajectories for each split in `splits`.
 
-    Each trajectory has its own terrain, unless `scenes` gives the number of terrains. `removed` are craters without
-    depth by scene; their labels and all else stay.
+    Each trajectory has its own terrain, unless `scenes` gives the number of terrains. `removed` are craters by scene
+    that keep a share of their depth; their labels and all else stay. `sun_offset_deg` turns the Sun.
     """
     splits = splits or {"train": 3, "val": 1, "test": 1}
     camera = Camera.from_field_of_view(side_px, side_px, 40.0)
     names = [split for split, count in splits.items() for _ in range(count)]
     recipe = Recipe(
-        preset="tiny", kind=kind, seed=seed, config={}, versions={"perilune_shared": perilune_shared.__version__}
+        preset="tiny",
+        kind=kind,
+        seed=seed,
+        config={"counterfactual": {"depth_share": depth_share}} if depth_share else {},
+        versions={"perilune_shared": perilune_shared.__version__},
     )
     grounds: dict[str, _Ground] = {}
     rows: dict[str, list[dict]] = {name: [] for name in TABLES}
@@ -110,7 +123,11 @@ def build_dataset(
         rng = np.random.default_rng([seed, number])
         if scene not in grounds:
             grounds[scene] = _Ground(
-                np.random.default_rng([seed, 1000, int(scene[1:])]), craters, (removed or {}).get(scene, ())
+                np.random.default_rng([seed, 1000, int(scene[1:])]),
+                craters,
+                (removed or {}).get(scene, ()),
+                depth_share,
+                sun_offset_deg,
             )
             _add_scene(rows, scene, grounds[scene], recipe.key)
         nominal = NominalTrajectory.parabola(**_PARABOLA, azimuth_deg=float(rng.uniform(0, 360)))

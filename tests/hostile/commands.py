@@ -100,7 +100,7 @@ USES = (
     use("perilune-train explain", "--dataset drawn", *_TINY),
     use("perilune-train causal", "--dataset data/detect --counterfactual without --turned without", *_TINY),
     use("perilune-train paper", "--runs runs"),
-    use("perilune-train report", "--name tiny --dataset drawn --runs runs --out report"),
+    use("perilune-train report", "--name tiny --dataset drawn --runs runs --out report --answers 1"),
 )
 
 

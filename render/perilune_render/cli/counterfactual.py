@@ -34,6 +34,9 @@ def counterfactual(
     sun_azimuth_offset_deg: Annotated[
         float, typer.Option(help="Azimuth of the Sun, clockwise from the dataset's Sun, degrees.")
     ] = 0.0,
+    depth_share: Annotated[
+        float, typer.Option(help="Share of their depth that the chosen craters keep, below 1; 0 removes them.")
+    ] = 0.0,
     dem: Annotated[Path | None, typer.Option(help="Elevation model that the manifest's recipe names.")] = None,
     catalogue: Annotated[Path | None, typer.Option(help="Crater catalogue that the manifest's recipe names.")] = None,
     workers: Annotated[
@@ -43,13 +46,14 @@ def counterfactual(
         int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
     ] = None,
 ) -> None:
-    """Render frames of a dataset again without some craters or with another azimuth of the Sun.
+    """Render frames of a dataset again, without some craters, with shallower craters, or with another Sun azimuth.
 
-    Everything else is unchanged; frames and craters keep their ids. The removed craters are listed in
+    Everything else is unchanged; frames and craters keep their ids. The removed or shallower craters are listed in
     OUT.removed.parquet. Run the same command again to resume.
     """
     # Check the options first, since reading the manifest takes seconds.
-    resolve_over(CounterfactualConfig, "counterfactual", "--sun-azimuth-offset-deg", _sun(sun_azimuth_offset_deg))
+    for option, value in (("sun_azimuth_offset_deg", sun_azimuth_offset_deg), ("depth_share", depth_share)):
+        resolve_over(CounterfactualConfig, "counterfactual", f"--{option.replace('_', '-')}", {option: value})
     options = JobOptions.of("local", None, workers, threads, None, finish=False, dry_run=False)
     source, store, table = ps.open_dataset(manifest), open_store(out), _table_beside(out)
     from perilune_render.dataset.begin import new_info
@@ -65,6 +69,7 @@ def counterfactual(
     plan = part_of(plan, split, frames_per_trajectory, sun_azimuth_offset_deg)
     craters = craters_to_remove(source, plan, craters_per_scene, seed)
     removed: dict[int, list[int]] = {}
+    what = "removed" if depth_share == 0 else f"reduced to {depth_share:g} of their depth"
     for scene in plan.scenes:
         ids = craters.loc[craters["seed"] == scene.seed, "crater_id"].tolist()
         n_found = len(ids)
@@ -72,10 +77,10 @@ def counterfactual(
             removed[scene.seed] = ids
         if n_found < craters_per_scene:
             line = (
-                f"{scene.scene_id}: {n_found} of {craters_per_scene} craters are removed; no more are far enough apart"
+                f"{scene.scene_id}: {n_found} of {craters_per_scene} craters are {what}; no more are far enough apart"
             )
             say(line, style="yellow")
-    values = {"removed": removed, **_sun(sun_azimuth_offset_deg)}
+    values = {"removed": removed, "sun_azimuth_offset_deg": sun_azimuth_offset_deg, "depth_share": depth_share}
     settings = resolve_over(CounterfactualConfig, "counterfactual", manifest, values)
     config = config.model_copy(update={"counterfactual": settings})
     recipe = recipe_of(config, info.kind, info.recipe().preset)
@@ -87,12 +92,8 @@ def counterfactual(
         _write(craters, *table)
         answer(
             f"{dataset.store}: {dataset.info.counts.frames} frames over {dataset.info.counts.scenes} scenes; "
-            f"{len(craters)} craters removed, listed in {table[0].at(table[1])}"
+            f"{len(craters)} craters {what}, listed in {table[0].at(table[1])}"
         )
-
-
-def _sun(offset_deg: float) -> dict[str, float]:
-    return {"sun_azimuth_offset_deg": offset_deg}
 
 
 def _table_beside(out: str) -> tuple[Store, str]:

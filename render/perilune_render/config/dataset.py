@@ -369,7 +369,7 @@ class DatasetConfig(Section):
     survey: SurveyConfig | None = None
     """Images from orbit in place of the descents, over the same ground; `perilune-render survey` sets it."""
     counterfactual: CounterfactualConfig | None = None
-    """Craters removed from the ground, or another Sun; `perilune-render counterfactual` sets it."""
+    """Craters removed or made shallower, or another Sun; `perilune-render counterfactual` sets it."""
 
     @field_validator("cameras")
     @classmethod
@@ -396,8 +396,13 @@ class DatasetConfig(Section):
         return self.detect if name == "detect" else self.nav
 
     def removed_from(self, scene_seed: int) -> tuple[int, ...]:
-        """Ids of the craters that are removed from the ground of the scene with this random seed."""
+        """Ids of the craters that are removed or made shallower in the scene with this random seed."""
         return self.counterfactual.removed.get(scene_seed, ()) if self.counterfactual is not None else ()
+
+    @property
+    def depth_share(self) -> float:
+        """Share of the depth that the craters of `removed_from` keep; 0 if they are removed."""
+        return self.counterfactual.depth_share if self.counterfactual is not None else 0.0
 
     def ground_flight(self, kind: str) -> FlightConfig:
         """Flight settings that determine the ground of `detect` or `nav`.

@@ -36,6 +36,8 @@ class CounterfactualConfig(Section):
     """
 
     removed: dict[SceneSeed, tuple[CraterId, ...]] = Field(default_factory=dict)
-    """Craters to remove from the ground: a list of `crater_id` for the random seed of each scene."""
+    """Craters to remove or to make shallower: a list of `crater_id` for the random seed of each scene."""
+    depth_share: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the depth that remains; 0 removes the craters, with their rays and boulders."""
     sun_azimuth_offset_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """Azimuth of the Sun, clockwise from the Sun's azimuth in the other dataset, degrees."""

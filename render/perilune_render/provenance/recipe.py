@@ -75,6 +75,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
         del plain["terrain"]["elevation"]["catalogue_columns"]
     if config.terrain.catalogue is None:
         del plain["terrain"]["elevation"]["rims"]
+    if config.counterfactual is not None and config.counterfactual.depth_share == 0:
+        del plain["counterfactual"]["depth_share"]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
     plain["render"]["device"] = device_of(config.render)

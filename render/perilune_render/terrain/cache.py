@@ -59,6 +59,8 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
     }
     if view.horizon:
         content["horizon"] = True
+    if config.removed_from(seed) and config.depth_share:
+        content["depth_share"] = config.depth_share
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

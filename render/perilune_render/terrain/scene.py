@@ -119,8 +119,9 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
 
     Craters that the configuration removes are omitted, with their rays and boulders. All random numbers are drawn as if
     these craters were present, and height 0 does not move. The heights change only within `craters.removal.REACH_RADII`
-    crater radii of the removed craters. Raises UserError if frames of `view` need too many vertices, or if a crater to
-    remove does not exist.
+    crater radii of the removed craters. Craters with a share of their depth keep their rays and boulders; their ground
+    is the mean, weighted by the share, of the ground with and without them. Raises UserError if frames of `view` need
+    too many vertices, or if a crater to remove does not exist.
     """
     terrain = config.terrain
     ground = uncratered_ground(config, view, seed)
@@ -138,15 +139,21 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         craters, sag, n_real = real.joined(craters), np.concatenate([np.zeros(len(real)), sag]), len(real)
     # 4. Removed craters: stamp all others again, and use this ground only near the removed ones.
     removed = indices_of(wanted, n_real, len(craters), seed)
-    raised_m = 0.0
+    raised_m, share = 0.0, config.depth_share
     if len(removed):
         again = _stamp(config, uncratered, grid, drawn, seed, visible[removed - n_real])
         gone = craters.chosen(removed)
         changed = near(*grid.vertices_xy(), gone)
         before_m = _at_site(soil.height_m, grid)
-        soil.height_m[changed], soil.albedo[:] = uncratered.height_m[changed], uncratered.albedo
+        soil.height_m[changed] = share * soil.height_m[changed] + (1 - share) * uncratered.height_m[changed]
         raised_m = float(_at_site(soil.height_m, grid) - before_m)
-        sag[n_real:] = np.where(near(craters.x_m, craters.y_m, gone)[n_real:], again.sag_m[visible], sag[n_real:])
+        new_sag_m = share * sag[n_real:] + (1 - share) * again.sag_m[visible]
+        sag[n_real:] = np.where(near(craters.x_m, craters.y_m, gone)[n_real:], new_sag_m, sag[n_real:])
+        if share:
+            # The craters stay, only shallower.
+            removed = removed[:0]
+        else:
+            soil.albedo[:] = uncratered.albedo
     # 5. Short waves on top of the craters; the site is at height 0; distant ground drops with the Moon's curvature.
     base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
     height = soil.height_m

@@ -161,6 +161,32 @@ def test_a_turned_sun_changes_the_light_alone(quick, tmp_path):
         assert row["png_sha256"] != frames(before)[frame_id]["png_sha256"]
 
 
+def test_shallower_craters_keep_their_labels_and_the_recipe_says_so(quick, made, tmp_path):
+    out = tmp_path / "half"
+    done = counterfactual(*command(quick, out), "--depth-share", 0.5)
+    assert done.returncode == 0, done.stderr
+    assert "3 craters reduced to 0.5 of their depth" in done.stdout.replace("\n", " ")
+    before, gone, after = open_dataset(quick / "detect"), open_dataset(made), open_dataset(out)
+    assert "depth_share" not in gone.info.recipe().config["counterfactual"]
+    assert after.info.recipe().config["counterfactual"]["depth_share"] == 0.5
+    pd.testing.assert_frame_equal(removed_craters(out), removed_craters(made))
+    keys = ["scene_id", "crater_id"]
+    changed = removed_craters(out)[keys]
+    depths = [
+        changed.merge(each.table("craters", [*keys, "depth_m"]).to_pandas(), on=keys)["depth_m"]
+        for each in (before, after)
+    ]
+    assert len(depths[1]) == 3 and (depths[1] / depths[0]).between(0.3, 0.7).all()
+    for frame_id, row in frames(after).items():
+        # The change of the frame is smaller than by removal.
+        whole, without, half = (
+            image(folder, frames(each)[frame_id])
+            for folder, each in ((quick / "detect", before), (made, gone), (out, after))
+        )
+        assert 0 < np.abs(half - whole).sum() < np.abs(without - whole).sum()
+        assert row["split"] == "test"
+
+
 def test_as_many_craters_as_fit_are_removed(quick, tmp_path):
     numbers = ["--craters-per-scene", 500, "--frames-per-trajectory", 1]
     done = counterfactual("--manifest", quick / "detect", "--out", tmp_path / "out", *numbers, "--workers", 0)
@@ -177,6 +203,7 @@ def test_as_many_craters_as_fit_are_removed(quick, tmp_path):
         (["--craters-per-scene", -1], ["--craters-per-scene"]),
         (["--frames-per-trajectory", 0], ["--frames-per-trajectory"]),
         (["--sun-azimuth-offset-deg", 200], ["sun_azimuth_offset_deg", "200", "180"]),
+        (["--depth-share", 1], ["--depth-share", "depth_share", "1"]),
         (["--out", "memory://bucket"], ["--out", "memory://bucket"]),
     ],
 )

@@ -167,3 +167,20 @@ def test_a_place_is_near_up_to_four_radii():
     removed = round_craters([[10.0, 0.0, 5.0, 0.2], [-100.0, 0.0, 2.0, 0.2]])
     x = np.array([10.0, 19.9, 20.1, -95.9, -96.1])
     assert near(x, np.zeros(5), removed).tolist() == [True, True, False, False, True]
+
+
+def test_shallower_craters_stay_with_half_of_the_changed_heights(whole, view):
+    ids = sorted(fresh(whole, 3).tolist())
+    gone = grow_scene(without(ids), view, SEED)
+    half = CounterfactualConfig(removed={SEED: tuple(ids)}, depth_share=0.5)
+    config = CONFIG.model_copy(update={"counterfactual": half})
+    changed = grow_scene(config, view, SEED)
+    np.testing.assert_allclose(changed.height_m, (whole.height_m + gone.height_m) / 2, atol=1e-4)
+    assert len(changed.removed) == 0 and np.array_equal(changed.crater_id, whole.crater_id)
+    # The rims are measured again. Other craters in or around the crater keep their depth.
+    ratio = changed.rims.depth_m[ids] / whole.rims.depth_m[ids]
+    assert (ratio > 0.35).all() and (ratio < 0.65).all()
+    assert np.array_equal(changed.albedo, whole.albedo)
+    assert boulder_rows(changed.boulders) == boulder_rows(whole.boulders)
+    keys = {scene_key(one, view, SEED) for one in (CONFIG, without(ids), config)}
+    assert len(keys) == 3

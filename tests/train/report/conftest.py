@@ -1,7 +1,8 @@
 """Datasets and runs with known content for the tests of the report."""
 
 import json
-from dataclasses import replace
+import shutil
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,17 @@ from perilune_shared.console.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.cli.report import report as report_of_command_line
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.split_evaluation import write_detections
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.inference.detector import open_run
+from perilune_train.detect.inference.scales import detect_at_scales
 from perilune_train.records.metrics_file import write_metrics
 from perilune_train.report.content import Report
 from perilune_train.report.page import SUMMARY, gather, html_of
+from perilune_train.report.sources import AnswerInputs
 from perilune_train.report.summary import summary_of
+from perilune_train.shipped.models import shipped_run
 
 HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.hacked=1>\"'\\]]>\u2028$x$ &amp;"
 """A name that runs code wherever it is not escaped, and that matplotlib reads as mathematics."""
@@ -139,3 +147,58 @@ def hostile_page(report_data, tmp_path_factory) -> Path:
     (root / "report.html").write_text(html_of(report), encoding="utf-8")
     (root / SUMMARY).write_text(summary_of(report), encoding="utf-8")
     return root / "report.html"
+
+
+CHANGED = range(0, 40, 2)
+"""Craters that the counterfactual datasets change: large ones of scene s004."""
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A report with answers of the installed detector."""
+
+    data: Path
+    """Folder of the datasets."""
+    runs: Path
+    """Folder of the runs; detect/demo-installed has the detections of the installed detector."""
+    inputs: AnswerInputs
+    """Datasets of changed frames."""
+    report: Report
+    """The content of the report."""
+    page: Path
+    """The page."""
+
+
+@pytest.fixture(scope="session")
+def answered(report_data, report_runs, tmp_path_factory) -> Answered:
+    """A report with answers on six detections. Read only."""
+    root = tmp_path_factory.mktemp("answered")
+    runs = Path(shutil.copytree(report_runs, root / "runs"))
+    detected_by_the_installed_detector(runs / "detect/demo-installed", report_data / "detect")
+    removed = {"s004": CHANGED}
+    for name, options in (
+        ("without", {"removed": removed}),
+        ("half", {"removed": removed, "depth_share": 0.5}),
+        ("turned", {"sun_offset_deg": 40.0}),
+    ):
+        build_dataset(root / name, "detect", n_frames=4, **options)
+        table = pd.DataFrame({"scene_id": "s004", "crater_id": list(CHANGED), "depth_ratio": 0.15})
+        table.to_parquet(root / f"{name}.removed.parquet")
+    inputs = AnswerInputs(6, str(root / "without"), str(root / "half"), str(root / "turned"))
+    report = gather("demo", "demo", report_data, runs, inputs)
+    path = root / "report.html"
+    path.write_text(html_of(report), encoding="utf-8")
+    return Answered(report_data, runs, inputs, report, path)
+
+
+def detected_by_the_installed_detector(folder: Path, data: Path) -> None:
+    """Write what an evaluation of the installed detector writes and the report reads."""
+    trained = shipped_run("detect")
+    config = config_of_run(trained)
+    split = load_split(open_dataset(str(data)), "test", config.labels)
+    folder.mkdir()
+    write_detections(
+        folder / "detections.parquet", split, detect_at_scales(open_run(trained, config), split.frames.images)
+    )
+    figures = {f"test/{key}": 0.9 for key in ("ap50_paper", "precision", "recall", "f1")}
+    write_metrics(folder, {**figures, "test/threshold": chosen_threshold(trained)})

@@ -216,6 +216,116 @@ def test_the_policy_forbids_other_scripts_and_connections(browser, page):
     opened.page.context.close()
 
 
+@pytest.fixture
+def asked(browser, answered) -> Iterator[Opened]:
+    """The page with answers on detections."""
+    made = load(browser, answered.page)
+    yield made
+    assert made.errors == [] and made.requests == []
+    made.page.context.close()
+
+
+def test_a_click_on_a_detection_opens_its_answers(asked, answered):
+    page = asked.page
+    answer = max(answered.report.viewer.answers.each, key=lambda one: len(one.pictures))
+    marks = answered.report.viewer.frames[answer.frame].detections
+    assert not page.is_visible("#answer")
+    page.locator("#place").fill(str(answer.frame))
+    page.locator("#stage").scroll_into_view_if_needed()
+    area = page.locator("#stage .detections rect").nth(answer.detection).bounding_box()
+    page.mouse.click(area["x"] + area["width"] / 2, area["y"] + area["height"] / 2)
+    # Where boxes overlap, the answers are on the smallest one around the place.
+    number = int(re.match(r"Detection (\d+): ", page.inner_text("#answer-title"))[1]) - 1
+    mark, wanted = marks[number], marks[answer.detection]
+    assert mark.shape[2] * mark.shape[3] <= wanted.shape[2] * wanted.shape[3]
+    x, y = (wanted.shape[k] + wanted.shape[k + 2] / 2 for k in (0, 1))
+    assert mark.shape[0] <= x <= mark.shape[0] + mark.shape[2] and mark.shape[1] <= y <= mark.shape[1] + mark.shape[3]
+    page.locator("#stage .detections rect").nth(answer.detection).press("Enter")
+    assert f"Score {wanted.shape[4]:.2f}" in page.inner_text("#answer-title")
+    assert page.locator("#answer-pictures figcaption").all_inner_texts() == [one.caption for one in answer.pictures]
+    assert page.locator("#answer-why p").all_inner_texts() == list(answer.why)
+    assert page.locator("#answer-position p").all_inner_texts() == list(answer.position)
+    assert "probability" in page.inner_text("#answer-sure") and "no ellipses" in page.inner_text("#answer-sure")
+    assert page.evaluate("document.activeElement.id") == "answer"
+    assert page.locator("#stage .chosen").count() == 1
+    page.keyboard.press("Escape")
+    assert not page.is_visible("#answer") and page.locator("#stage .chosen").count() == 0
+    assert page.evaluate("document.activeElement.tagName") == "rect"
+
+
+def test_detections_without_answers_show_how_sure_they_are(asked, answered):
+    viewer = answered.report.viewer
+    known = {(one.frame, one.detection) for one in viewer.answers.each}
+    frame, number = next(
+        (f, k) for f, shown in enumerate(viewer.frames) for k in range(len(shown.detections)) if (f, k) not in known
+    )
+    page = asked.page
+    page.locator("#place").fill(str(frame))
+    page.locator("#stage .detections rect").nth(number).press("Enter")
+    assert "Not computed for this detection" in page.inner_text("#answer-why")
+    assert "Score" in page.inner_text("#answer-sure")
+    # Another frame closes the panel.
+    page.click("#previous" if frame else "#next")
+    assert not page.is_visible("#answer")
+
+
+def test_the_keyboard_reaches_every_detection_by_one_stop(asked):
+    page = asked.page
+    count = page.locator("#stage .detections rect").count()
+    assert count > 2
+    assert page.locator("#stage [tabindex='0']").count() == 1
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.tagName") == "rect":
+            break
+    focused = "document.activeElement.getAttribute('aria-label')"
+    assert page.evaluate(focused).startswith(f"Detection 1 of {count}: Score ")
+    before = shown(page)
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(focused).startswith("Detection 2 of") and shown(page) == before
+    page.keyboard.press("End")
+    assert page.evaluate(focused).startswith(f"Detection {count} of")
+    assert page.locator("#stage [tabindex='0']").count() == 1
+    page.keyboard.press("Enter")
+    assert page.inner_text("#answer-title").startswith(f"Detection {count}: ")
+    # Keys of the page still work from the panel.
+    page.keyboard.press("ArrowRight")
+    assert shown(page) != before
+
+
+def test_a_button_and_a_key_step_through_the_answers(asked, answered):
+    page = asked.page
+    each = sorted((one.frame, one.detection) for one in answered.report.viewer.answers.each)
+    for number, (frame, detection) in enumerate([*each, each[0]]):
+        if number % 2:
+            page.keyboard.press("a")
+        else:
+            page.click("#next-answer")
+        assert page.input_value("#place") == str(frame)
+        assert page.inner_text("#answer-title").startswith(f"Detection {detection + 1}: ")
+        assert page.locator("#stage .answered").count() == sum(one[0] == frame for one in each)
+
+
+def test_a_page_without_answers_has_no_button_for_them(opened):
+    assert opened.page.locator("#next-answer").count() == 0
+    opened.page.locator("#stage .detections rect").first.press("Enter")
+    assert "no calibration" in opened.page.inner_text("#answer-sure")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 400])
+def test_axe_finds_no_fault_in_the_answers(browser, answered, scheme, width):
+    opened = load(browser, answered.page, viewport={"width": width, "height": 900}, color_scheme=scheme)
+    opened.page.click("#next-answer")
+    assert opened.page.evaluate("document.documentElement.scrollWidth") == width
+    opened.page.evaluate((importlib.resources.files("axe_playwright_python") / "axe.min.js").read_text())
+    result = opened.page.evaluate("() => axe.run('#viewer')")
+    assert len(result["passes"]) > 10
+    assert [f"{one['id']}: {one['nodes'][0]['html'][:200]}" for one in result["violations"]] == []
+    assert opened.errors == [] and opened.requests == []
+    opened.page.context.close()
+
+
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1400), ("dark", 400)])
 def test_axe_finds_no_serious_fault(browser, page, scheme, width):
     opened = load(browser, page, viewport={"width": width, "height": 900}, color_scheme=scheme)

@@ -11,6 +11,8 @@ from perilune_shared.storage.files import is_plain
 
 USUAL_MB = 15
 """Size limit of the page of `small`, MB (1e6 bytes); a larger page opens slowly."""
+USUAL_ANSWERS = 12
+"""Number of detections with answers in the report of a demo."""
 
 
 def report(
@@ -30,6 +32,26 @@ def report(
         Path | None, typer.Option(help="Folder that holds all runs. [default: runs; for paper, runs/<name>]")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the report. [default: runs/report/<name>]")] = None,
+    answers: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=200,
+            help="Number of detections in the viewer for which the page shows why they were found, and their effect on"
+            " the position. Each takes seconds. [default: 12; 0 for --kind paper and benchmark]",
+        ),
+    ] = None,
+    counterfactual: Annotated[
+        str | None,
+        typer.Option(help="Dataset of the detection frames without some craters, to show scores without them."),
+    ] = None,
+    shallower: Annotated[
+        str | None,
+        typer.Option(help="Dataset of the detection frames with shallower craters (`--depth-share 0.5`)."),
+    ] = None,
+    turned: Annotated[
+        str | None, typer.Option(help="Dataset of the detection frames under another Sun, with all craters.")
+    ] = None,
 ) -> None:
     """Write the report of a demo, a paper run or a benchmark as one HTML file, with a summary in Markdown.
 
@@ -38,13 +60,16 @@ def report(
     """
     # matplotlib and pandas take seconds to load.
     from perilune_train.report.page import SUMMARY, write_report
+    from perilune_train.report.sources import AnswerInputs
 
     chosen = name or {"demo": "small", "paper": "paper", "benchmark": "benchmark"}[kind]
     if not is_plain(chosen) or "/" in chosen:
         raise UserError("--name", "", chosen, "a plain name, without folders")
     data = dataset or Path("data") / ("benchmark" if kind == "benchmark" else chosen)
     root = runs or (Path("runs") / chosen if kind == "paper" else Path("runs"))
-    page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen)
+    count = answers if answers is not None else USUAL_ANSWERS if kind == "demo" else 0
+    inputs = AnswerInputs(count, counterfactual, shallower, turned)
+    page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen, inputs)
     megabytes = page.stat().st_size / 1e6
     if megabytes > USUAL_MB:
         text = f"warning: {page}: size: got {megabytes:.1f} MB, expected below {USUAL_MB} MB; it opens slowly"

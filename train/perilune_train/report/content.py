@@ -94,6 +94,9 @@ class Mark:
     """Labels: found, missed or ignored. Detections: matched, false or unjudged (not evaluated)."""
     shape: tuple[float, float, float, float, float]
     """Ellipse: centre x, y and semi-axes, pixels; direction, degrees. Box: x0, y0, width, height, pixels; score."""
+    ellipse: tuple[float, ...] = ()
+    """Ellipse of a detection: semi-axes, pixels; direction, degrees; standard deviations of the centre's x and y and of
+    both semi-axes, pixels. Empty if the detector predicts no ellipses."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,50 @@ class MaskStack:
 
 
 @dataclass(frozen=True)
+class AnswerPicture:
+    """Ground around a detection, in the frame or in a changed version of it."""
+
+    caption: str
+    """The version of the frame, and the score of the detection in it."""
+    image: str
+    """Data URI of a square of ground."""
+    box: tuple[float, float, float, float]
+    """Box of the detection: x0, y0, width, height, as shares of the side of the square."""
+    overlay: str = ""
+    """Data URI of a map over the square; empty without a map."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Answers on one detection of the viewer, computed in addition to its score and shape."""
+
+    frame: int
+    """Index of the frame in the viewer."""
+    detection: int
+    """Index of the detection in the frame."""
+    pictures: tuple[AnswerPicture, ...]
+    """The ground with the effect of each patch on the score, and the ground in changed frames."""
+    why: tuple[str, ...]
+    """Sentences on the ground that decides."""
+    position: tuple[str, ...]
+    """Sentences on the position that the landing filter computes from the frame."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Answers on the detections of the viewer."""
+
+    of_score: str
+    """Meaning of a score."""
+    chosen: str
+    """Which detections have an answer, or why none has one."""
+    each: tuple[Answer, ...] = ()
+    """The answers."""
+    sources: tuple[Provenance, ...] = ()
+    """The datasets of changed frames."""
+
+
+@dataclass(frozen=True)
 class Viewer:
     """One descent whose frames the reader can step through."""
 
@@ -161,7 +208,9 @@ class Viewer:
     masks: tuple[MaskStack, ...]
     """Masks of each gate; empty if there is no explain run."""
     sources: tuple[Provenance, ...]
-    """Sources of the frames, detections and masks."""
+    """Sources of the frames, detections, masks and answers."""
+    answers: Answers | None = None
+    """Answers on single detections; None if the frames have no detections."""
 
 
 @dataclass(frozen=True)

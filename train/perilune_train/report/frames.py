@@ -43,6 +43,8 @@ class LabelledFrames:
     """Whether the detections come from a run; False if there is no run."""
     provenance: Provenance
     """Provenance of the run, or of the dataset if there is no run."""
+    are_probabilities: bool = False
+    """Whether the scores are calibrated."""
 
     def f1(self) -> NDArray[np.float64]:
         """F1 of each frame (N,) at the run's threshold; NaN for frames without selected labels."""
@@ -67,11 +69,13 @@ class LabelledFrames:
         labels = [mark for mark, labelled in zip(labels, frame_labels.labelled, strict=True) if labelled]
         detections = []
         # The matches of a frame have the order of its detections.
-        for (x0, y0, x1, y1), score, outcome in zip(
-            self.found[index].boxes, self.found[index].scores, self.matches.outcome[rows], strict=True
+        found = self.found[index]
+        for k, ((x0, y0, x1, y1), score, outcome) in enumerate(
+            zip(found.boxes, found.scores, self.matches.outcome[rows], strict=True)
         ):
             shape = (_px(x0), _px(y0), _px(x1 - x0), _px(y1 - y0), round(float(score), 3))
-            detections.append(Mark(_KINDS.get(int(outcome), "unjudged"), shape))
+            ellipse = () if found.shapes is None else _ellipse(found.ellipses[k], found.shapes[k])
+            detections.append(Mark(_KINDS.get(int(outcome), "unjudged"), shape, ellipse))
         image = self.split.frames.images[index]
         height, width = image.shape
         return FramePicture(
@@ -93,6 +97,12 @@ class LabelledFrames:
         outcome = self.matches.outcome[self.matches.frame == index]
         return text + f", {np.sum(outcome == FOUND)} found, {np.sum(outcome == FALSE)} false"
 
+    def craters_of(self, index: int) -> list[int | None]:
+        """The crater_id of the label of each detection of a frame; None without a label or without ids."""
+        ids, labels = self.split.labels[index].crater_id, self.matches.label[self.matches.frame == index]
+        own = [int(label - self.first_label[index]) if label >= 0 else None for label in labels]
+        return [None if label is None or ids is None or ids[label] < 0 else int(ids[label]) for label in own]
+
     def indices_of(self, trajectory: str) -> list[int]:
         """Indices of the frames of one trajectory (scene_id/trajectory_id), in order."""
         return [index for index, name in enumerate(facts_of(self.split.frames).trajectory) if name == trajectory]
@@ -102,7 +112,12 @@ class LabelledFrames:
         return list(dict.fromkeys(facts_of(self.split.frames).trajectory))
 
 
-def labelled_frames(split: DetectSplit, detected: list[Detections] | None, provenance: Provenance) -> LabelledFrames:
+def labelled_frames(
+    split: DetectSplit,
+    detected: list[Detections] | None,
+    provenance: Provenance,
+    are_probabilities: bool = False,
+) -> LabelledFrames:
     """Match the labels of a split to a run's detections above the threshold; `detected` is None without a run."""
     nothing = Detections(np.empty((0, 4)), np.empty(0))
     detections = [nothing] * len(split) if detected is None else detected
@@ -112,13 +127,13 @@ def labelled_frames(split: DetectSplit, detected: list[Detections] | None, prove
     first = np.searchsorted(overlaps.label_frame, np.arange(len(split)))
     # Order each frame's detections by score, as in the matches.
     ordered = [_best_first(of_frame) for of_frame in detections]
-    return LabelledFrames(split, ordered, matches, first, detected is not None, provenance)
+    return LabelledFrames(split, ordered, matches, first, detected is not None, provenance, are_probabilities)
 
 
 def frame_uri(image: NDArray[np.uint8]) -> str:
     """A frame as a data URI: a lossless PNG up to 512 px; larger frames are reduced to 512 px, as WebP."""
     if max(image.shape) <= _MAX_SIDE_PX:
-        return _png(Image.fromarray(image))
+        return picture_uri(Image.fromarray(image))
     picture = Image.fromarray(image)
     picture.thumbnail((_MAX_SIDE_PX, _MAX_SIDE_PX))
     return image_uri(picture)
@@ -198,7 +213,7 @@ def _stacks(content: dict[str, NDArray[Any]], names: Sequence[str]) -> list[Mask
                 continue
             picture = Image.fromarray(content[str(block)][index]).convert("P")
             picture.putpalette(colours.tobytes())
-            images.append(_png(picture))
+            images.append(picture_uri(picture))
         low, high = (float(content[key][number]) for key in ("low", "high"))
         stacks.append(MaskStack(str(block), low, high, tuple(images)))
     return stacks
@@ -209,7 +224,8 @@ def _best_first(detections: Detections) -> Detections:
     return detections.take(order)
 
 
-def _png(picture: Image.Image) -> str:
+def picture_uri(picture: Image.Image) -> str:
+    """A picture as a data URI, lossless."""
     stream = io.BytesIO()
     picture.save(stream, "PNG", optimize=True)
     return png_uri(stream.getvalue())
@@ -217,3 +233,9 @@ def _png(picture: Image.Image) -> str:
 
 def _px(value: float) -> float:
     return round(float(value), 2)
+
+
+def _ellipse(ellipse: NDArray[np.float64], shape: NDArray[np.float64]) -> tuple[float, ...]:
+    """The values of `Mark.ellipse` from rows of `Detections.ellipses` and `Detections.shapes`."""
+    semi_major, semi_minor, theta = ellipse[2:]
+    return (_px(semi_major), _px(semi_minor), _px(np.degrees(theta)), *(round(float(sigma), 3) for sigma in shape[1:]))

@@ -18,16 +18,21 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.finished_run import calibration_of, raw_threshold, threshold_of_table
 from perilune_train.records.markdown import write_markdown
 from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.report import detection, explanation, navigation
-from perilune_train.report.content import Provenance, Report, Section, Viewer
+from perilune_train.report.answers.answers import with_answers
+from perilune_train.report.content import Answers, Provenance, Report, Section, Viewer
 from perilune_train.report.dataset import dataset_section
 from perilune_train.report.frames import MASKS_FILE, LabelledFrames, labelled_frames, viewer_of
 from perilune_train.report.paper.detections import read_detections
 from perilune_train.report.sources import (
     INSTALLED,
+    NO_ANSWERS,
     SCORE_FILE,
+    AnswerInputs,
     Folders,
     Kind,
     Run,
@@ -67,45 +72,52 @@ class _Opened:
     """Names of the datasets and runs that do not exist or are not complete."""
 
 
-def write_report(kind: Kind, name: str, dataset: Path, runs: Path, out: Path) -> Path:
+def write_report(
+    kind: Kind, name: str, dataset: Path, runs: Path, out: Path, inputs: AnswerInputs = NO_ANSWERS
+) -> Path:
     """Write report.html and summary.md of a demo, a paper run or a benchmark into `out`; return the page's path.
 
     `dataset` is the folder of the datasets, `runs` the folder of all runs; `sources.folders_of` lists what is read from
-    them. Datasets and runs that do not exist are left out, and the page names them. Raises UserError and writes nothing
-    if no dataset and no run exists, or if a file is damaged.
+    them. `inputs` says for how many detections of the viewer the page has answers. Datasets and runs that do not exist
+    are left out, and the page names them. Raises UserError and writes nothing if no dataset and no run exists, or if a
+    file is damaged.
     """
-    report = gather(kind, name, dataset, runs)
+    report = gather(kind, name, dataset, runs, inputs)
     page, summary = html_of(report), summary_of(report)
     write_markdown(out / SUMMARY, summary)
     write_text(out / PAGE, page)
     return out / PAGE
 
 
-def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
+def gather(kind: Kind, name: str, dataset: Path, runs: Path, inputs: AnswerInputs = NO_ANSWERS) -> Report:
     """Read everything that a report shows. Raises UserError like `write_report`."""
     folders = folders_of(kind, name, dataset, runs)
     opened = _open(folders, runs)
     sections: list[Section] = []
     frames: LabelledFrames | None = None
+    shown: Dataset | None = None
     for folder, data in opened.datasets.items():
         split: DetectSplit | None = None
         if data.info.kind == "detect" and "test" in data.table("frames", ["split"])["split"].unique().to_pylist():
             detect = opened.detect[-1] if opened.detect else None
-            detections = None
+            detections, are_probabilities = None, False
             if detect is not None:
-                installed = detect.name.endswith(INSTALLED)
-                read = read_detections(detect.folder, str(folder), shipped_run("detect") if installed else None)
-                split, detections = read.split, read.found
+                read = read_detections(detect.folder, str(folder), _trained(detect))
+                split, (detections, are_probabilities) = read.split, _calibrated(read.found, detect)
             else:
                 split = load_split(data, "test", LabelSettings())
             source = provenance_of_dataset(data) if detect is None else detect.provenance
-            frames = frames or labelled_frames(split, detections, source)
+            if frames is None:
+                frames, shown = labelled_frames(split, detections, source, are_probabilities), data
         sections.append(dataset_section(data, f"dataset-{len(sections)}", split))
+    # Compute the answers before the figures, so that wrong inputs are found early.
+    viewer = _viewer(frames, opened)
+    if viewer is not None and frames is not None and shown is not None and opened.detect:
+        viewer = with_answers(viewer, frames, _trained(opened.detect[-1]), shown, inputs)
     # Show results first, then descriptions of the datasets.
     sections = [*_run_sections(folders, opened, frames, runs), *sections]
     if not sections:
         raise UserError(dataset, "report", "no dataset and no finished run", f"the datasets and runs of a {kind}")
-    viewer = _viewer(frames, opened)
     return Report(
         f"{_TITLES[kind]}: {name}",
         tuple(_headlines(opened, folders)),
@@ -114,6 +126,23 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
         _provenance(sections, viewer),
         opened.missing,
     )
+
+
+def _trained(run: Run) -> Path:
+    """The folder with the weights and the settings of a run of detection."""
+    return shipped_run("detect") if run.name.endswith(INSTALLED) else run.folder
+
+
+def _calibrated(found: list[Detections], run: Run) -> tuple[list[Detections], bool]:
+    """The detections with probabilities as scores, and whether they have them: only if the run has a calibration."""
+    trained = _trained(run)
+    calibration = calibration_of(trained)
+    if calibration is None:
+        return found, False
+    if trained == run.folder and threshold_of_table(run.folder) == raw_threshold(run.folder):
+        # The table is older than the calibration.
+        found = [replace(one, scores=calibration.probabilities(one.scores)) for one in found]
+    return found, True
 
 
 def _open(folders: Folders, root: Path) -> _Opened:
@@ -254,11 +283,17 @@ def viewer_data(viewer: Viewer) -> dict[str, object]:
             "width": frame.width_px,
             "height": frame.height_px,
             "labels": [[mark.kind, *mark.shape] for mark in frame.labels],
-            "detections": [[mark.kind, *mark.shape] for mark in frame.detections],
+            "detections": [[mark.kind, *mark.shape, *mark.ellipse] for mark in frame.detections],
         }
         for frame in viewer.frames
     ]
-    return {"frames": frames, "masks": [asdict(mask) for mask in viewer.masks]}
+    answers = None if viewer.answers is None else _answers_data(viewer.answers)
+    return {"frames": frames, "masks": [asdict(mask) for mask in viewer.masks], "answers": answers}
+
+
+def _answers_data(answers: Answers) -> dict[str, object]:
+    each = [{name: value for name, value in asdict(answer).items()} for answer in answers.each]
+    return {"ofScore": answers.of_score, "chosen": answers.chosen, "each": each}
 
 
 def json_block(content: object) -> Markup:

@@ -11,6 +11,7 @@ from perilune_shared.config.resolve import read_config_file
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Address
 from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.report.content import Provenance
 from perilune_train.report.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
@@ -58,6 +59,24 @@ class Folders:
     """Monte Carlo run of the filter on the test descents."""
     page: Path | None = None
     """Folder with paper.json and the pictures of the paper's experiment."""
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerInputs:
+    """For how many detections answers are computed, and the datasets of changed frames."""
+
+    n_detections: int = 0
+    """Largest number of detections with an answer."""
+    counterfactual: Address | None = None
+    """The frames without some craters."""
+    shallower: Address | None = None
+    """The frames with the depth of some craters reduced."""
+    turned: Address | None = None
+    """The frames under another Sun."""
+
+
+NO_ANSWERS = AnswerInputs()
+"""No answers on single detections."""
 
 
 def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:

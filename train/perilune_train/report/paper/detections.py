@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -14,7 +15,9 @@ from perilune_shared.dataset.manifest import open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.ellipses import correlations_of
 from perilune_train.detect.evaluate.matching import Detections, find_overlaps
+from perilune_train.detect.evaluate.split_evaluation import ELLIPSE_COLUMNS
 from perilune_train.detect.finished_run import config_of_run, threshold_of_table
 from perilune_train.records.pictures import save_figure
 from perilune_train.records.spread import Interval, Resamples, draw_resamples, spreads
@@ -45,7 +48,10 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
     if not path.is_file():
         raise UserError(path, "detections", "no such file", "the detections of a finished run")
     try:
-        table = pd.read_parquet(path, columns=["frame_id", *_BOX, "score"])
+        stored = set(pq.read_schema(path).names)
+        # Tables of older versions have no ellipses.
+        ellipses = list(ELLIPSE_COLUMNS) if stored.issuperset(ELLIPSE_COLUMNS) else []
+        table = pd.read_parquet(path, columns=["frame_id", *_BOX, "score", *ellipses])
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise UserError(path, "detections", error, f"columns frame_id, {', '.join(_BOX)}, score") from None
     for name in (*_BOX, "score"):
@@ -61,9 +67,18 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
     if unknown:
         raise UserError(path, "frame_id", min(unknown), f"a test frame of {dataset}")
     parts = [of_frame.get(name, table.iloc[:0]) for name in names]
-    return Detected(
-        split, [Detections(part[_BOX].to_numpy(np.float64), part["score"].to_numpy(np.float64)) for part in parts]
-    )
+    return Detected(split, [_detections(part, ellipses) for part in parts])
+
+
+def _detections(rows: pd.DataFrame, ellipses: list[str]) -> Detections:
+    """The detections of a frame. Without standard deviations, the detector predicts no ellipses."""
+    boxes, scores = rows[_BOX].to_numpy(np.float64), rows["score"].to_numpy(np.float64)
+    if not ellipses or not np.isfinite(rows[ellipses].to_numpy(np.float64)).all():
+        return Detections(boxes, scores)
+    semi_major, semi_minor, angle_deg, *sigmas_px = rows[ellipses].to_numpy(np.float64).T
+    centres = (boxes[:, :2] + boxes[:, 2:]) / 2
+    shape = np.column_stack([centres, semi_major, semi_minor, np.radians(angle_deg)])
+    return Detections(boxes, scores, np.column_stack([correlations_of(shape), *sigmas_px]))
 
 
 @dataclass(frozen=True)
