@@ -108,7 +108,7 @@ def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     assert metrics["pcc1_background/B_11"] == pytest.approx(mean, abs=1e-5)
     assert metrics["pcc1_craterness/B_11"] == pytest.approx(-mean, abs=1e-5)
     assert "weaker on craters" in metrics["pcc1_sign"] and metrics["labels/selection"] == "visible"
-    # All 23 gates, the 4 stages with several gates and all together are forced, in both tasks; a forced gate changes something.
+    # All 23 gates, the 4 stages with several gates and all together are forced, in both tasks.
     forced = tables["gates"]
     assert forced.groupby("task")["scope"].nunique().to_dict() == {"detect": 28, "navigate": 28}
     assert (forced.groupby("task")["scene_id"].nunique() >= 1).all()
