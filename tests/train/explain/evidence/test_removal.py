@@ -217,8 +217,8 @@ def effects_of(harms, scenes=8):
 
 HARMS = {
     "B_38": {"most": 0.3, "least": 0.0, "random": 0.2, "shifted": 0.1},
-    "edge/stage_3": {"most": 0.4, "least": 0.0, "random": 0.1, "shifted": 0.1},
-    PERFECT: {"most": 0.5, "least": 0.0, "random": 0.1, "shifted": 0.2},
+    "edge/stage_3": {"most": 0.4},
+    PERFECT: {"most": 0.5, "random": 0.1, "shifted": 0.2},
 }
 
 
@@ -241,3 +241,15 @@ def test_a_relative_harm_without_a_perfect_mask_without_harm_and_with_few_scenes
     assert np.isnan(found["control"].value) and found["edge/stage_3"].interval is None
     undefined = effects_of(HARMS).assign(before=np.nan)
     assert all(np.isnan(ratio.value) for ratio in relative_harm(undefined, "B_38", "mean", True, rng).values())
+
+
+def test_edges_have_no_controls_and_a_perfect_mask_has_no_least(rng):
+    images = np.stack([noise_image(rng, 64)] * 2)
+    maps = {name: rng.random(images.shape) for name in ("B_38", "edge/stage_3", PERFECT)}
+    effects = removal_effect(images, maps, dict.fromkeys(maps, 1), lambda changed: changed.std((1, 2)), rng)
+    removals = effects.groupby("map")["which"].unique().map(set)
+    assert removals["B_38"] == {"most", "least", "random", "shifted"}
+    assert removals["edge/stage_3"] == {"most"} and removals[PERFECT] == {"most", "random", "shifted"}
+    table = removal_summary(effects, higher_is_better=True).set_index("map")
+    assert table.loc["edge/stage_3", ["random", "ratio", "overlap"]].isna().all(axis=None)
+    assert np.isfinite(table.loc["edge/stage_3", "most"]).all() and np.isfinite(table.loc[PERFECT, "overlap"]).all()

@@ -108,8 +108,9 @@ def removal_effect(
     """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
 
     `maps` are (N, height, width); `sign` is 1, or -1 for a map that is weaker on craters. `measure` runs once on the
-    unchanged images, and once for each combination of map, which and how. If an image is two frames stacked in height,
-    replacements at the seam use pixels of both frames. Columns:
+    unchanged images, and once for each combination of map, which and how. Edge maps ("edge/...") have no controls and
+    no "least", and the perfect mask has no "least", because no claim needs them. If an image is two frames stacked in
+    height, replacements at the seam use pixels of both frames. Columns:
 
     - map
     - which: "most" or "least" attended pixels, or the control "random" or "shifted"
@@ -121,16 +122,13 @@ def removal_effect(
     before = np.asarray(measure(images))
     tables = []
     for name, image_maps in maps.items():
-        most, least = (
-            [chosen_pixels(image_map, share, which, sign[name], rng) for image_map in image_maps]
-            for which in ("most", "least")
-        )
-        choices = {
-            "most": most,
-            "least": least,
-            "random": [random_like(*pair, rng) for pair in zip(images, most, strict=True)],
-            "shifted": [shifted_like(image_map, rng) for image_map in most],
-        }
+        most = [chosen_pixels(image_map, share, "most", sign[name], rng) for image_map in image_maps]
+        choices = {"most": most}
+        if not name.startswith("edge/"):
+            choices["random"] = [random_like(*pair, rng) for pair in zip(images, most, strict=True)]
+            choices["shifted"] = [shifted_like(image_map, rng) for image_map in most]
+            if name != PERFECT:
+                choices["least"] = [chosen_pixels(one, share, "least", sign[name], rng) for one in image_maps]
         for which, chosen in choices.items():
             overlap = [
                 (image_map & first).sum() / image_map.sum() for image_map, first in zip(chosen, most, strict=True)
@@ -150,7 +148,7 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     lower values are better. Columns:
 
     - map, how
-    - most, least, random, shifted: harms; NaN if no frame has a value
+    - most, least, random, shifted: harms; NaN if no frame has a value, or if this removal was not measured
     - control: name of the control with the larger harm
     - ratio: harm of `most` divided by the harm of this control; NaN unless the control's harm is above 0
     - overlap: mean share of this control's pixels that are among the most attended pixels. If only the most attended
@@ -168,7 +166,8 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     table["control"] = controls.fillna(-np.inf).idxmax(axis=1)
     table["ratio"] = (table["most"] / controls.max(axis=1)).where(controls.max(axis=1) > 0)
     overlaps = effects.groupby(["map", "how", "which"])["overlap"].mean()
-    table["overlap"] = [overlaps[(*pair, control)] for pair, control in zip(pairs, table["control"], strict=True)]
+    chosen = zip(pairs, table["control"], strict=True)
+    table["overlap"] = [float(overlaps.get((*pair, control), np.nan)) for pair, control in chosen]
     return table
 
 
