@@ -344,7 +344,7 @@ def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, hig
         f"{task}: {_REMOVES} that {evidence.strongest} attends to hurts more than controls and edges ({unit})",
         figure,
         f"{', '.join(intervals)} ({scenes} scenes)" if intervals else f"none: {scenes} scenes",
-        ", ".join(controls),
+        "-" if math.isnan(row["most"]) else ", ".join(controls),
         "does not beat: " + ", ".join(lost) if verdict == "does not hold" else verdict,
         picture,
     )
