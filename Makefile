@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results traces trace-inputs release clean
+.PHONY: help setup setup-dev bench bench-nac demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect compare-detectors train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-learned-alignment bench-monte-carlo bench-stream bench-suppress bench-robust bench-alarms bench-suspect bench-gates bench-engines bench-gpu bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results assurance traces trace-inputs release clean
 
 # `##@ Title` begins a group of targets; `##` describes a target.
 help: ## list these targets
@@ -399,9 +399,13 @@ trace-inputs: setup # render the descents of the reference traces from their see
 	  --set dataset.nav.trajectories_per_scene=2 $(TRACE_DATA) --out data/reference-relief
 	@$(BIN)/python -m scripts.reference_traces inputs
 
-results: setup ## write the headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
+results: setup ## write the headline figures into docs/results.md, README.md and the reviewer's table (RECORD="runs/bench/labels.json ...")
 	@$(if $(RECORD),$(BIN)/python scripts/results.py record $(RECORD))
 	@$(BIN)/python scripts/results.py write
+	@$(BIN)/python -m scripts.assurance
+
+assurance: setup ## write the table for a mission's reviewer, docs/reference/assurance.md, from the records
+	@$(BIN)/python -m scripts.assurance
 
 release: setup-dev ## check, build and tag a version from a clean tree (VERSION=0.1.0); uploads only with UPLOAD=1
 	@$(BIN)/python scripts/release.py release $(call quoted,$(or $(VERSION),$(error VERSION: got nothing, expected a version: make release VERSION=0.1.0))) \

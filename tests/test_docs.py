@@ -183,6 +183,47 @@ def leaves(nav: Any) -> Iterator[str]:
             yield from leaves(each)
 
 
+NOT_KEPT = re.compile(
+    r"\bprovisional\b|\bscripts?( and trial code)? (that|which) (is|are|was|were) not kept|\bearlier scripts?, which"
+    r"|, not kept\b|\bby (a|an own|some) script\b|\bplugin that is not kept|\bare not kept;"
+)
+"""Wording of a figure that no command makes."""
+
+
+def attributed_to_no_command(text: str) -> list[str]:
+    """Phrases of a page that attribute a figure to a script that is not kept."""
+    return [found.group() for found in NOT_KEPT.finditer(re.sub(r"\s+", " ", text))]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "By a script that is\nnot kept, the median is 3.",
+        "**These figures are provisional** until a kept command",
+        "scripts that are not kept called the functions",
+        "(a script that calls the same functions, not kept)",
+    ],
+)
+def test_a_figure_without_a_command_is_recognised(text):
+    assert attributed_to_no_command(text)
+    assert not attributed_to_no_command("The script `scripts/results.py` is kept. Frames are not kept in memory.")
+
+
+@pytest.mark.parametrize("folder", ["explanation", "how-to", "reference", "tutorials"])
+def test_no_figure_of_a_current_page_rests_on_a_script_that_is_not_kept(folder):
+    pages = [page for page in PAGES if page.parent.name == folder or folder in page.parent.parts]
+    assert pages
+    wrong = {page.name: attributed_to_no_command(page.read_text(encoding="utf-8")) for page in pages}
+    assert {name: found for name, found in wrong.items() if found} == {}
+
+
+def test_a_notebook_page_says_once_which_figures_have_no_command():
+    for page in sorted((DOCS / "notebook").glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        stated = text.count("*Figures without a kept command*: ")
+        assert stated == bool(attributed_to_no_command(text)), page.name
+
+
 def test_every_picture_is_shown():
     """A page without it leaves a file that every clone carries."""
     pages = [page.read_text(encoding="utf-8") for page in [*PAGES, DOCS.parent / "mkdocs.yml"]]

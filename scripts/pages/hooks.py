@@ -80,4 +80,5 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         # The home page and the results have no neighbours to list.
         page.meta.setdefault("hide", ["navigation"])
     # Notebooks become pages; the records of results are outside the folder of the documentation.
-    return markdown.replace(".ipynb)", ".md)").replace("](../results/", "](results/")
+    markdown = markdown.replace(".ipynb)", ".md)").replace("](../results/", "](results/")
+    return markdown.replace("](../../results/", "](../results/")

@@ -108,9 +108,9 @@ def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     assert metrics["pcc1_background/B_11"] == pytest.approx(mean, abs=1e-5)
     assert metrics["pcc1_craterness/B_11"] == pytest.approx(-mean, abs=1e-5)
     assert "weaker on craters" in metrics["pcc1_sign"] and metrics["labels/selection"] == "visible"
-    # All 23 gates, 5 stages and all together are forced, in both tasks; a forced gate changes something.
+    # All 23 gates, the 4 stages with several gates and all together are forced, in both tasks.
     forced = tables["gates"]
-    assert forced.groupby("task")["scope"].nunique().to_dict() == {"detect": 29, "navigate": 29}
+    assert forced.groupby("task")["scope"].nunique().to_dict() == {"detect": 28, "navigate": 28}
     assert (forced.groupby("task")["scene_id"].nunique() >= 1).all()
     nav = forced[(forced["task"] == "navigate") & (forced["scope"] == "all gates")]
     assert np.isfinite(nav["after"]).all() and (nav["after"] > 0).all()
@@ -120,17 +120,19 @@ def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     assert tables["summary"].query("task == 'detect'")["low"].isna().all()
     assert not tables["tested"]["beats_all"].any()
     claims = json.loads((run.root / "claims.json").read_text())
-    assert len(claims) == 16 and all(set(one) == set(claims[0]) for one in claims)
+    assert len(claims) == 18 and all(set(one) == set(claims[0]) for one in claims)
     assert {(run.root / one["picture"]).is_file() for one in claims} == {True}
     verdicts = [one["verdict"] for one in claims if "is constant" not in one["claim"]]
     assert all(verdict.startswith("undecided") for verdict in verdicts)
     assert "follows craters" in metrics["headline"] and "PCC4" in metrics["headline"]
-    assert metrics["headline"].count("removing what it attends to hurts 3 times as much as controls: undecided") == 2
+    assert metrics["headline"].count("removing what it attends to hurts more than controls and edges: undecided") == 2
     # Every figure of the page is on record: nulls, forced gates, removed pixels, stability, random weights.
     for key in (
         "pcc1_craterness_null/B_11/edge",
         "auc_null/B_11/untrained",
         "detect/forced/all gates",
+        "detect/removal/craters/inpaint/most",
+        "detect/removal/craters/mean/random",
         "detect/stability/noise 2 DN/B_11",
         "detect/randomised/bottom_up/stage 1/B_11",
         "auc/occlusion",
@@ -199,7 +201,7 @@ def test_one_network_alone(checkpoints, dataset_detect, tmp_path):
     assert set(json.loads((run.root / "captions.json").read_text())) == {name for name in CAPTIONS if "detect" in name}
     assert set(pd.read_parquet(run.root / "gates.parquet")["task"]) == {"detect"}
     claims, metrics = (json.loads((run.root / name).read_text()) for name in ("claims.json", "metrics.json"))
-    assert len(claims) == 10 and not any("Navigator" in one["claim"] for one in claims)
+    assert len(claims) == 11 and not any("Navigator" in one["claim"] for one in claims)
     assert metrics["headline"].startswith("Detector: ") and "Navigator" not in metrics["headline"]
     assert not any("navigat" in key for key in metrics)
     assert "navigat" not in (run.root / "inputs.json").read_text()

@@ -20,7 +20,7 @@ from perilune_train.explain.evidence.nulls import detector_nulls, measure_statis
 from perilune_train.explain.evidence.performance import DetectionPerformance
 from perilune_train.explain.evidence.permutation import detector_permutations
 from perilune_train.explain.evidence.randomisation import randomised
-from perilune_train.explain.evidence.removal import removal_effect
+from perilune_train.explain.evidence.removal import PERFECT, removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary, validation_signs
 from perilune_train.explain.evidence.stability import stability
 from perilune_train.explain.evidence.tables import Evidence
@@ -82,8 +82,9 @@ def explain_detector(
     measure = DetectionPerformance(detector, [frames.labels[i] for i in changed], frames.radius_px)
     gates = forced_gates(network.backbone, gate_means(known), images, measure, "force gates of the detector")
     to_remove = {strongest: masks[strongest][changed], f"edge/stage_{stage}": nulls[f"edge/stage_{stage}"][changed]}
-    say(f"detector: remove pixels by {strongest}, chosen on validation frames, and by edges")
-    removal = removal_effect(images, to_remove, sign_of_map, measure, rng, settings.removed_share)
+    to_remove[PERFECT] = frames.perfect_masks(changed)
+    say(f"detector: remove pixels by {strongest}, chosen on validation frames, by edges and by the labels")
+    removal = removal_effect(images, to_remove, sign_of_map | {PERFECT: 1}, measure, rng, settings.removed_share)
 
     def masks_of(changed_images: NDArray[np.uint8]) -> Masks:
         return detector_masks(network, changed_images, where)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from perilune_shared.console.terminal import say_page
@@ -17,7 +16,7 @@ from perilune_train.detect.train.guide import GUIDED
 from perilune_train.explain import detection, navigation
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import PCC1_SIGN
-from perilune_train.explain.evidence.removal import removal_summary
+from perilune_train.explain.evidence.removal import PERFECT, removal_summary
 from perilune_train.explain.evidence.tables import TABLES, Evidence
 from perilune_train.explain.maps.masks import Masks, detector_masks, navigator_masks, save_masks
 from perilune_train.explain.networks import (
@@ -28,7 +27,7 @@ from perilune_train.explain.networks import (
     terrain_marks,
 )
 from perilune_train.explain.page import claims as page
-from perilune_train.explain.page.claims import Claim, beating_gates, forced_harm, removal_row
+from perilune_train.explain.page.claims import Claim, beating_gates, forced_harm, relative_removal, removal_row
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, Masked, draw_detector, draw_navigator
 from perilune_train.records.marks import mark_files
 from perilune_train.records.metrics_file import Metrics, write_metrics
@@ -37,6 +36,8 @@ from perilune_train.training.runs import NamedRun, RunFolder
 
 _COUNTED = {"detect": ("pcc1_craterness", "pcc1_partial"), "navigate": ("pcc4", "pcc4_minus_pcc3")}
 """Measures of each task in which metrics.json counts the gates that beat every null."""
+_RELATIVE = {"control": "ratio", PERFECT: "of_perfect", "perfect control": "perfect_ratio"}
+"""Endings of metrics by the key of `relative_harm`; the other keys are edge maps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +177,9 @@ def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metr
     - <measure>/<map>: mean of a gate or an attribution method; with _low and _high, the ends of its interval
     - <measure>_null/<gate>/<null>: mean of a null
     - <measure>_p/<gate>: p over all nulls, corrected for the number of gates
-    - <task>/forced/<scope>: harm of forcing a gate, a stage or all gates to their means
+    - <task>/forced/<scope>: harm of forcing a gate, a stage or all gates to their means; with _low and _high
     - <task>/removal/<map>/<how>/<which>: harm of removed pixels
+    - <task>/removal_ratio, _of_edges, _of_perfect, _perfect_ratio: see `relative_harm`; with _low and _high
     - <task>/stability/<change>/<gate>, <task>/randomised/<direction>/<step>/<gate>: similarity of masks
     """
     numbers: dict[str, float] = {}
@@ -188,8 +190,13 @@ def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metr
         numbers[f"{row['measure']}_null/{row['map']}/{row['null']}"] = row["null_value"]
     for row in evidence.tested.to_dict("records"):
         numbers[f"{row['measure']}_p/{row['map']}"] = row["p_adjusted"]
-    for scope, harm in forced_harm(evidence, higher_is_better=higher_is_better).items():
-        numbers[f"{task}/forced/{scope}"] = harm
+    for row in forced_harm(evidence, higher_is_better=higher_is_better).to_dict("records"):
+        key = f"{task}/forced/{row['scope']}"
+        numbers |= {key: row["value"], f"{key}_low": row["low"], f"{key}_high": row["high"]}
+    for name, ratio in relative_removal(evidence, higher_is_better=higher_is_better).items():
+        key = f"{task}/removal_{_RELATIVE.get(name, 'of_edges')}"
+        low, high = ratio.interval or (math.nan, math.nan)
+        numbers |= {key: ratio.value, f"{key}_low": low, f"{key}_high": high}
     for row in removal_summary(evidence.removal, higher_is_better).to_dict("records"):
         for which in ("most", "least", "random", "shifted"):
             numbers[f"{task}/removal/{row['map']}/{row['how']}/{which}"] = row[which]
@@ -206,7 +213,7 @@ def figures_of(evidence: Evidence, task: str, *, higher_is_better: bool) -> Metr
     least = removal_row(evidence, higher_is_better=higher_is_better)
     metrics |= {f"{task}/removal_{name}": float(least[name]) for name in ("most", "least", "random", "shifted")}
     # The ratio is undefined if no control does harm; record 0.
-    metrics[f"{task}/removal_ratio"] = float(least["ratio"]) if np.isfinite(least["ratio"]) else 0.0
+    metrics.setdefault(f"{task}/removal_ratio", 0.0)
     metrics[f"{task}/strongest_gate"] = evidence.strongest
     for measure in _COUNTED[task]:
         metrics[f"{task}/{measure}_beating_to_stride_8"] = len(beating_gates(evidence, measure))

@@ -45,6 +45,24 @@ def ground_truth_mask(
     return mask
 
 
+def ellipse_mask(size_px: tuple[int, int], ellipses: Array) -> NDArray[np.float32]:
+    """1 at pixels (height, width) whose centre is in one of the ellipses, 0 elsewhere.
+
+    `ellipses` (M, 5) have centre x and y and semi-axes a and b in pixels, and the direction of a in radians.
+    """
+    mask = np.zeros(size_px, np.float32)
+    for x, y, a, b, theta_rad in ellipses:
+        reach = max(a, b) + 1
+        left, right = max(int(x - reach), 0), min(int(x + reach) + 1, size_px[1])
+        top, bottom = max(int(y - reach), 0), min(int(y + reach) + 1, size_px[0])
+        if left >= right or top >= bottom:
+            continue
+        u, v = np.meshgrid(np.arange(left, right) + 0.5 - x, np.arange(top, bottom) + 0.5 - y)
+        along, across = np.cos(theta_rad) * u + np.sin(theta_rad) * v, np.cos(theta_rad) * v - np.sin(theta_rad) * u
+        mask[top:bottom, left:right][np.hypot(along / a, across / b) <= 1] = 1
+    return mask
+
+
 @dataclass(frozen=True)
 class LabelledFrames:
     """N labelled frames."""
@@ -68,6 +86,12 @@ class LabelledFrames:
     def craters(self) -> NDArray[np.bool_]:
         """Pixels in craters (N, height, width)."""
         return self.truth == 0
+
+    def perfect_masks(self, rows: Sequence[int]) -> NDArray[np.float32]:
+        """Perfect masks (len(rows), height, width) of the frames `rows`: 1 in the ellipses of the selected craters."""
+        _, height, width = self.images.shape
+        labels = [self.labels[row] for row in rows]
+        return np.stack([ellipse_mask((height, width), one.ellipses[one.selected]) for one in labels])
 
 
 @dataclass(frozen=True)

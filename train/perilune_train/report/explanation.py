@@ -23,7 +23,8 @@ _CAPTIONS = {
     "pcc_detect.png": "Correlations of the detector's masks, gate by gate.",
     "pcc_navigate.png": "Correlations of the navigator's masks, gate by gate.",
 }
-_ORDER = ("masks_", "pcc_", "gates_", "removal_", "before_after_")
+_ORDER = ("gates_", "removal_", "before_after_", "masks_", "pcc_")
+"""Starts of the names of the first pictures: what the network uses, then what its masks look like."""
 
 
 def explanation_section(run: Run, key: str, title: str) -> Section:

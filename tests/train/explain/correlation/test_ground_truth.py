@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.explain.inputs import ground_truth_mask
+from perilune_train.explain.inputs import ellipse_mask, ground_truth_mask
 
 _RINGS = (1.1, 1.2, 1.3, 1.4)
 
@@ -21,3 +21,15 @@ def test_overlapping_craters_take_the_least_and_edges_are_safe():
     two = ground_truth_mask(60, 40, [[32, 20], [59, 39]], [10, 8], _RINGS)
     np.testing.assert_array_equal(both, np.minimum(one, two))
     assert np.all(ground_truth_mask(8, 8, np.zeros((0, 2)), [], _RINGS) == 1)
+
+
+def test_a_perfect_mask_has_the_pixels_in_ellipses():
+    mask = ellipse_mask((60, 80), np.array([[30.0, 25.0, 12.0, 4.0, np.pi / 6], [79.0, 59.0, 5.0, 5.0, 0.0]]))
+    rotation = np.array([[np.cos(np.pi / 6), np.sin(np.pi / 6)], [-np.sin(np.pi / 6), np.cos(np.pi / 6)]])
+    for row in range(60):
+        for column in range(80):
+            along, across = rotation @ [column + 0.5 - 30, row + 0.5 - 25]
+            inside = (along / 12) ** 2 + (across / 4) ** 2 <= 1
+            inside |= np.hypot(column + 0.5 - 79, row + 0.5 - 59) <= 5
+            assert mask[row, column] == inside
+    assert not ellipse_mask((8, 8), np.zeros((0, 5))).any()

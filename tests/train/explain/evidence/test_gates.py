@@ -1,10 +1,11 @@
 """Gates forced to their means."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
-from perilune_train.explain.evidence.gates import ALL, forced, forced_gates, gate_means, scopes
+from perilune_train.explain.evidence.gates import ALL, forced, forced_gates, forced_summary, gate_means, scopes
 from perilune_train.models.darknet import AttentionDarknet53
 
 
@@ -60,14 +61,35 @@ def test_forcing_a_constant_gate_to_its_value_changes_nothing_and_others_do(back
     assert table.groupby("scope").size().to_dict() == dict.fromkeys(scopes(list(means)), 3)
 
 
-def test_scopes_are_gates_stages_and_all():
+def test_scopes_are_gates_stages_with_several_gates_and_all():
     found = scopes(["B_11", "B_21", "B_22"])
     assert found == {
         "B_11": ("B_11",),
         "B_21": ("B_21",),
         "B_22": ("B_22",),
-        "stage 1": ("B_11",),
         "stage 2": ("B_21", "B_22"),
         ALL: ("B_11", "B_21", "B_22"),
     }
     assert gate_means({"B_11": np.array([[[0.0, 1.0]], [[1.0, 4.0]]], np.float32)}) == {"B_11": 1.5}
+
+
+@pytest.mark.parametrize("higher_is_better", [True, False])
+def test_the_harm_of_a_scope_has_an_interval_over_scenes_and_a_test(higher_is_better):
+    rng = np.random.default_rng(1)
+    rows = [
+        {"scope": scope, "frame_id": f"s{scene}/t/{k}", "scene_id": f"s{scene}", "before": 1.0, "after": 1.0 - harm}
+        for scope, mean in (("B_11", 0.2), (ALL, 0.0))
+        for scene in range(8)
+        for k, harm in enumerate(mean + rng.normal(0, 0.05, 3))
+    ]
+    table = pd.DataFrame(rows)
+    if not higher_is_better:
+        table = table.assign(before=table["after"], after=table["before"])
+    found = forced_summary(table, higher_is_better, np.random.default_rng(0)).set_index("scope")
+    harm = (table["before"] - table["after"]).abs()[table["scope"] == "B_11"]
+    assert found.loc["B_11", "value"] == pytest.approx(harm.mean())
+    assert found.loc["B_11", "low"] > 0.1 and found.loc["B_11", "high"] < 0.3
+    assert found.loc["B_11", "p"] == 2**-8 and found.loc[ALL, "p"] > 0.05
+    assert found["n_units"].tolist() == [8, 8]
+    few = forced_summary(table[table["scene_id"] < "s4"], higher_is_better, np.random.default_rng(0))
+    assert few["low"].isna().all()

@@ -5,9 +5,11 @@ import pandas as pd
 import pytest
 
 from perilune_train.explain.evidence.removal import (
+    PERFECT,
     block_means,
     chosen_pixels,
     random_like,
+    relative_harm,
     removal_effect,
     removal_summary,
     removed,
@@ -196,3 +198,58 @@ def test_without_a_defined_measure_there_are_rows_and_no_ratio():
     assert table.loc["B_11", "ratio"] == 1 and np.isnan(table.loc["B_22", "ratio"])
     alone = removal_summary(effects[effects["map"] == "B_38"], higher_is_better=True)
     assert len(alone) == 1 and alone[[*kinds, "ratio"]].isna().all(axis=None)
+
+
+def effects_of(harms, scenes=8):
+    """Effects with one harm for each map and choice of pixels; scenes differ by a factor of mean 1."""
+    factors = np.linspace(0.8, 1.2, scenes)
+    return pd.DataFrame(
+        [
+            {"map": name, "which": which, "how": how, "scene_id": f"s{k}", "frame_id": f"s{k}/t/0"}
+            | {"before": 1.0, "after": 1.0 - factors[k] * harm * (1 if how == "mean" else 2), "overlap": 0.2}
+            for name, by_which in harms.items()
+            for which, harm in by_which.items()
+            for how in ("inpaint", "mean")
+            for k in range(scenes)
+        ]
+    )
+
+
+HARMS = {
+    "B_38": {"most": 0.3, "least": 0.0, "random": 0.2, "shifted": 0.1},
+    "edge/stage_3": {"most": 0.4},
+    PERFECT: {"most": 0.5, "random": 0.1, "shifted": 0.2},
+}
+
+
+def test_harm_is_relative_to_the_stronger_control_to_edges_and_to_a_perfect_mask(rng):
+    found = relative_harm(effects_of(HARMS), "B_38", "mean", True, rng)
+    values = {name: ratio.value for name, ratio in found.items()}
+    expected = {"control": 1.5, "edge/stage_3": 0.75, "perfect control": 2.5, PERFECT: 0.6}
+    assert values == {name: pytest.approx(value) for name, value in expected.items()}
+    # All scenes have these ratios, so the intervals have no width.
+    for name, ratio in found.items():
+        assert ratio.interval == (pytest.approx(values[name]), pytest.approx(values[name]))
+    assert found["control"].p == 2**-8 and found["edge/stage_3"].p == 1
+    assert np.isnan(found[PERFECT].p)
+
+
+def test_a_relative_harm_without_a_perfect_mask_without_harm_and_with_few_scenes(rng):
+    harmless = {"B_38": HARMS["B_38"] | {"random": 0.0, "shifted": 0.0}, "edge/stage_3": HARMS["edge/stage_3"]}
+    found = relative_harm(effects_of(harmless, scenes=4), "B_38", "inpaint", True, rng)
+    assert set(found) == {"control", "edge/stage_3"}
+    assert np.isnan(found["control"].value) and found["edge/stage_3"].interval is None
+    undefined = effects_of(HARMS).assign(before=np.nan)
+    assert all(np.isnan(ratio.value) for ratio in relative_harm(undefined, "B_38", "mean", True, rng).values())
+
+
+def test_edges_have_no_controls_and_a_perfect_mask_has_no_least(rng):
+    images = np.stack([noise_image(rng, 64)] * 2)
+    maps = {name: rng.random(images.shape) for name in ("B_38", "edge/stage_3", PERFECT)}
+    effects = removal_effect(images, maps, dict.fromkeys(maps, 1), lambda changed: changed.std((1, 2)), rng)
+    removals = effects.groupby("map")["which"].unique().map(set)
+    assert removals["B_38"] == {"most", "least", "random", "shifted"}
+    assert removals["edge/stage_3"] == {"most"} and removals[PERFECT] == {"most", "random", "shifted"}
+    table = removal_summary(effects, higher_is_better=True).set_index("map")
+    assert table.loc["edge/stage_3", ["random", "ratio", "overlap"]].isna().all(axis=None)
+    assert np.isfinite(table.loc["edge/stage_3", "most"]).all() and np.isfinite(table.loc[PERFECT, "overlap"]).all()

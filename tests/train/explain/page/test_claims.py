@@ -28,36 +28,37 @@ def _values(task, measure, means, kinds=None, spread=0.02, only_scenes=_SCENES):
     return pd.DataFrame(rows)
 
 
-def _interventions(harm):
-    """Tables of forced gates and removed pixels: each loses `harm` of a performance of 1."""
+def _interventions(harm, edges):
+    """Forced gates lose `harm` of a performance of 1 in each scene; removed pixels lose 0.4, of edges `edges`."""
     forced, removed = [], []
     for scene in range(_SCENES):
         place = {"frame_id": f"s{scene}/t/0", "scene_id": f"s{scene}", "before": 1.0}
         forced += [{"scope": scope, **place, "after": 1.0 - harm[scene]} for scope in ("B_11", "stage 1", ALL)]
-        for how in ("inpaint", "mean"):
-            losses = {"most": 0.4, "random": 0.1, "shifted": 0.05, "least": 0.0}
+        for name, most in (("B_11", 0.4), ("edge/stage_1", edges), ("craters", 0.5)):
+            losses = {"most": most} | ({"random": 0.1, "shifted": 0.05, "least": 0.0} if name != "edge/stage_1" else {})
             removed += [
-                {"map": "B_11", "which": k, "how": how, **place, "after": 1 - v, "overlap": 0.2}
+                {"map": name, "which": k, "how": how, **place, "after": 1 - v, "overlap": 0.2}
+                for how in ("inpaint", "mean")
                 for k, v in losses.items()
             ]
     return pd.DataFrame(forced), pd.DataFrame(removed)
 
 
-def _evidence(values, harm=(0.1,) * _SCENES):
+def _evidence(values, harm=(0.1,) * _SCENES, edges=0.3):
     rng = np.random.default_rng(0)
     signs = defaultdict(lambda: 1.0)
     pcc1 = values.loc[values["measure"].str.startswith("pcc1"), ["task", "measure", "map"]]
     known = dict.fromkeys(map(tuple, pcc1.to_numpy()), 1.0)
     tested = values[~values["measure"].str.endswith("_chance")]
     differences = null_differences(tested, known | signs, rng)
-    forced, removed = _interventions(harm)
+    forced, removed = _interventions(harm, edges)
     empty = pd.DataFrame()
     return Evidence(
         values, summary(values, rng), differences, against_nulls(differences), forced, removed, empty, empty, {}, "B_11"
     )
 
 
-def _detector(craterness=0.6, methods=0.6, only_scenes=_SCENES, harm=(0.1,) * _SCENES):
+def _detector(craterness=0.6, methods=0.6, only_scenes=_SCENES, harm=(0.1,) * _SCENES, edges=0.3):
     parts = []
     for measure, gate, null in (
         ("pcc1_craterness", craterness, 0.3),
@@ -74,7 +75,7 @@ def _detector(craterness=0.6, methods=0.6, only_scenes=_SCENES, harm=(0.1,) * _S
         if measure in ("auc", "relevance_mass", "pointing"):
             means["grad_cam"], kinds["grad_cam"] = methods, "attribution"
         parts.append(_values("detect", measure, means, kinds, only_scenes=only_scenes))
-    found = _evidence(pd.concat(parts, ignore_index=True), harm)
+    found = _evidence(pd.concat(parts, ignore_index=True), harm, edges)
     return {one.claim: one for one in detector_claims(found, {"B_11": 0.3})}
 
 
@@ -136,9 +137,38 @@ def test_forced_gates_count_scenes_with_a_value(harm, verdict):
     assert claim.verdict == verdict and "nan" not in claim.interval
 
 
-def test_the_headline_says_what_removal_shows():
+def test_claims_on_what_is_used_come_first():
+    for claims in (list(_detector().values()), _navigator(0.2)):
+        words = ["the pattern of the masks matters", "the pattern of a single mask matters", "removing the 20 %"]
+        assert [word in one.claim for word, one in zip(words, claims, strict=False)] == [True] * 3
+        assert claims[3].picture.startswith("pcc_")
+
+
+def test_a_single_gate_that_matters_is_counted_and_listed():
+    claim = _of(_detector(), "a single mask")
+    assert (claim.figure, claim.verdict) == ("1 of 1 gates; largest harm 0.100 (B_11)", "holds")
+    assert claim.interval == "0.100 to 0.100 (8 units: scene)" and claim.nulls == "B_11 0.100 (p 0.0039)"
+    nothing = _of(_detector(harm=(0.1, -0.1) * 4), "a single mask")
+    assert nothing.verdict == "does not hold" and nothing.figure.startswith("0 of 1 gates")
+    empty = _of(_detector(harm=(np.nan,) * 8), "a single mask")
+    assert (empty.figure, empty.interval, empty.nulls) == ("0 of 1 gates", "none: no scene with a value", "-")
+
+
+def test_removal_is_relative_to_controls_edges_and_a_perfect_mask():
+    claim = _of(_detector(), "removing the 20 %")
+    ratios = "4.00 times the stronger control, 1.33 times edges, 0.80 of what a perfect mask reaches"
+    assert claim.figure == f"0.400: {ratios} (filled by inpaint, the less favourable)"
+    assert claim.nulls.endswith("edges 0.300, perfect mask 0.500 (5.00 times its control)")
+    assert claim.interval.endswith("(8 scenes)") and claim.verdict == "holds"
+    assert _of(_detector(edges=0.45), "removing the 20 %").verdict == "does not beat: edges"
+
+
+def test_the_headline_says_first_what_is_used():
     text = headline(list(_detector().values()) + _navigator(0.2))
-    assert text.startswith("Detector: the mask of B_11 follows craters: holds: beats every null; removing what it")
-    assert text.count("removing what it attends to hurts 3 times as much as controls: holds. Navigator: both") == 1
+    assert text.startswith(
+        "Detector: the pattern of its masks matters: holds (harm 0.100); removing what it attends to"
+    )
+    assert "controls and edges: holds; the mask of B_11 follows craters: holds: beats every null. Navigator: " in text
     # Lower errors after a removal are no harm.
-    assert text.endswith("removing what it attends to hurts 3 times as much as controls: does not hold.")
+    assert "removing what it attends to hurts more than controls and edges: does not beat: control" in text
+    assert headline(_navigator(0.2)[3:4]).startswith("Navigator: both halves of the mask")

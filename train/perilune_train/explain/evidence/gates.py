@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from perilune_shared.console.terminal import progress_bar
+from perilune_train.explain.evidence.significance import summary, unit_sign_flip_p
 from perilune_train.explain.maps.masks import Masks
 from perilune_train.models.darknet import AttentionDarknet53
 
@@ -26,11 +27,14 @@ def gate_means(masks: Masks) -> dict[str, float]:
 
 
 def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Gates that are forced together, by scope: each gate alone, the gates of each stage ("stage 3"), all gates."""
+    """Gates that are forced together, by scope: each gate alone, the gates of each stage ("stage 3"), all gates.
+
+    A stage with one gate has no scope of its own.
+    """
     stages = sorted({block[2] for block in blocks})
     alone = {block: (block,) for block in blocks}
     together = {f"stage {stage}": tuple(block for block in blocks if block[2] == stage) for stage in stages}
-    return {**alone, **together, ALL: tuple(blocks)}
+    return {**alone, **{stage: gates for stage, gates in together.items() if len(gates) > 1}, ALL: tuple(blocks)}
 
 
 @contextmanager
@@ -73,3 +77,23 @@ def forced_gates(
             tables.append(pd.DataFrame(columns))
             progress.advance(task)
     return pd.concat(tables, ignore_index=True)
+
+
+def forced_summary(gates: pd.DataFrame, higher_is_better: bool, rng: np.random.Generator) -> pd.DataFrame:
+    """Mean harm of forcing the gates of each scope, in one row for each scope.
+
+    `gates` is the table of `forced_gates` with the columns frame_id and scene_id. Harm is before - after, or
+    after - before if lower values are better. Columns:
+
+    - scope
+    - value, low, high: mean over frames and its 95 % interval over scenes (NaN with fewer than five)
+    - n_units, unit: number and kind of units with a value
+    - p: one-sided p, by sign flips of the means of scenes, of a harm above 0
+    """
+    change = (gates["before"] - gates["after"]) * (1 if higher_is_better else -1)
+    names = {"task": "", "kind": "forced", "map": gates["scope"], "measure": "harm"}
+    table = pd.DataFrame({**names, "frame_id": gates["frame_id"], "scene_id": gates["scene_id"], "value": change})
+    means = summary(table, rng)[["map", "value", "low", "high", "n_units", "unit"]].rename(columns={"map": "scope"})
+    by_scene = table.groupby(["map", "scene_id"])["value"].mean()
+    means["p"] = [unit_sign_flip_p(by_scene[scope].to_numpy(np.float64)) for scope in means["scope"]]
+    return means

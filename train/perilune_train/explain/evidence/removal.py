@@ -1,6 +1,7 @@
-"""Measure the harm of removing the pixels that a map attends to, compared with two controls."""
+"""Measure the harm of removing the pixels that a map attends to, compared with controls and with a perfect mask."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -8,12 +9,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_train.explain.evidence.significance import unit_sign_flip_p
+from perilune_train.records.spread import Array, Interval, Resamples, draw_resamples, spreads
+
 Which = Literal["most", "least"]
 Filling = Literal["inpaint", "mean"]
 Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
 """Function that returns a value (N,) for each image (N, height, width); NaN if undefined."""
 CONTROLS = ("random", "shifted")
 """Names of the controls (`random_like`, `shifted_like`)."""
+PERFECT = "craters"
+"""Name of the perfect mask: 1 in the ellipses of the selected craters, 0 elsewhere."""
 _FILLINGS: tuple[Filling, ...] = ("inpaint", "mean")
 BLOCK_PX = 8
 """Side of the removed blocks, pixels. Inpainting can restore single pixels, but not blocks of this size."""
@@ -102,8 +108,9 @@ def removal_effect(
     """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
 
     `maps` are (N, height, width); `sign` is 1, or -1 for a map that is weaker on craters. `measure` runs once on the
-    unchanged images, and once for each combination of map, which and how. If an image is two frames stacked in height,
-    replacements at the seam use pixels of both frames. Columns:
+    unchanged images, and once for each combination of map, which and how. Edge maps ("edge/...") have no controls and
+    no "least", and the perfect mask has no "least", because no claim needs them. If an image is two frames stacked in
+    height, replacements at the seam use pixels of both frames. Columns:
 
     - map
     - which: "most" or "least" attended pixels, or the control "random" or "shifted"
@@ -115,16 +122,13 @@ def removal_effect(
     before = np.asarray(measure(images))
     tables = []
     for name, image_maps in maps.items():
-        most, least = (
-            [chosen_pixels(image_map, share, which, sign[name], rng) for image_map in image_maps]
-            for which in ("most", "least")
-        )
-        choices = {
-            "most": most,
-            "least": least,
-            "random": [random_like(*pair, rng) for pair in zip(images, most, strict=True)],
-            "shifted": [shifted_like(image_map, rng) for image_map in most],
-        }
+        most = [chosen_pixels(image_map, share, "most", sign[name], rng) for image_map in image_maps]
+        choices = {"most": most}
+        if not name.startswith("edge/"):
+            choices["random"] = [random_like(*pair, rng) for pair in zip(images, most, strict=True)]
+            choices["shifted"] = [shifted_like(image_map, rng) for image_map in most]
+            if name != PERFECT:
+                choices["least"] = [chosen_pixels(one, share, "least", sign[name], rng) for one in image_maps]
         for which, chosen in choices.items():
             overlap = [
                 (image_map & first).sum() / image_map.sum() for image_map, first in zip(chosen, most, strict=True)
@@ -144,7 +148,7 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     lower values are better. Columns:
 
     - map, how
-    - most, least, random, shifted: harms; NaN if no frame has a value
+    - most, least, random, shifted: harms; NaN if no frame has a value, or if this removal was not measured
     - control: name of the control with the larger harm
     - ratio: harm of `most` divided by the harm of this control; NaN unless the control's harm is above 0
     - overlap: mean share of this control's pixels that are among the most attended pixels. If only the most attended
@@ -162,8 +166,74 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     table["control"] = controls.fillna(-np.inf).idxmax(axis=1)
     table["ratio"] = (table["most"] / controls.max(axis=1)).where(controls.max(axis=1) > 0)
     overlaps = effects.groupby(["map", "how", "which"])["overlap"].mean()
-    table["overlap"] = [overlaps[(*pair, control)] for pair, control in zip(pairs, table["control"], strict=True)]
+    chosen = zip(pairs, table["control"], strict=True)
+    table["overlap"] = [float(overlaps.get((*pair, control), np.nan)) for pair, control in chosen]
     return table
+
+
+@dataclass(frozen=True, slots=True)
+class Relative:
+    """Harm of removing what a gate attends to, relative to the harm of another removal."""
+
+    value: float
+    """The ratio; NaN if the other removal does no harm."""
+    interval: Interval | None
+    """95 % interval over scenes; None with fewer than five scenes."""
+    p: float
+    """One-sided p, by sign flips of scenes, that the gate's removal does more harm; NaN where it is not tested."""
+
+
+def relative_harm(
+    effects: pd.DataFrame, gate: str, how: Filling, higher_is_better: bool, rng: np.random.Generator
+) -> dict[str, Relative]:
+    """Harm of removing what a gate attends to, relative to the stronger control, to edges and to a perfect mask.
+
+    `effects` is the table of `removal_effect` with the columns frame_id and scene_id; only the filling `how` is used.
+    Frames without a value are left out. Keys of the result:
+
+    - "control": harm of the gate / harm of its stronger control. p is the larger p of both controls.
+    - the name of each other map: harm of the gate / harm of this map's most attended pixels
+    - `PERFECT`: the gate's ratio to its control / the perfect mask's ratio to the perfect mask's control. A perfect
+      mask attends to other pixels, so it has its own controls. p is not tested.
+    - "perfect control": the perfect mask's ratio to its stronger control. p is not tested.
+    """
+    harm = effects["before"] - effects["after"] if higher_is_better else effects["after"] - effects["before"]
+    rows = effects.assign(harm=harm, removed=effects["map"] + "\n" + effects["which"])[effects["how"] == how]
+    table = rows.pivot(index=["scene_id", "frame_id"], columns="removed", values="harm").dropna()
+    scenes, frames = (table.index.get_level_values(name).astype(str).tolist() for name in ("scene_id", "frame_id"))
+    resamples = draw_resamples(scenes, [name.rpartition("/")[0] for name in frames], frames, rng)
+    every = np.arange(len(table))
+    others = [str(name) for name in dict.fromkeys(rows["map"]) if name not in (gate, PERFECT)]
+
+    def ratios(drawn: Resamples) -> dict[str, Array]:
+        def most(name: str) -> Array:
+            return drawn.totals(every, table[f"{name}\nmost"].to_numpy(np.float64))
+
+        def to_control(name: str) -> Array:
+            controls = [drawn.totals(every, table[f"{name}\n{each}"].to_numpy(np.float64)) for each in CONTROLS]
+            return _ratio(most(name), np.maximum(*controls))
+
+        found = {"control": to_control(gate)} | {name: _ratio(most(gate), most(name)) for name in others}
+        if PERFECT in set(rows["map"]):
+            perfect = to_control(PERFECT)
+            found |= {PERFECT: _ratio(found["control"], perfect), "perfect control": perfect}
+        return found
+
+    whole = ratios(replace(resamples, weights=np.ones((1, resamples.count))))
+    intervals = spreads(ratios, every, resamples)
+    differences = table[f"{gate}\nmost"].to_numpy()[:, None] - table.to_numpy()
+    by_scene = pd.DataFrame(differences, table.index, table.columns).groupby(level="scene_id").mean()
+    p = {name: unit_sign_flip_p(by_scene[f"{name}\nmost"].to_numpy(np.float64)) for name in others}
+    p["control"] = max(unit_sign_flip_p(by_scene[f"{gate}\n{each}"].to_numpy(np.float64)) for each in CONTROLS)
+    return {
+        name: Relative(float(value[0]), intervals[name].interval, p.get(name, float("nan")))
+        for name, value in whole.items()
+    }
+
+
+def _ratio(over: Array, under: Array) -> Array:
+    """over / under; NaN where `under` is not above 0."""
+    return np.where(under > 0, over / np.where(under > 0, under, 1.0), np.nan)
 
 
 def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:

@@ -8,6 +8,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from perilune_train.explain.evidence.gates import forced_summary
+from perilune_train.explain.evidence.removal import PERFECT
 from perilune_train.records.pictures import save_figure
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
@@ -74,15 +76,21 @@ def _draw_nulls(axis: Axes, gates: pd.DataFrame, differences: pd.DataFrame) -> N
 
 
 def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
-    """Draw the harm of forcing each gate, each stage and all gates to their means: means as bars, scenes as dots."""
+    """Draw the harm of forcing each gate, each stage and all gates to their means.
+
+    Bars are means with 95 % intervals over scenes, if there are five or more; dots are scenes.
+    """
     harm = (gates["before"] - gates["after"]) * (1 if higher_is_better else -1)
     table = gates.assign(harm=harm)
-    scopes = list(dict.fromkeys(table["scope"]))
-    mean = table.groupby("scope")["harm"].mean().reindex(scopes)
+    means = forced_summary(gates, higher_is_better, np.random.default_rng(0))
+    scopes, mean = means["scope"].tolist(), means["value"]
     figure = Figure(figsize=(12, 3.6), layout="constrained")
     axis = figure.subplots()
     colours = [BLUE if scope.startswith("B_") else ORANGE for scope in scopes]
     axis.bar(np.arange(len(scopes)), mean, 0.7, color=colours)
+    errors = np.vstack([mean - means["low"], means["high"] - mean])
+    if np.isfinite(errors).any():
+        axis.errorbar(np.arange(len(scopes)), mean, errors, fmt="none", ecolor="black", capsize=3, linewidth=1)
     for scene, rows in table.groupby("scene_id"):
         values = rows.groupby("scope")["harm"].mean().reindex(scopes)
         axis.plot(np.arange(len(scopes)), values, ".", color="black", markersize=4, label=str(scene))
@@ -111,7 +119,10 @@ def draw_removal(path: Path, removal: pd.DataFrame, unit: str, higher_is_better:
         axis.bar(
             np.arange(len(groups)) + 0.2 * k, values, 0.19, color=colour, edgecolor="black", hatch=hatch, label=label
         )
-    axis.set_xticks(np.arange(len(groups)) + 0.3, [f"{name}\n{how}" for name, how in groups], fontsize=8)
+    names = {PERFECT: "perfect mask"}
+    axis.set_xticks(
+        np.arange(len(groups)) + 0.3, [f"{names.get(name, name)}\n{how}" for name, how in groups], fontsize=8
+    )
     axis.axhline(0, color="black", linewidth=0.8)
     axis.set_ylabel(f"harm: {unit}", fontsize=9)
     axis.legend(fontsize=8)

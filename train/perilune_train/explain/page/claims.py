@@ -6,17 +6,22 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.stats import false_discovery_control
 
-from perilune_train.explain.evidence.gates import ALL
-from perilune_train.explain.evidence.removal import removal_summary
+from perilune_train.explain.evidence.gates import ALL, forced_summary
+from perilune_train.explain.evidence.removal import PERFECT, Relative, relative_harm, removal_summary
 from perilune_train.explain.evidence.significance import BEATS, LEVEL, UNDECIDED, unit_sign_flip_p
 from perilune_train.explain.evidence.tables import Evidence
 from perilune_train.records.spread import MIN_UNITS
 
 MIN_DEVIATION = 0.02
 """Smallest standard deviation, over pixels and images, at which a mask does not count as constant."""
+_FORCES = "the pattern of the masks matters"
+"""Words by which `headline` recognises the claim on all forced gates."""
 _REMOVES = "removing the 20 %"
 """Words by which `headline` recognises the claim on removed pixels."""
+_LOOKS = ("follows craters", "mark the same ground")
+"""Words by which `headline` recognises the first claim on what the strongest mask looks like."""
 STILL_FROM = 37
 """Number of the gate B_37. The paper states that PCC4 is above PCC3 up to B_36, and below PCC3 from B_37 on."""
 DEEP_GATES = tuple(f"B_4{k}" for k in (8,)) + tuple(f"B_5{k}" for k in (1, 2, 3, 4))
@@ -24,8 +29,8 @@ DEEP_GATES = tuple(f"B_4{k}" for k in (8,)) + tuple(f"B_5{k}" for k in (1, 2, 3,
 DEEP_ALIKE = 0.75
 LOCALISATION = {"auc": "ROC-AUC", "relevance_mass": "relevance mass", "pointing": "pointing game"}
 """Localisation measures and their display names."""
-HARM_RATIO = 3.0
-"""Smallest ratio of the harm of removing attended pixels to the harm of the stronger control."""
+_LISTED_GATES = 5
+"""Largest number of gates whose harms a claim lists."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +66,10 @@ def row_of(evidence: Evidence, measure: str, name: str) -> pd.Series:
     return rows.iloc[0]
 
 
-def interval_text(row: pd.Series) -> str:
+def interval_text(row: pd.Series, decimals: int = 2) -> str:
     """The interval of a row of the summary and its number of units, as text; "none" without an interval."""
     if math.isfinite(row["low"]) and math.isfinite(row["high"]):
-        return f"{row['low']:.2f} to {row['high']:.2f} ({row['n_units']} units: {row['unit']})"
+        return f"{row['low']:.{decimals}f} to {row['high']:.{decimals}f} ({row['n_units']} units: {row['unit']})"
     return f"none: {row['n_units']} units ({row['unit']})"
 
 
@@ -74,7 +79,7 @@ def scenes_of(rows: pd.DataFrame) -> int:
 
 
 def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Collection[str] = ()) -> list[Claim]:
-    """Claims about the detector.
+    """Claims about the detector: first what it uses, then what its masks look like.
 
     `deviations` are the standard deviations of the masks over pixels and images. `guided` are gates whose masks were
     trained to follow labels; claims on these gates say so.
@@ -85,45 +90,49 @@ def detector_claims(evidence: Evidence, deviations: dict[str, float], guided: Co
     beyond = f"{follows} beyond brightness and gradient{trained}"
     unit = "AP of a frame"
     return [
+        forced_claim(evidence, "Detector", unit, "gates_detect.png", higher_is_better=True),
+        single_gate_claim(evidence, "Detector", unit, "gates_detect.png", higher_is_better=True),
+        removal_claim(evidence, "Detector", unit, "removal_detect.png", higher_is_better=True),
         against_nulls(evidence, "pcc1_craterness", strongest, follows + trained, "pcc_detect.png"),
         against_nulls(evidence, "pcc1_partial", strongest, beyond, "pcc_detect.png"),
         shallow(evidence),
         deep_alike(evidence),
         *(located(evidence, measure) for measure in LOCALISATION),
-        removal_claim(evidence, "Detector", unit, "removal_detect.png", higher_is_better=True),
-        forced_claim(evidence, "Detector", unit, "gates_detect.png", higher_is_better=True),
         _constant("Detector", deviations, "masks_detect.png"),
     ]
 
 
 def navigator_claims(evidence: Evidence, deviations: dict[str, float]) -> list[Claim]:
-    """Claims about the stack navigator; `deviations` are the standard deviations of the masks."""
+    """Claims about the stack navigator: first what it uses, then what its masks look like.
+
+    `deviations` are the standard deviations of the masks.
+    """
     strongest, unit = evidence.strongest, "position error of a pair, m"
     alike = f"Navigator: both halves of the mask of {strongest} mark the same ground (PCC4)"
     return [
+        forced_claim(evidence, "Navigator", unit, "gates_navigate.png", higher_is_better=False),
+        single_gate_claim(evidence, "Navigator", unit, "gates_navigate.png", higher_is_better=False),
+        removal_claim(evidence, "Navigator", unit, "removal_navigate.png", higher_is_better=False),
         against_nulls(evidence, "pcc4", strongest, alike, "pcc_navigate.png"),
         motion(evidence, moving=True),
         motion(evidence, moving=False),
-        removal_claim(evidence, "Navigator", unit, "removal_navigate.png", higher_is_better=False),
-        forced_claim(evidence, "Navigator", unit, "gates_navigate.png", higher_is_better=False),
         _constant("Navigator", deviations, "masks_navigate.png"),
     ]
 
 
 def headline(claims: list[Claim]) -> str:
-    """One sentence for each network: the verdicts on its strongest gate and on the removal of the gate's pixels."""
+    """One sentence for each network: what its output uses, then what its strongest mask looks like."""
     sentences = []
     for task in ("Detector", "Navigator"):
-        task_claims = [claim for claim in claims if claim.claim.startswith(task)]
-        if not task_claims:
-            continue
-        parts = [f"{task_claims[0].claim[len(task) + 2 :]}: {task_claims[0].verdict}"]
-        removal = next((claim for claim in task_claims if _REMOVES in claim.claim), None)
-        if removal is not None:
-            parts.append(
-                f"removing what it attends to hurts {HARM_RATIO:g} times as much as controls: {removal.verdict}"
-            )
-        sentences.append(f"{task}: " + "; ".join(parts) + ".")
+        of_task = [claim for claim in claims if claim.claim.startswith(task)]
+        forced, removed = (next((one for one in of_task if words in one.claim), None) for words in (_FORCES, _REMOVES))
+        looks = next((one for one in of_task if any(words in one.claim for words in _LOOKS)), None)
+        parts = [f"the pattern of its masks matters: {forced.verdict} ({forced.figure})"] if forced else []
+        parts += (
+            [f"removing what it attends to hurts more than controls and edges: {removed.verdict}"] if removed else []
+        )
+        parts += [f"{looks.claim[len(task) + 2 :]}: {looks.verdict}"] if looks else []
+        sentences += [f"{task}: {'; '.join(parts)}."] if parts else []
     return " ".join(sentences)
 
 
@@ -293,58 +302,92 @@ def removal_row(evidence: Evidence, *, higher_is_better: bool) -> pd.Series:
     return rows.iloc[int(np.argmin(rows["ratio"].fillna(-np.inf).to_numpy()))]
 
 
+def relative_removal(evidence: Evidence, *, higher_is_better: bool) -> dict[str, Relative]:
+    """`relative_harm` of the strongest gate, for its filling with the lower ratio to the stronger control."""
+    how = removal_row(evidence, higher_is_better=higher_is_better)["how"]
+    rng = np.random.default_rng(0)
+    return relative_harm(evidence.removal, evidence.strongest, how, higher_is_better, rng)
+
+
 def removal_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
-    """The claim that removing attended pixels harms at least HARM_RATIO times as much as the stronger control."""
+    """The claim that removing attended pixels does more harm than both controls and than removing edges.
+
+    The figure is also stated relative to a perfect mask, if the labels give one.
+    """
     row = removal_row(evidence, higher_is_better=higher_is_better)
-    controls = (
-        f"random {row['random']:.3f}, same shape elsewhere {row['shifted']:.3f}, least attended {row['least']:.3f}"
-    )
+    relative = relative_removal(evidence, higher_is_better=higher_is_better)
+    words = {"control": "times the stronger control", PERFECT: "of what a perfect mask reaches"}
+    words |= {name: "times edges" for name in relative if name.startswith("edge")}
+    ratios = {words[name]: ratio for name, ratio in relative.items() if name in words and np.isfinite(ratio.value)}
+    intervals = [
+        f"{ratio.interval[0]:.2f} to {ratio.interval[1]:.2f} {name}" for name, ratio in ratios.items() if ratio.interval
+    ]
     scenes = evidence.removal.loc[evidence.removal["before"].notna(), "scene_id"].nunique()
     if math.isnan(row["most"]):
-        times = "no image with a value"
-    elif math.isfinite(row["ratio"]):
-        times = f"{row['ratio']:.1f} times the stronger control"
+        figure = "no image with a value"
     else:
-        times = "the stronger control does no harm, so there is no ratio"
+        known = [f"{ratio.value:.2f} {name}" for name, ratio in ratios.items()]
+        known += [] if "times the stronger control" in ratios else ["the stronger control does no harm"]
+        figure = f"{row['most']:.3f}: {', '.join(known)} (filled by {row['how']}, the less favourable)"
+    controls = [f"random {row['random']:.3f}", f"same shape elsewhere {row['shifted']:.3f}"]
+    controls.append(f"least attended {row['least']:.3f}")
+    table = removal_summary(evidence.removal, higher_is_better)
+    for other in table[(table["how"] == row["how"]) & (table["map"] != evidence.strongest)].to_dict("records"):
+        name = "perfect mask" if other["map"] == PERFECT else "edges"
+        times = f" ({other['ratio']:.2f} times its control)" if np.isfinite(other["ratio"]) else ""
+        controls.append(f"{name} {other['most']:.3f}{times}")
+    edge = next((name for name in relative if name.startswith("edge")), None)
+    tested = {"control": relative["control"].p} | ({"edges": relative[edge].p} if edge else {})
+    lost = [name for name, p in tested.items() if not p < LEVEL]
+    verdict = decided(not lost, scenes)
     return Claim(
-        f"{task}: removing the 20 % that {evidence.strongest} attends to hurts at least {HARM_RATIO:g} times as much as"
-        f" a control ({unit})",
-        f"{row['most']:.3f}; {times} (filled by {row['how']}, the less favourable)",
-        f"none: ratio over {scenes} scenes",
-        controls,
-        decided(math.isfinite(row["ratio"]) and row["ratio"] >= HARM_RATIO and row["most"] > 0, scenes),
+        f"{task}: {_REMOVES} that {evidence.strongest} attends to hurts more than controls and edges ({unit})",
+        figure,
+        f"{', '.join(intervals)} ({scenes} scenes)" if intervals else f"none: {scenes} scenes",
+        "-" if math.isnan(row["most"]) else ", ".join(controls),
+        "does not beat: " + ", ".join(lost) if verdict == "does not hold" else verdict,
         picture,
     )
 
 
-def forced_harm(evidence: Evidence, *, higher_is_better: bool) -> dict[str, float]:
-    """Harm of forcing each gate, each stage and all gates to their means, by name; means over frames."""
-    harm = _harms(evidence, higher_is_better).groupby("scope", sort=False)["harm"].mean()
-    return {str(scope): float(value) for scope, value in harm.items()}
+def forced_harm(evidence: Evidence, *, higher_is_better: bool) -> pd.DataFrame:
+    """`forced_summary` of the network's gates."""
+    return forced_summary(evidence.gates, higher_is_better, np.random.default_rng(0))
 
 
 def forced_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
     """The claim that the output gets worse if all gates are forced to their means."""
     harm = forced_harm(evidence, higher_is_better=higher_is_better)
-    single = pd.Series({scope: value for scope, value in harm.items() if scope.startswith("B_")}).dropna()
-    table = _harms(evidence, higher_is_better)
-    by_scene = table[table["scope"] == ALL].groupby("scene_id")["harm"].mean()
-    scenes = by_scene.dropna().to_numpy(np.float64)
-    p = unit_sign_flip_p(scenes)
-    interval = "none: no scene with a value"
-    if len(scenes):
-        interval = f"smallest and largest of {len(scenes)} scenes: {scenes.min():.3f} to {scenes.max():.3f}, p {p:.4f}"
-    controls = f"largest single gate {single.idxmax()} {single.max():.3f}; median gate {single.median():.3f}"
+    row = harm[harm["scope"] == ALL].iloc[0]
     return Claim(
-        f"{task}: the pattern of the masks matters (all gates forced to their means: {unit})",
-        f"harm {harm[ALL]:.3f}",
-        interval,
-        controls if len(single) else "-",
-        decided(p < LEVEL, len(scenes)),
+        f"{task}: {_FORCES} (all gates forced to their means: {unit})",
+        f"harm {row['value']:.3f}" if math.isfinite(row["value"]) else "-",
+        f"{interval_text(row, 3)}, p {row['p']:.4f}" if math.isfinite(row["p"]) else "none: no scene with a value",
+        "-",
+        decided(row["p"] < LEVEL, scenes_of(row.to_frame().T)),
         picture,
     )
 
 
-def _harms(evidence: Evidence, higher_is_better: bool) -> pd.DataFrame:
-    change = (evidence.gates["before"] - evidence.gates["after"]) * (1 if higher_is_better else -1)
-    return evidence.gates.assign(harm=change)
+def single_gate_claim(evidence: Evidence, task: str, unit: str, picture: str, *, higher_is_better: bool) -> Claim:
+    """The claim that the output gets worse if some gate alone is forced to its mean.
+
+    p is corrected for the number of gates (Benjamini & Hochberg 1995).
+    """
+    harm = forced_harm(evidence, higher_is_better=higher_is_better)
+    single = harm[harm["scope"].str.startswith("B_")]
+    single = single.assign(adjusted=false_discovery_control(single["p"].fillna(1.0)))
+    ordered = single.dropna(subset="value").sort_values("value", ascending=False, kind="stable")
+    mattering = int(((single["adjusted"] < LEVEL) & (single["value"] > 0)).sum())
+    listed = [f"{row['scope']} {row['value']:.3f} (p {row['adjusted']:.4f})" for row in ordered.to_dict("records")]
+    more = f", {len(listed) - _LISTED_GATES} more" if len(listed) > _LISTED_GATES else ""
+    largest = None if ordered.empty else ordered.iloc[0]
+    return Claim(
+        f"{task}: the pattern of a single mask matters (one gate forced to its mean: {unit})",
+        f"{mattering} of {len(single)} gates"
+        + ("" if largest is None else f"; largest harm {largest['value']:.3f} ({largest['scope']})"),
+        "none: no scene with a value" if largest is None else interval_text(largest, 3),
+        ", ".join(listed[:_LISTED_GATES]) + more if listed else "-",
+        decided(mattering > 0, scenes_of(single)),
+        picture,
+    )

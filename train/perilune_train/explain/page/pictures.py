@@ -35,17 +35,20 @@ _NAVIGATE = {
     "pcc4_minus_pcc3": "PCC4 - PCC3",
 }
 _SHARED = {
+    "gates": "Harm of forcing masks to their means: single gates, stages with several gates, all gates, with 95 %"
+    " intervals if there are five or more scenes. Dots: scenes.",
+    "removal": "Harm of replacing a share of the pixels, chosen by the strongest gate, by edges and, for the detector,"
+    " by a perfect mask of the labelled craters: most attended, two controls, least attended.",
+    "before_after": "One image after inpainting: the most attended pixels, random pixels of equal brightness, the same"
+    " shape elsewhere, the least attended pixels.",
     "masks": "Attention masks of all gates on one scale, at high, middle and low altitude of one descent.",
     "pcc": "Correlations of all gates, with 95 % intervals if there are five or more scenes. The gates of filled bars"
     " beat every null. Markers: nulls.",
-    "gates": "Harm of forcing masks to their means: single gates, stages, all gates. Dots: scenes.",
-    "removal": "Harm of replacing a share of the pixels: most attended, two controls, least attended.",
     "randomisation": "Similarity of the masks to the trained masks after stages got random weights, from the top and"
     " from the bottom.",
     "stability": "Mean correlation of the masks before and after a change of the image: noise, shift or another lens.",
-    "before_after": "One image after inpainting: the most attended pixels, random pixels of equal brightness, the same"
-    " shape elsewhere, the least attended pixels.",
 }
+"""Captions: first what the network uses, then what its masks look like."""
 _LOCALISATION = "ROC-AUC of maps on crater pixels (chance: 0.5). Blue: gates, grey: nulls, orange: attribution methods."
 CAPTIONS = {f"{name}_{task}.png": text for task in ("detect", "navigate") for name, text in _SHARED.items()} | {
     "localisation_detect.png": _LOCALISATION
