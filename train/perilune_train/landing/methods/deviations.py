@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from perilune_train.landing.methods.detector_errors import FrameMatches, paired_errors
 from perilune_train.landing.methods.seen import SeenDescent
-from perilune_train.landing.monte_carlo.detector_errors import FrameMatches, paired_errors
 
 N_CLASSES = 8
 """Number of classes of equal size, by stated standard deviation."""

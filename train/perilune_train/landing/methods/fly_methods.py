@@ -20,11 +20,11 @@ from perilune_train.landing.methods.absolute import (
     catalogues_of,
     on_the_same_frames,
 )
+from perilune_train.landing.methods.detector_errors import matches_of
 from perilune_train.landing.methods.deviations import deviation_table
 from perilune_train.landing.methods.page import deviations_section, page_of, same_frames_section
 from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
-from perilune_train.landing.monte_carlo.detector_errors import matches_of
 from perilune_train.motion.data.trajectories import Trajectory, load_split
 from perilune_train.motion.evaluate_runs import fusion_of, learned_motions
 from perilune_train.motion.metrics.baselines import MethodMotions, baselines

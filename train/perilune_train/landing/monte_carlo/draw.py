@@ -19,9 +19,9 @@ from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.flight import DopplerLidar, Instruments, StarTracker
 from perilune_train.landing.filter.lander import Beam, LidarErrors
 from perilune_train.landing.filter.state import rotation_matrices
+from perilune_train.landing.methods.detector_errors import DetectorErrors, FrameMatches, drawn_sightings
 from perilune_train.landing.methods.flights import STAR_TRACKER_ARCSEC
 from perilune_train.landing.methods.seen import SeenDescent
-from perilune_train.landing.monte_carlo.detector_errors import DetectorErrors, FrameMatches, drawn_sightings
 from perilune_train.landing.monte_carlo.motion import TrueMotion
 from perilune_train.landing.monte_carlo.scenario import WRONG_PRIOR_M, Draws
 

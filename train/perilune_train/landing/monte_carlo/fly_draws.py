@@ -25,10 +25,10 @@ from perilune_shared.threads import usable_cores
 from perilune_train.landing.craters.catalogue import MIN_DIAMETER_M, exact_catalogue
 from perilune_train.landing.filter.flight import Estimate, Instruments, fly_together, together
 from perilune_train.landing.filter.propagate import start_sigmas
+from perilune_train.landing.methods.detector_errors import matches_of, measured_errors
 from perilune_train.landing.methods.flights import START_M, START_MPS, Start, lander_of, mounting_of, row_of, table_of
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents
 from perilune_train.landing.monte_carlo.consistency import by_altitude, of_descents
-from perilune_train.landing.monte_carlo.detector_errors import matches_of, measured_errors
 from perilune_train.landing.monte_carlo.draw import Site, drawn
 from perilune_train.landing.monte_carlo.motion import true_motion
 from perilune_train.landing.monte_carlo.page import Run, page_of
