@@ -100,7 +100,7 @@ def _predict(paths: list[Path], run: Path, config: DetectConfig, out: Path, sett
             suspicion = suspicion_of(image, detections, detector.calibration is not None)
             if suspicion is not None:
                 doubts.append(f"warning: {path.name}: {suspicion.text}")
-            if is_novel(detections.novelty):
+            elif is_novel(detections.novelty):
                 novel.append(f"warning: {path.name}: {novelty_text(detections.novelty)}")
             detections = strongest(of_size(above(detections, threshold), settings.min_size_px), settings.top)
             tables.append(flagged(table_of(path.name, detections), suspicion, detections.novelty))
