@@ -20,6 +20,8 @@ import subprocess
 
 from playwright.sync_api import sync_playwright
 
+from perilune_shared.console.command_line import one_command, run_command_line
+
 PICTURE = Path(__file__).parent.parent / "docs/pictures/report_answers.jpg"
 _SETTINGS = (
     "render.engine=heightfield", "seed=48", "detect.n_scenes=1", "detect.trajectories_per_scene=1",
@@ -73,4 +75,4 @@ def _run(program: str, *arguments: object) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    run_command_line(one_command(main))

@@ -91,7 +91,8 @@ def test_a_program_ends_with_one_line(name, after_s, folder):
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_script_ends_with_one_line(name, after_s, folder):
     path = ROOT / "scripts" / name
-    code = f"sys.path.insert(0, {str(path.parent)!r})\nsys.argv[0] = {str(path)!r}\n"
+    # Some run as `python scripts/name.py`, others as `python -m scripts.name`.
+    code = f"sys.path[:0] = {[str(path.parent), str(ROOT)]!r}\nsys.argv[0] = {str(path)!r}\n"
     code += f"runpy.run_path({str(path)!r}, run_name='__main__')"
     check(*interrupted(code, ("--help",), folder, after_s))
 
