@@ -24,7 +24,7 @@ from perilune_train.landing.craters.catalogue import Catalogue
 from perilune_train.landing.craters.projection import Pose, projected
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.records.metrics_file import write_metrics
-from perilune_train.report.answers.choice import chosen_detections
+from perilune_train.report.answers.answers import chosen_detections
 from perilune_train.report.answers.position import SeenFrame, sentences_on_position
 from perilune_train.report.answers.shading import N_PATCHES, Patches, covered, occlude, sentences_of
 from perilune_train.report.content import FramePicture, Mark

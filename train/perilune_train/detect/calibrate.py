@@ -15,8 +15,8 @@ from perilune_train.detect.data.split import load_split
 from perilune_train.detect.finished_run import raw_threshold
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.novelty import write_training_features
-from perilune_train.detect.train.familiar import training_features
 from perilune_train.detect.train.threshold import calibration_entries, detect_validation
+from perilune_train.detect.train.training_features import training_features
 from perilune_train.records.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.records.provenance import read_provenance, split_terrain
 from perilune_train.training import runs

@@ -12,12 +12,13 @@ from perilune_train.landing.craters.projection import Pose, projected
 from perilune_train.landing.craters.sightings import Sightings
 from perilune_train.landing.filter.state import common_pattern
 from perilune_train.landing.methods.detector_errors import (
+    N_CLASSES,
     DetectorErrors,
+    deviation_table,
     drawn_sightings,
     matches_of,
     measured_errors,
 )
-from perilune_train.landing.methods.deviations import N_CLASSES, deviation_table
 from perilune_train.landing.methods.seen import SeenDescent
 from perilune_train.landing.monte_carlo.draw import _with_false
 

@@ -36,9 +36,9 @@ from perilune_train.detect.inference.scales import detect_split, multiply_adds_o
 from perilune_train.detect.novelty import TrainingFeatures, write_training_features
 from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.train.distill import Teacher
-from perilune_train.detect.train.familiar import training_features
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.threshold import calibration_entries, detect_validation
+from perilune_train.detect.train.training_features import training_features
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 from perilune_train.records.marks import mark_files

@@ -20,8 +20,7 @@ from perilune_train.landing.methods.absolute import (
     catalogues_of,
     on_the_same_frames,
 )
-from perilune_train.landing.methods.detector_errors import matches_of
-from perilune_train.landing.methods.deviations import deviation_table
+from perilune_train.landing.methods.detector_errors import deviation_table, matches_of
 from perilune_train.landing.methods.page import deviations_section, page_of, same_frames_section
 from perilune_train.landing.methods.pictures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.landing.methods.seen import SeenDescent, seen_descents

@@ -1,7 +1,9 @@
 """Compute the answers on single detections of the viewer: occlusion, changed frames, and the effect on the position."""
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +32,6 @@ from perilune_train.landing.craters.catalogue import (
 from perilune_train.landing.craters.projection import Pose
 from perilune_train.landing.fly.detections import flight_config
 from perilune_train.landing.fly.run import sightings_of
-from perilune_train.report.answers.choice import Place, chosen_detections
 from perilune_train.report.answers.position import SeenFrame, sentences_on_position
 from perilune_train.report.answers.shading import (
     MIN_DECREASE,
@@ -41,12 +42,15 @@ from perilune_train.report.answers.shading import (
     score_at,
     sentences_of,
 )
-from perilune_train.report.content import Answer, AnswerPicture, Answers, Viewer
+from perilune_train.report.content import Answer, AnswerPicture, Answers, FramePicture, Viewer
 from perilune_train.report.frames import LabelledFrames, picture_uri
 from perilune_train.report.sources import AnswerInputs, provenance_of_dataset
 from perilune_train.training.runs import RunFolder
 
 Image8 = NDArray[np.uint8]
+_GOLDEN = (np.sqrt(5) - 1) / 2
+Place = tuple[int, int]
+"""Index of a frame in the viewer, and index of a detection in this frame."""
 _LOWERS, _RAISES = (230, 159, 0), (86, 180, 233)
 """Colours of patches that lower and that raise the score when they are covered."""
 _MAX_OPACITY = 190
@@ -309,3 +313,36 @@ def _ground(image: Image8, box: NDArray[np.float64], patches: Patches, caption: 
     shares = np.array([box[0] - x0_px, box[1] - y0_px, *(box[2:] - box[:2])]) / side_px
     x, y, width, height = (round(float(share), 4) for share in shares)
     return AnswerPicture(caption, picture_uri(picture), (x, y, width, height))
+
+
+def chosen_detections(
+    frames: Sequence[FramePicture], craters: Sequence[Sequence[int | None]], changed: Collection[int], count: int
+) -> list[Place]:
+    """At most `count` detections: in turn a changed crater, a false positive, and a correct detection.
+
+    `craters` has the crater_id of each detection's label by frame, None without a label; `changed` has the craters that
+    counterfactual frames change. Craters that were not chosen before come first. Of each frame, the false positive with
+    the highest score and the correct detection with the lowest score are considered. Consecutive choices are from
+    frames that are far apart.
+    """
+    # Multiples of the golden ratio spread any number of first frames evenly over the descent.
+    order = np.argsort(np.arange(len(frames)) * _GOLDEN % 1, kind="stable").tolist()
+    of_changed: list[tuple[int, Place]] = []
+    false: list[Place] = []
+    correct: list[Place] = []
+    seen: Counter[int] = Counter()
+    for frame in order:
+        detections = frames[frame].detections
+        for k, crater in enumerate(craters[frame]):
+            if crater is not None and crater in changed:
+                of_changed.append((seen[crater], (frame, k)))
+                seen[crater] += 1
+        wrong = [k for k, mark in enumerate(detections) if mark.kind == "false"]
+        right = [k for k, mark in enumerate(detections) if mark.kind == "matched"]
+        # Detections are sorted by score.
+        false += [(frame, wrong[0])] if wrong else []
+        correct += [(frame, right[-1])] if right else []
+    of_changed.sort(key=lambda ranked: ranked[0])
+    queues = ([place for _, place in of_changed], false, correct)
+    in_turn = [place for group in zip_longest(*queues) for place in group if place is not None]
+    return list(dict.fromkeys(in_turn))[:count]
