@@ -72,6 +72,17 @@ class _Shots(NamedTuple):
     """State of each frame's random stream (`draws.state_of`) (N, 4) uint64."""
 
 
+class _Part(NamedTuple):
+    """The part of the frames to render."""
+
+    first_row: int
+    """First row."""
+    n_rows: int
+    """Number of rows."""
+    n_samples: int
+    """Samples of each pixel."""
+
+
 class _Images(NamedTuple):
     """Rendered frames on the device, as arguments of the kernel; see `FrameBatch`."""
 
@@ -106,17 +117,18 @@ class FrameBatch:
 
 
 @cuda.jit
-def _render(ground, rocks, horizon, light, shots, images, first_row, n_rows, n_samples):
+def _render(ground, rocks, horizon, light, shots, images, part):
     """Render one pixel of one frame in each thread: x and y of the grid are column and row, z is the frame."""
     column, row, frame = cuda.grid(3)
     frames, height, width = images.radiance_factor.shape
-    if column >= width or row >= n_rows or frame >= frames:
+    if column >= width or row >= part.n_rows or frame >= frames:
         return
-    row += first_row
+    row += part.first_row
     state, view = (
         shots.state[frame],
         View(shots.origin[frame], shots.basis[frame], light.far_m, light.sun, light.plane, horizon),
     )
+    n_samples = part.n_samples
     block, total = Block(np.inf, -1), np.float32(0)
     for s in range(n_samples):
         # As `HeightfieldEngine._drawn`: the first half of the stream moves the samples, the second is for the disc.
@@ -224,18 +236,10 @@ class CudaEngine(HeightfieldEngine):
         shots = _Shots(*map(_sent, (origins, rays_of(self.camera) @ rotations, states)))
         if self._horizon_sent is None or self._horizon_sent[0] is not horizon:
             self._horizon_sent = horizon, _on_device(horizon)
-        n_rows = rows.stop - rows.start
-        blocks = math.ceil(self.camera.width_px / _BLOCK_PX), math.ceil(n_rows / _BLOCK_PX), len(positions)
+        part = _Part(rows.start, rows.stop - rows.start, self._samples)
+        blocks = math.ceil(self.camera.width_px / _BLOCK_PX), math.ceil(part.n_rows / _BLOCK_PX), len(positions)
         _render[blocks, (_BLOCK_PX, _BLOCK_PX, 1)](
-            self._ground,
-            self._rocks,
-            self._horizon_sent[1],
-            self._light,
-            shots,
-            images,
-            rows.start,
-            n_rows,
-            self._samples,
+            self._ground, self._rocks, self._horizon_sent[1], self._light, shots, images, part
         )
 
     def _check_memory(self, needed: int) -> None:
