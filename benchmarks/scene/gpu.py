@@ -17,11 +17,14 @@ import typer
 from benchmarks.figures import write_figures
 from benchmarks.scene.truth import POSES, pose
 from perilune_render.config.dataset import DatasetConfig
+from perilune_render.engines.frame_source import FrameSource, Shot
 from perilune_render.engines.heightfield.engine import HeightfieldEngine
 from perilune_render.engines.heightfield.gpu import CudaEngine, device_name
+from perilune_render.engines.heightfield.gpu_frames import CudaSource
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import view_of
+from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.config.resolve import resolve
 from perilune_shared.console.command_line import one_command, run_command_line
@@ -70,6 +73,18 @@ def frames_per_second(gpu: CudaEngine, poses: list[tuple[Array, Array]], batch: 
     return count / (time.perf_counter() - started)
 
 
+def labelled_per_second(source: CudaSource, poses: list[tuple[Array, Array]], batch: int, seconds: float) -> float:
+    """Frames per second with sensor and labels; images stay on the device, labels reach the processor."""
+    still = np.zeros(3)
+    shots = [Shot(*poses[k % len(poses)], still, 1, k) for k in range(batch)]
+    source.labels(source.take(shots))
+    started, count = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        source.labels(source.take(shots))
+        count += batch
+    return count / (time.perf_counter() - started)
+
+
 def resized(camera: Camera, side_px: int) -> Camera:
     """The camera with square frames of another size and the same view."""
     scale = side_px / camera.width_px
@@ -97,11 +112,14 @@ def main(
         cpu = HeightfieldEngine(scene, config, camera, sun, 1, surface)
         surface = cpu.surface
         gpu = CudaEngine(scene, config, camera, sun, surface)
+        source = CudaSource(FrameSource.of(gpu, config, camera, RimCircles.of_scene(scene)))
         figures[f"agreement_{side_px}_px"] = agreement(cpu, gpu, poses)
         for batch in map(int, batches.split(",")):
             rate = frames_per_second(gpu, poses, batch, seconds)
+            labelled = labelled_per_second(source, poses, batch, seconds / 2)
             figures["speed"][f"{side_px} px, batches of {batch}"] = {
                 "frames_per_s": rate,
+                "frames_per_s_with_sensor_and_labels": labelled,
                 "million_rays_per_s": rate * side_px**2 * config.render.samples / 1e6,
                 "hours_for_a_million_frames": 1e6 / rate / 3600,
                 "seconds_for_the_frames_of_the_paper": _PAPER_FRAMES / rate,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from perilune.datasets import Dataset as Dataset
     from perilune.datasets import open_dataset as open_dataset
     from perilune_render.scenes import RenderedFrame as RenderedFrame
+    from perilune_render.scenes import RenderedFrames as RenderedFrames
     from perilune_render.scenes import Scene as Scene
     from perilune_shared.geometry.poses import Pose as Pose
     from perilune_shared.geometry.poses import descent as descent
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 _MODULES = {
     "perilune.datasets": ("Dataset", "open_dataset"),
-    "perilune_render.scenes": ("RenderedFrame", "Scene"),
+    "perilune_render.scenes": ("RenderedFrame", "RenderedFrames", "Scene"),
     "perilune_shared.geometry.poses": ("Pose", "descent", "look_at", "look_down"),
     "perilune_train.detect.images.find": ("CraterDetector", "Craters", "load_detector"),
     "perilune_train.landing.fly.from_python": ("fly",),
@@ -57,6 +58,7 @@ __all__ = [
     "MissingPart",
     "Pose",
     "RenderedFrame",
+    "RenderedFrames",
     "Scene",
     "UserError",
     "descent",

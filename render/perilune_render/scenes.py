@@ -19,9 +19,10 @@ from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import view_of
+from perilune_render.labels.frame_labels import Labels
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.provenance.recipe import config_of
-from perilune_render.server.simulation import SimulatedScene, View, open_simulation, simulation_over
+from perilune_render.server.simulation import SimulatedScene, View, open_simulation, shot_of, simulation_over
 from perilune_shared.config.errors import nearest
 from perilune_shared.config.resolve import PRESETS, resolve
 from perilune_shared.dataset.frame import ELLIPSE_COLUMNS
@@ -94,6 +95,63 @@ class RenderedFrame:
         return f"RenderedFrame({width} x {height} px, {self.image.dtype}, {len(self.labels)} labels, {self.pose!r})"
 
 
+class RenderedFrames(Sequence[RenderedFrame]):
+    """The N frames of `Scene.render`, one after the other and as stacked arrays.
+
+    With `dataset.render.device=cuda`, the arrays are in the memory of the device, and an item is copied from it. torch,
+    JAX and NumPy take an array over by DLPack, on the device without a copy:
+
+        frames = scene.render(poses)
+        images = torch.from_dlpack(frames.images)
+    """
+
+    def __init__(self, images: Any, depth_m: Any, labels: Sequence[pd.DataFrame], poses: Sequence[Pose]):
+        """Keep the arrays; the arguments are described at the properties."""
+        self._images, self._depth_m, self._labels, self._poses = images, depth_m, tuple(labels), tuple(poses)
+
+    @property
+    def images(self) -> Any:
+        """Grey values, DN (N, h, w), uint8, or uint16 above 8 bits: a NumPy array, or an array on the device."""
+        return self._images
+
+    @property
+    def depth_m(self) -> Any:
+        """Depths as in `RenderedFrame`, metres (N, h, w) float32: a NumPy array, or an array on the device."""
+        return self._depth_m
+
+    @property
+    def labels(self) -> pd.DataFrame:
+        """Labels of all frames, as in `RenderedFrame`, with the index of the frame in the column `frame`."""
+        tables = [table.assign(frame=index) for index, table in enumerate(self._labels)]
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=["frame"])
+
+    @property
+    def poses(self) -> tuple[Pose, ...]:
+        """Poses of the camera."""
+        return self._poses
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    @overload
+    def __getitem__(self, index: int) -> RenderedFrame: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[RenderedFrame]: ...
+    def __getitem__(self, index: int | slice) -> RenderedFrame | list[RenderedFrame]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        k = range(len(self))[index]
+        return RenderedFrame(_host(self._images, k), _host(self._depth_m, k), self._labels[k], self._poses[k])
+
+    def __repr__(self) -> str:
+        return f"RenderedFrames({len(self)} frames of {self.images.shape[2]} x {self.images.shape[1]} px)"
+
+
+def _host(images: Any, k: int) -> np.ndarray:
+    """Image k in the memory of the processor."""
+    return images[k] if isinstance(images, np.ndarray) else images.to_host(k)
+
+
 class Scene:
     """Lunar ground with craters, a Sun and a camera; renders labelled frames from given poses.
 
@@ -163,27 +221,49 @@ class Scene:
     @overload
     def render(self, poses: Pose) -> RenderedFrame: ...
     @overload
-    def render(self, poses: Sequence[Pose]) -> list[RenderedFrame]: ...
-    def render(self, poses: Pose | Sequence[Pose]) -> RenderedFrame | list[RenderedFrame]:
-        """Render and label the frame of a pose, or the list of frames of several poses.
+    def render(self, poses: Sequence[Pose]) -> RenderedFrames: ...
+    def render(self, poses: Pose | Sequence[Pose]) -> RenderedFrame | RenderedFrames:
+        """Render and label the frame of a pose, or the frames of several poses.
 
-        The index of a pose in the list determines the noise of its frame; a single pose has index 0. Raises UserError
-        for a pose below the ground, or if the camera sees beyond the ground.
+        The index of a pose in the list determines the noise of its frame; a single pose has index 0. On a CUDA device,
+        the frames of a list are rendered together and stay there, and the noise differs from the processor's. Raises
+        UserError for a pose below the ground, or if the camera sees beyond the ground.
         """
-        frames = [self._render(pose, index) for index, pose in enumerate(listed(poses))]
+        several = listed(poses)
+        if not several:
+            return RenderedFrames(np.empty((0, 0, 0), np.uint8), np.empty((0, 0, 0), np.float32), (), ())
+        frames = self._render(several)
         return frames[0] if isinstance(poses, Pose) else frames
 
-    def _render(self, pose: Pose, index: int) -> RenderedFrame:
+    def _render(self, poses: Sequence[Pose]) -> RenderedFrames:
         simulated, stated = self._simulated, self.config.scene or SceneConfig()
         sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
-        view = View(pose.position_m, pose.rotation_camera_from_site, self.camera, sun)
-        frame = simulated.frame(view, trajectory_seed(simulated.scene.seed, 0), index, pose.velocity_mps)
-        labels = simulated.labels(view, frame)
+        views = [View(pose.position_m, pose.rotation_camera_from_site, self.camera, sun) for pose in poses]
+        seed = trajectory_seed(simulated.scene.seed, 0)
+        shots = [
+            shot_of(view, seed, index, pose.velocity_mps)
+            for index, (view, pose) in enumerate(zip(views, poses, strict=True))
+        ]
+        batch = simulated.on_device(views, shots)
+        if batch is not None:
+            frames, labels = batch
+            return RenderedFrames(frames.images, frames.rendering.depth_m, list(map(self._rows, labels)), poses)
+        images, depths, rows = [], [], []
+        for view, shot in zip(views, shots, strict=True):
+            frame = simulated.take(view, shot)
+            images.append(frame.image)
+            depths.append(frame.radiance.depth_m)
+            rows.append(self._rows(simulated.labels(view, frame)))
+        return RenderedFrames(np.stack(images), np.stack(depths), rows, poses)
+
+    def _rows(self, labels: Labels) -> pd.DataFrame:
+        """The table `RenderedFrame.labels`."""
+        scene = self._simulated.scene
         rows = label_table("frame", labels).to_pandas().drop(columns="frame_id")
-        rim = np.searchsorted(simulated.scene.crater_id, labels.crater_id)
-        rows["depth_m"] = simulated.scene.rims.depth_m[rim]
-        rows["diameter_m"] = simulated.scene.craters.diameter_m[rim]
-        return RenderedFrame(frame.image, frame.radiance.depth_m, rows, pose)
+        rim = np.searchsorted(scene.crater_id, labels.crater_id)
+        rows["depth_m"] = scene.rims.depth_m[rim]
+        rows["diameter_m"] = scene.craters.diameter_m[rim]
+        return rows
 
     def close(self) -> None:
         """Release the engine. It is also released at the end of the program."""

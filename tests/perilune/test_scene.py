@@ -44,7 +44,12 @@ def test_frames_of_a_list_are_those_of_their_poses(scene):
     assert [frame.pose for frame in frames] == poses
     np.testing.assert_array_equal(scene.render(poses[0]).image, frames[0].image)
     np.testing.assert_array_equal(scene.render(poses)[2].image, frames[2].image)
-    assert scene.render([]) == []
+    assert len(scene.render([])) == 0
+    # The same frames as stacked arrays and one table.
+    np.testing.assert_array_equal(frames.images, np.stack([frame.image for frame in frames]))
+    np.testing.assert_array_equal(np.from_dlpack(frames.depth_m)[1], frames[1].depth_m)
+    assert [len(part) for _, part in frames.labels.groupby("frame")] == [len(frame.labels) for frame in frames]
+    assert "3 frames of 64 x 64 px" in repr(frames)
 
 
 def test_a_scene_is_determined_by_its_seed_and_settings(scene):

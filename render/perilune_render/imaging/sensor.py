@@ -27,9 +27,9 @@ from perilune_shared.geometry.frames import Array
 
 _STRETCH = 1.5
 """Approximate upper bound on the factor by which distortion stretches motion at the image edges."""
-_MIN_MOTION_PX = 0.05
+MIN_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
-_FAINT_E = 100.0
+FAINT_E = 100.0
 """Signal above which a rounded Gaussian approximates Poisson noise, electrons. It takes a tenth of the time."""
 HOT_PIXEL_S = 0.002
 """Exposure time to which `hot_pixel_e` refers, seconds; the signal is proportional to the exposure time."""
@@ -89,7 +89,7 @@ def expose(
     move_m = np.asarray(velocity_camera_mps) * exposure_s
     turn_rad = np.zeros(3) if angular_velocity_radps is None else angular_velocity_radps * exposure_s
     fastest_px = _fastest_px(radiance.depth_m, camera, exr_camera, move_m, turn_rad)
-    if config.motion_blur and fastest_px >= _MIN_MOTION_PX:
+    if config.motion_blur and fastest_px >= MIN_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
         light = _blurred(light, motion_px(depth_m, camera, move_m, turn_rad))
     return Exposure(light, exposure_s)
@@ -135,7 +135,7 @@ def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rn
     electrons += pattern.hot_e * np.float32(exposure.time_s / HOT_PIXEL_S)
     normal = rng.standard_normal(electrons.shape, np.float32)
     noisy = electrons + np.sqrt(electrons + np.float32(config.read_noise_e**2)) * normal
-    faint = electrons < _FAINT_E
+    faint = electrons < FAINT_E
     noisy[faint] = rng.poisson(electrons[faint]) + config.read_noise_e * normal[faint]
     noisy += pattern.offset_e
     largest = 2**config.bits - 1
@@ -179,7 +179,11 @@ def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
     """
     if config.exposure == "fixed":
         return config.exposure_time_s
-    bright = float(np.percentile(light, config.exposure_percentile))
+    return exposure_time_of(float(np.percentile(light, config.exposure_percentile)), config)
+
+
+def exposure_time_of(bright: float, config: SensorConfig) -> float:
+    """Automatic exposure time, seconds, for the radiance factor at the percentile `exposure_percentile`."""
     share = min((config.exposure_level - config.black_level_share) / config.gain, config.exposure_level)
     rate = config.responsivity_e_per_s * bright + config.dark_current_e_per_s
     return min(share * config.full_well_e / max(rate, 1e-30), config.longest_exposure_s)
@@ -233,13 +237,21 @@ def _rays(camera: Camera) -> np.ndarray:
 def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """The mean of an image over an exposure during which its content moves by `motion` (h, w, 2), pixels."""
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
-    if longest < _MIN_MOTION_PX:
+    if longest < MIN_MOTION_PX:
         return light
-    # Gauss-Legendre nodes: two are enough for the correct width of a short blur.
-    times, weights = np.polynomial.legendre.leggauss(int(min(2 * longest, 126)) + 2)
+    times, weights = blur_nodes(longest)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
     mean = np.zeros_like(light)
-    for time, weight in zip(times / 2, weights / 2, strict=True):
+    for time, weight in zip(times, weights, strict=True):
         source_px = column - np.float32(time) * motion[..., 0], row - np.float32(time) * motion[..., 1]
         mean += np.float32(weight) * cv2.remap(light, *source_px, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     return np.maximum(mean, 0)
+
+
+def blur_nodes(longest_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times, in exposures from the middle, and weights (n,) of the images that make a blur of this length.
+
+    They are Gauss-Legendre nodes. Two are enough for the correct width of a short blur.
+    """
+    times, weights = np.polynomial.legendre.leggauss(int(min(2 * longest_px, 126)) + 2)
+    return times / 2, weights / 2

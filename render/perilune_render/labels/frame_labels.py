@@ -116,6 +116,21 @@ def label_frame(
     the depth in `radiance`, which has the pixels of `camera` (`perilune_render.imaging.resampling.seen_by`). The
     contrast also depends on the sensor, so it is NaN until `with_contrast` adds it.
     """
+    pose = position_m, rotation_camera_from_site
+    labels = centred_labels(circles, camera, *pose, radii_px)
+    rows = np.searchsorted(circles.crater_id, labels.crater_id)
+    visible = _visible_fraction(circles, camera, *pose, radiance.depth_m, rows)
+    return replace(labels, visible_fraction=visible, sunlit_fraction=sunlit_fractions(labels.ellipses, radiance.sunlit))
+
+
+def centred_labels(
+    circles: RimCircles,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    radii_px: tuple[float, float],
+) -> Labels:
+    """The labels of `label_frame`, with NaN for everything that is read from the pixels of a rendering."""
     pose, (min_radius_px, max_radius_px) = (position_m, rotation_camera_from_site), radii_px
     if any(camera.distortion):
         in_camera = _in_camera(circles.centre_m, *pose)
@@ -141,10 +156,9 @@ def label_frame(
         ellipses.b_px[in_range],
         ellipses.theta_rad[in_range],
     )
-    visible = _visible_fraction(circles, camera, position_m, rotation_camera_from_site, radiance.depth_m, rows)
-    lit = sunlit_fractions(ellipses, radiance.sunlit)
+    unknown = np.full(len(rows), np.nan)
     n_above = int((radius > max_radius_px).sum())
-    return Labels(circles.crater_id[rows], ellipses, visible, lit, np.full(len(rows), np.nan), n_above)
+    return Labels(circles.crater_id[rows], ellipses, unknown, unknown, unknown, n_above)
 
 
 def _in_camera(points_m: Array, position_m: Array, rotation_camera_from_site: Array) -> Array:
@@ -169,7 +183,7 @@ def with_contrast(
     """The labels with their contrast in the image of `camera` (`labels.pixels.contrasts`)."""
     rows = np.searchsorted(circles.crater_id, labels.crater_id)
     centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
-    matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, image.sun, rows)
+    matrices = image_from_rim(circles, camera, position_m, rotation_camera_from_site, image.sun, rows)
     return replace(labels, contrast=contrasts(centre, matrices, image.grey, image.noise))
 
 
@@ -181,10 +195,10 @@ def shading_axes(
     The offsets are in radii, along and across the direction of the Sun.
     """
     rows = np.searchsorted(circles.crater_id, crater_id)
-    return _image_from_rim(circles, camera, position_m, rotation, sun, rows)
+    return image_from_rim(circles, camera, position_m, rotation, sun, rows)
 
 
-def _image_from_rim(
+def image_from_rim(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
 ) -> Array:
     """Matrices (N, 2, 2) that map offsets in each rim's plane to pixels.
@@ -201,6 +215,11 @@ def _image_from_rim(
     return np.swapaxes(ends[0] - ends[1], 1, 2) / 2
 
 
+def rims_of(circles: RimCircles, rows: np.ndarray) -> Rims:
+    """The points of these rims at which visibility is tested."""
+    return Rims(circles.centre_m[rows], *plane_basis(circles.normal[rows]), circles.radius_m[rows], *_RIM)
+
+
 def _visible_fraction(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, depth_m: np.ndarray, rows: np.ndarray
 ) -> Array:
@@ -214,8 +233,7 @@ def _visible_fraction(
         return np.empty(0)
     radii = circles.radius_m[rows]
     if not any(camera.distortion):
-        rims = Rims(circles.centre_m[rows], *plane_basis(circles.normal[rows]), radii, *_RIM)
-        return rim_shares(rims, camera, position_m, rotation, depth_m)
+        return rim_shares(rims_of(circles, rows), camera, position_m, rotation, depth_m)
     points_m = rim_points(circles.centre_m[rows], circles.normal[rows], radii, _N_RIM)
     points = camera_from_site(points_m, position_m, rotation)
     pixels = camera.project(points)

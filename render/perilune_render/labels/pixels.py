@@ -1,5 +1,6 @@
 """Compiled loops over craters and pixels: selection, visible share, sunlit share, contrast, index."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
 
 REACH = 1.5
 """Radius of the disc in which contrast is measured, in radii of the rim."""
-_N_FITTED = 4
+N_FITTED = 4
+"""Number of fitted values of a crater's shading."""
 _SLACK = 0.99
 """Factor on the smallest radius in `centred_in`, since rounding differs in the ellipses that are computed later."""
 
@@ -28,7 +30,7 @@ class Circles(NamedTuple):
     """Radii, metres (N,)."""
 
 
-class _Pinhole(NamedTuple):
+class Pinhole(NamedTuple):
     """A camera without distortion, as an argument of compiled functions; all values in pixels."""
 
     fx: float
@@ -39,8 +41,8 @@ class _Pinhole(NamedTuple):
     height: int
 
 
-def _pinhole(camera: Camera) -> _Pinhole:
-    return _Pinhole(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px)
+def pinhole_of(camera: Camera) -> Pinhole:
+    return Pinhole(camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px)
 
 
 def centred_in(
@@ -56,7 +58,7 @@ def centred_in(
     loop computes them, since a scene has far more craters than an image shows.
     """
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
-    return _centred_in(circles, *pose, _pinhole(camera), least_px)
+    return _centred_in(circles, *pose, pinhole_of(camera), least_px)
 
 
 @njit(error_model="numpy")
@@ -80,6 +82,12 @@ def _centred_in(circles, position, rotation, pinhole, least):
                     rows[count], in_camera[count, 0], in_camera[count, 1], in_camera[count, 2] = k, x, y, z
                     count += 1
     return rows[:count].copy(), in_camera[:count].copy()
+
+
+@njit()
+def floored(x):
+    """The largest integer up to x. On a CUDA device, `math.floor` returns a float, and there is no `np.floor`."""
+    return int(math.floor(x))  # noqa: RUF046
 
 
 class Rims(NamedTuple):
@@ -111,33 +119,40 @@ def rim_shares(
     result of `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside` to the bit.
     """
     pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
-    return _rim_shares(rims, *pose, _pinhole(camera), depth)
+    return _rim_shares(rims, *pose, pinhole_of(camera), depth)
 
 
 @njit()
 def _rim_shares(rims, position, rotation, pinhole, depth):
-    fx, fy, cx, cy, width, height = pinhole
     shares = np.empty(len(rims.radius_m))
     for k in range(len(shares)):
-        centre, p, q, radius = rims.centre_m[k], rims.p[k], rims.q[k], rims.radius_m[k]
-        slack, shown = 0.0, 0
-        for m in range(len(rims.cos)):
-            cos, sin = rims.cos[m], rims.sin[m]
-            dx = centre[0] + radius * (cos * p[0] + sin * q[0]) - position[0]
-            dy = centre[1] + radius * (cos * p[1] + sin * q[1]) - position[1]
-            dz = centre[2] + radius * (cos * p[2] + sin * q[2]) - position[2]
-            z = dx * rotation[2, 0] + dy * rotation[2, 1] + dz * rotation[2, 2]
-            if m == 0:
-                slack = max(SLACK_RADII * radius, SLACK_PX * z / fx)
-            if z > 0:
-                x = dx * rotation[0, 0] + dy * rotation[0, 1] + dz * rotation[0, 2]
-                y = dx * rotation[1, 0] + dy * rotation[1, 1] + dz * rotation[1, 2]
-                u, v = fx * (x / z) + cx, fy * (y / z) + cy
-                if 0 <= u < width and 0 <= v < height:
-                    ground_z = depth[int(v), int(u)]
-                    shown += np.isfinite(ground_z) and z <= ground_z + slack
-        shares[k] = shown / len(rims.cos)
+        shares[k] = rim_share(rims, k, position, rotation, pinhole, depth)
     return shares
+
+
+@njit()
+def rim_share(rims, k, position, rotation, pinhole, depth):
+    """Share of the points of rim k, as `rim_shares`."""
+    fx, fy, cx, cy, width, height = pinhole
+    centre, p, q, radius = rims.centre_m[k], rims.p[k], rims.q[k], rims.radius_m[k]
+    slack, shown = 0.0, 0
+    for m in range(len(rims.cos)):
+        cos, sin = rims.cos[m], rims.sin[m]
+        dx = centre[0] + radius * (cos * p[0] + sin * q[0]) - position[0]
+        dy = centre[1] + radius * (cos * p[1] + sin * q[1]) - position[1]
+        dz = centre[2] + radius * (cos * p[2] + sin * q[2]) - position[2]
+        z = dx * rotation[2, 0] + dy * rotation[2, 1] + dz * rotation[2, 2]
+        if m == 0:
+            slack = max(SLACK_RADII * radius, SLACK_PX * z / fx)
+        if z > 0:
+            x = dx * rotation[0, 0] + dy * rotation[0, 1] + dz * rotation[0, 2]
+            y = dx * rotation[1, 0] + dy * rotation[1, 1] + dz * rotation[1, 2]
+            u, v = fx * (x / z) + cx, fy * (y / z) + cy
+            if 0 <= u < width and 0 <= v < height:
+                ground_z = depth[int(v), int(u)]
+                if math.isfinite(ground_z) and z <= ground_z + slack:
+                    shown += 1
+    return shown / len(rims.cos)
 
 
 def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
@@ -151,21 +166,27 @@ def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
 
 @njit()
 def _lit(shapes, boxes, sunlit):
+    shares = np.zeros(len(boxes))
+    for k in range(len(boxes)):
+        shares[k] = lit_share(shapes, boxes, k, sunlit)
+    return shares
+
+
+@njit()
+def lit_share(shapes, boxes, k, sunlit):
+    """Share of the pixels of ellipse k, as `sunlit_fractions`."""
     (cx, cy, a, b, theta), (height, width) = shapes, sunlit.shape
-    share = np.zeros(len(cx))
-    for k in range(len(cx)):
-        cos, sin = np.cos(theta[k]), np.sin(theta[k])
-        inside = lit = 0
-        for row in range(max(int(np.floor(boxes[k, 1])), 0), min(int(np.ceil(boxes[k, 3])), height)):
-            dy = row + 0.5 - cy[k]
-            for column in range(max(int(np.floor(boxes[k, 0])), 0), min(int(np.ceil(boxes[k, 2])), width)):
-                dx = column + 0.5 - cx[k]
-                if ((dx * cos + dy * sin) / a[k]) ** 2 + ((dy * cos - dx * sin) / b[k]) ** 2 <= 1:
-                    inside += 1
-                    lit += sunlit[row, column]
-        if inside > 0:
-            share[k] = lit / inside
-    return share
+    cos, sin = math.cos(theta[k]), math.sin(theta[k])
+    inside = lit = 0
+    for row in range(max(floored(boxes[k, 1]), 0), min(-floored(-boxes[k, 3]), height)):
+        dy = row + 0.5 - cy[k]
+        for column in range(max(floored(boxes[k, 0]), 0), min(-floored(-boxes[k, 2]), width)):
+            dx = column + 0.5 - cx[k]
+            if ((dx * cos + dy * sin) / a[k]) ** 2 + ((dy * cos - dx * sin) / b[k]) ** 2 <= 1:
+                inside += 1
+                if sunlit[row, column]:
+                    lit += 1
+    return lit / inside if inside > 0 else 0.0
 
 
 def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: np.ndarray) -> Array:
@@ -187,43 +208,53 @@ def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: 
 
 @njit()
 def _shading(centre, matrices, grey, noise):
-    height, width = grey.shape
     result = np.zeros(len(centre))
-    values = np.empty(_N_FITTED)
+    scratch = np.empty(N_FITTED), np.empty(N_FITTED), np.empty((N_FITTED, N_FITTED))
     for k in range(len(centre)):
-        m00, m01, m10, m11 = matrices[k, 0, 0], matrices[k, 0, 1], matrices[k, 1, 0], matrices[k, 1, 1]
-        determinant = m00 * m11 - m01 * m10
-        if not np.isfinite(determinant) or determinant == 0:
-            continue
-        x, y = centre[k, 0], centre[k, 1]
-        half_w, half_h = REACH * np.hypot(m00, m01), REACH * np.hypot(m10, m11)
-        first, last = max(int(np.floor(x - half_w)), 0), min(int(np.ceil(x + half_w)), width)
-        normal, right = np.zeros((_N_FITTED, _N_FITTED)), np.zeros(_N_FITTED)
-        squares = variance = 0.0
-        count = 0
-        level = grey[min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)]
-        for row in range(max(int(np.floor(y - half_h)), 0), min(int(np.ceil(y + half_h)), height)):
-            dy = row + 0.5 - y
-            for column in range(first, last):
-                dx = column + 0.5 - x
-                s, t = (m11 * dx - m01 * dy) / determinant, (m00 * dy - m10 * dx) / determinant
-                square = s * s + t * t
-                if square > REACH * REACH:
-                    continue
-                values[0], values[1], values[2] = 1.0, s, t
-                values[3] = -s * np.exp(-((square / 0.64) ** 2))
-                value = grey[row, column] - level
-                for i in range(_N_FITTED):
-                    right[i] += values[i] * value
-                    for j in range(i + 1):
-                        normal[i, j] += values[i] * values[j]
-                squares += value * value
-                variance += noise[row, column] ** 2
-                count += 1
-        if count <= _N_FITTED:
-            continue
-        result[k] = _last_over_its_error(normal, right, squares, variance / count, count)
+        result[k] = shading(centre, matrices, k, grey, noise, scratch)
     return result
+
+
+@njit()
+def shading(centre, matrices, k, grey, noise, scratch):
+    """Contrast of crater k, as `contrasts`; `scratch` has two vectors and a matrix of N_FITTED numbers."""
+    height, width = grey.shape
+    values, right, normal = scratch
+    m00, m01, m10, m11 = matrices[k, 0, 0], matrices[k, 0, 1], matrices[k, 1, 0], matrices[k, 1, 1]
+    determinant = m00 * m11 - m01 * m10
+    if not math.isfinite(determinant) or determinant == 0:
+        return 0.0
+    x, y = centre[k, 0], centre[k, 1]
+    half_w, half_h = REACH * math.hypot(m00, m01), REACH * math.hypot(m10, m11)
+    first, last = max(floored(x - half_w), 0), min(-floored(-(x + half_w)), width)
+    for i in range(N_FITTED):
+        right[i] = 0.0
+        for j in range(N_FITTED):
+            normal[i, j] = 0.0
+    squares = variance = 0.0
+    count = 0
+    level = grey[min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)]
+    for row in range(max(floored(y - half_h), 0), min(-floored(-(y + half_h)), height)):
+        dy = row + 0.5 - y
+        for column in range(first, last):
+            dx = column + 0.5 - x
+            s, t = (m11 * dx - m01 * dy) / determinant, (m00 * dy - m10 * dx) / determinant
+            square = s * s + t * t
+            if square > REACH * REACH:
+                continue
+            values[0], values[1], values[2] = 1.0, s, t
+            values[3] = -s * math.exp(-((square / 0.64) ** 2))
+            value = grey[row, column] - level
+            for i in range(N_FITTED):
+                right[i] += values[i] * value
+                for j in range(i + 1):
+                    normal[i, j] += values[i] * values[j]
+            squares += value * value
+            variance += noise[row, column] ** 2
+            count += 1
+    if count <= N_FITTED:
+        return 0.0
+    return _last_over_its_error(normal, right, squares, variance / count, count)
 
 
 @njit()
@@ -232,7 +263,7 @@ def _last_over_its_error(normal, right, squares, variance, count):
 
     Only the lower triangle of `normal` is read.
     """
-    for i in range(_N_FITTED):
+    for i in range(N_FITTED):
         for j in range(i + 1):
             rest = normal[i, j]
             for m in range(j):
@@ -240,7 +271,7 @@ def _last_over_its_error(normal, right, squares, variance, count):
             if i > j:
                 normal[i, j] = rest / normal[j, j]
             elif rest > 1e-9 * normal[i, i]:
-                normal[i, i] = np.sqrt(rest)
+                normal[i, i] = math.sqrt(rest)
             else:
                 return 0.0
         for m in range(i):
@@ -248,7 +279,7 @@ def _last_over_its_error(normal, right, squares, variance, count):
         right[i] /= normal[i, i]
         squares -= right[i] ** 2
     # The last unknown is right / d and its variance is 1 / d^2, with d the last diagonal element of L.
-    return right[-1] / np.sqrt(variance + max(squares, 0.0) / (count - _N_FITTED))
+    return right[N_FITTED - 1] / math.sqrt(variance + max(squares, 0.0) / (count - N_FITTED))
 
 
 def smallest_crater(
@@ -262,7 +293,7 @@ def smallest_crater(
     """
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)
     depth = np.full((1, 1), np.inf) if depth_m is None else depth_m
-    _fill(image, crater_id, circles, boxes_px, _pinhole(camera), depth)
+    _fill(image, crater_id, circles, boxes_px, pinhole_of(camera), depth)
     return image
 
 

@@ -1,9 +1,10 @@
 """A scene that can be rendered from any pose and measured with rays. Only one thread may use it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from perilune_render.flight.view import horizon_envelope, scene_view, view_envel
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.poses.plan import scene_seed
-from perilune_render.provenance.versions import check_installed
+from perilune_render.provenance.versions import check_installed, device_of
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.scene import Scene, check_ground
@@ -29,6 +30,10 @@ from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix, sun_direction
+
+if TYPE_CHECKING:
+    # Without a device, numba's CUDA module is not imported.
+    from perilune_render.engines.heightfield.gpu_frames import DeviceFrames
 
 _MAX_SOURCES = 8
 _PREPARED_AT_M = 500.0
@@ -103,11 +108,31 @@ class SimulatedScene:
 
         Raises UserError like `check_view`, and if a velocity exceeds LARGEST_MPS or LARGEST_RADPS.
         """
+        return self.take(view, shot_of(view, seed, index, velocity_mps, angular_velocity_radps))
+
+    def take(self, view: View, shot: Shot) -> Frame:
+        """Render and develop the shot of a view. Raises UserError like `check_view`."""
         self.check_view(view)
-        velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
-        turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")
-        pose = view.position_m, view.rotation_camera_from_site
-        return self._source(view).take(Shot(*pose, velocity, seed, index, angular_velocity_radps=turn))
+        return self._source(view).take(shot)
+
+    def on_device(self, views: Sequence[View], shots: Sequence[Shot]) -> "tuple[DeviceFrames, list[Labels]] | None":
+        """Render and label a batch of frames in the memory of the CUDA device; all views have one camera and one Sun.
+
+        Returns None if the processor must make the frames (`gpu_frames.CudaSource.fits`). Raises UserError like
+        `check_view`.
+        """
+        if device_of(self.config.render) != "cuda":
+            return None
+        from perilune_render.engines.heightfield.gpu_frames import CudaSource
+
+        source = self._source(views[0])
+        if not CudaSource.fits(source):
+            return None
+        for view in views:
+            self.check_view(view)
+        on_device = CudaSource(source)
+        frames = on_device.take(shots)
+        return frames, on_device.labels(frames)
 
     def labels(self, view: View, frame: Frame) -> Labels:
         """Labels of a frame."""
@@ -155,6 +180,16 @@ class SimulatedScene:
             open_engine(self.scene, self.config, pinhole, view.sun, None if cycles else self.surface)
         )
         return FrameSource.of(engine, self.config, view.camera, self._circles), stack
+
+
+def shot_of(
+    view: View, seed: int, index: int, velocity_mps: Array | None, angular_velocity_radps: Array | None = None
+) -> Shot:
+    """The shot of a view. Raises UserError if a velocity exceeds LARGEST_MPS or LARGEST_RADPS."""
+    velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
+    turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")
+    pose = view.position_m, view.rotation_camera_from_site
+    return Shot(*pose, velocity, seed, index, angular_velocity_radps=turn)
 
 
 def open_simulation(config: DatasetConfig) -> SimulatedScene:

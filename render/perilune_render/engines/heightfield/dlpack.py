@@ -101,9 +101,10 @@ class SharedArray:
         _LENT[ctypes.addressof(managed)] = managed, shape, self.array
         return _new_capsule(ctypes.addressof(managed), _NAME, _destroy)
 
-    def to_host(self) -> np.ndarray:
-        """A copy in the memory of the processor; waits for the device."""
-        return np.array(self.array) if isinstance(self.array, np.ndarray) else self.array.copy_to_host()
+    def to_host(self, index: int | None = None) -> np.ndarray:
+        """A copy of the array, or of its item `index`, in the memory of the processor; waits for the device."""
+        array = self.array if index is None else self.array[index]
+        return np.array(array) if isinstance(array, np.ndarray) else array.copy_to_host()
 
 
 def _number_of_device() -> int:

@@ -7,7 +7,11 @@ then of the upper half.
 
     state = state_of(np.random.default_rng(7))
     uniform_pair(state, np.uint64(3))         # equals default_rng(7).random(8, np.float32)[6:8]
+
+Philox4x64-10 (Salmon et al., 2011, doi 10.1145/2063384.2063405) needs no steps: it computes the output of any counter.
 """
+
+import math
 
 import numpy as np
 
@@ -19,6 +23,13 @@ _ZERO, _ONE = np.uint64(0), np.uint64(1)
 _MULTIPLIER = np.uint64(2549297995355413924), np.uint64(4865540595714422341)
 """The generator's multiplier, upper and lower 64 bits."""
 _ROTATION, _WORD, _SIX_BITS = np.uint64(58), np.uint64(64), np.uint64(63)
+_PHILOX = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
+"""Philox's multipliers."""
+_WEYL = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
+"""Philox's increments of the key."""
+_PHILOX_ROUNDS = 10
+_DROPPED_64, _UNIT_64 = np.uint64(11), 2.0**-53
+"""A float64 uses the upper 53 of 64 bits."""
 _DROPPED, _UNIT = np.uint64(8), np.float32(2.0**-24)
 """A float32 uses the upper 24 of 32 bits."""
 
@@ -73,3 +84,50 @@ def uniform_pair(state, n):
     output = (mixed >> turn) | (mixed << ((_WORD - turn) & _SIX_BITS))
     first, second = (output & _LOW) >> _DROPPED, (output >> _HALF) >> _DROPPED
     return np.float32(first) * _UNIT, np.float32(second) * _UNIT
+
+
+@njit(**INLINED)
+def _wide_product(a, b):
+    """Upper and lower 64 bits of the product of two uint64."""
+    a0, a1, b0, b1 = a & _LOW, a >> _HALF, b & _LOW, b >> _HALF
+    middle = a1 * b0 + ((a0 * b0) >> _HALF)
+    upper = a0 * b1 + (middle & _LOW)
+    return a1 * b1 + (middle >> _HALF) + (upper >> _HALF), a * b
+
+
+@njit(**INLINED)
+def philox(k0, k1, n):
+    """The four uint64 of counter (n, 0, 0, 0) with the key (k0, k1); all are uint64."""
+    first, second, third, fourth = n, _ZERO, _ZERO, _ZERO
+    for _ in range(_PHILOX_ROUNDS):
+        high0, low0 = _wide_product(_PHILOX[0], first)
+        high1, low1 = _wide_product(_PHILOX[1], third)
+        first, second, third, fourth = high1 ^ second ^ k0, low1, high0 ^ fourth ^ k1, low0
+        k0, k1 = k0 + _WEYL[0], k1 + _WEYL[1]
+    return first, second, third, fourth
+
+
+@njit(**INLINED)
+def normal_and_uniform(k0, k1, n):
+    """A standard normal and a uniform number in [0, 1) of counter n, with the key (k0, k1); all uint64.
+
+    The normal number is by Box and Muller, 1958, doi 10.1214/aoms/1177706645.
+    """
+    first, second, third, _ = philox(k0, k1, n)
+    # Above 0, so that the logarithm is finite.
+    radius = math.sqrt(-2.0 * math.log((np.float64(first >> _DROPPED_64) + 1.0) * _UNIT_64))
+    angle = 2.0 * math.pi * np.float64(second >> _DROPPED_64) * _UNIT_64
+    return radius * math.cos(angle), np.float64(third >> _DROPPED_64) * _UNIT_64
+
+
+@njit(**INLINED)
+def poisson(mean, uniform):
+    """The Poisson number at the quantile `uniform`; `mean` is at most 700, where exp(-mean) is still above 0."""
+    share = math.exp(-mean)
+    total, count = share, 0
+    # The sum of the shares can stay below the largest uniform numbers by rounding.
+    while uniform > total and count < 10 * mean + 100:
+        count += 1
+        share *= mean / count
+        total += share
+    return count

@@ -166,8 +166,8 @@ class CudaEngine(HeightfieldEngine):
         self._check_memory(size + self.bytes_of(1))
         self._ground, self._rocks = _on_device(self.surface.ground), _on_device(self.surface.rocks)
         self._light = _Light(
-            _sent(self.sun),
-            _sent(np.stack(plane_basis(self.sun))),
+            sent_to_device(self.sun),
+            sent_to_device(np.stack(plane_basis(self.sun))),
             float(self._far_m),
             self._disc_rad,
             LAW_NUMBERS[self._law],
@@ -226,14 +226,14 @@ class CudaEngine(HeightfieldEngine):
 
     def _empty(self, n_frames: int) -> _Images:
         shape = n_frames, self.camera.height_px, self.camera.width_px
-        factor, depth = _new(shape, np.float32), _new(shape, np.float32)
-        return _Images(factor, depth, _new((*shape, 3), np.float32), _new(shape, np.uint8))
+        factor, depth = empty_on_device(shape, np.float32), empty_on_device(shape, np.float32)
+        return _Images(factor, depth, empty_on_device((*shape, 3), np.float32), empty_on_device(shape, np.uint8))
 
     def _launch(
         self, images: _Images, positions: Array, rotations: Array, states: np.ndarray, horizon: Horizon, rows: slice
     ) -> None:
         origins = positions - [*self.surface.centre_m, 0.0]
-        shots = _Shots(*map(_sent, (origins, rays_of(self.camera) @ rotations, states)))
+        shots = _Shots(*map(sent_to_device, (origins, rays_of(self.camera) @ rotations, states)))
         if self._horizon_sent is None or self._horizon_sent[0] is not horizon:
             self._horizon_sent = horizon, _on_device(horizon)
         part = _Part(rows.start, rows.stop - rows.start, self._samples)
@@ -260,14 +260,14 @@ def device_name() -> str:
 
 def _on_device(arrays: Any) -> Any:
     """The named tuple with its arrays in the memory of the device."""
-    return type(arrays)(*(_sent(part) if isinstance(part, np.ndarray) else part for part in arrays))
+    return type(arrays)(*(sent_to_device(part) if isinstance(part, np.ndarray) else part for part in arrays))
 
 
-def _sent(array: np.ndarray) -> Any:
+def sent_to_device(array: np.ndarray) -> Any:
     """The array in the memory of the device. The simulator's arrays are NumPy's, which compiled functions accept."""
     return array if config.ENABLE_CUDASIM else cuda.to_device(array)
 
 
-def _new(shape: tuple[int, ...], dtype: Any) -> Any:
+def empty_on_device(shape: int | tuple[int, ...], dtype: Any) -> Any:
     """An array in the memory of the device, without values."""
     return np.empty(shape, dtype) if config.ENABLE_CUDASIM else cuda.device_array(shape, dtype)

@@ -20,6 +20,21 @@ SMALL = (
     *QUICK, "--set=dataset.camera.width_px=16", "--set=dataset.camera.height_px=16", "--set=dataset.detect.n_frames=2",
     "--set=dataset.labels.min_radius_px=0.5",
 )  # fmt: skip
+SCENE = """
+import sys
+import numpy as np
+import perilune
+settings = ["dataset.camera.width_px=16", "dataset.camera.height_px=16", "dataset.render.samples=1",
+            "dataset.labels.min_radius_px=0.3", "dataset.terrain.spacing_px=2", "dataset.render.device=auto"]
+with perilune.Scene("mare", seed=3, settings=settings) as scene:
+    poses = perilune.descent(n_frames=2)
+    frames = scene.render(poses)
+    assert type(frames.images).__name__ == "SharedArray"
+    np.savez(
+        sys.argv[1], shared=np.from_dlpack(frames.images), items=np.stack([frame.image for frame in frames]),
+        alone=scene.render(poses[0]).image, frames=frames.labels["frame"],
+    )
+"""
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +72,53 @@ def test_rolling_shutter_and_parts_agree(rendered):
 def test_a_batch_is_handed_over_without_a_copy_of_other_values(rendered):
     assert rendered["dlpack"].shape == (len(SEEDS), 16, 16)
     np.testing.assert_array_equal(rendered["dlpack"], rendered["batch"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rests", "moves"])
+def test_the_sensor_on_the_device_agrees_with_the_processor(rendered, name):
+    np.testing.assert_allclose(rendered[f"{name}.time.gpu"], rendered[f"{name}.time.cpu"], rtol=1e-5)
+    cpu, gpu = (rendered[f"{name}.light.{device}"] for device in ("cpu", "gpu"))
+    # OpenCV rounds the places of a motion blur to 1/32 px.
+    np.testing.assert_allclose(gpu, cpu, atol=(0.01 if name == "moves" else 1e-6) * np.ptp(cpu))
+    # Noise has other values and the same distribution. Single frames also have the fixed pattern.
+    images, mean, noise = (rendered[f"{name}.{part}"] for part in ("images.gpu", "mean", "noise"))
+    assert images.dtype == (np.uint8 if name == "rests" else np.uint16)
+    inside = (mean > 4 * noise) & (mean + 4 * noise < (255 if name == "rests" else 4095))
+    deviations = (images - mean)[inside] / noise[inside]
+    assert len(deviations) > 300
+    assert abs(deviations.mean()) < 4 / np.sqrt(len(deviations)) and 0.9 < deviations.std() < 1.1
+    np.testing.assert_array_equal(rendered[f"{name}.alone"], images[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rests", "moves"])
+def test_labels_on_the_device_are_those_of_the_processor(rendered, name):
+    prefix = f"{name}.labels.gpu."
+    columns = [key.removeprefix(prefix) for key in rendered.files if key.startswith(prefix)]
+    assert {"visible_fraction", "sunlit_fraction", "contrast"} <= set(columns)
+    for column in columns:
+        cpu, gpu = (rendered[f"{name}.labels.{device}.{column}"] for device in ("cpu", "gpu"))
+        assert len(cpu) > 20
+        if column == "contrast":
+            # Contrast reads the image, which differs as stated above.
+            np.testing.assert_allclose(gpu, cpu, rtol=1e-3, atol=0.02 if name == "moves" else 1e-4)
+        else:
+            np.testing.assert_array_equal(gpu, cpu)
+
+
+@pytest.mark.slow
+def test_frames_of_a_scene_stay_on_the_device(tmp_path):
+    path = tmp_path / "frames.npz"
+    done = subprocess.run(
+        [sys.executable, "-c", SCENE, str(path)], env=SIMULATED, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = np.load(path)
+    np.testing.assert_array_equal(found["shared"], found["items"])
+    np.testing.assert_array_equal(found["alone"], found["items"][0])
+    assert found["shared"].shape == (2, 16, 16) and found["shared"].std() > 1
+    assert set(found["frames"]) == {0, 1}
 
 
 @pytest.mark.slow
