@@ -71,7 +71,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.labels.pixels", "N_FITTED", {"imaging"}),
         ("perilune_render.labels.frame_labels", "_N_RIM", {"imaging"}),
         ("perilune_shared.labels.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
-        ("perilune_shared.geometry.ellipse", "N_FITTED", {"imaging"}),
+        ("perilune_shared.geometry.ellipse", "_N_FITTED", {"imaging"}),
         ("perilune_shared.geometry.camera", "_MAX_UNDISTORTION_ERROR", set(ROOTS)),
         ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "renderer", "rays", "imaging", "outputs"}),
     ],
