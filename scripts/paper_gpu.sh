@@ -6,28 +6,19 @@
 #   MINUTES=8 OUT=out scripts/paper_gpu.sh     run the experiment
 #
 # PRESET=tiny: a trial run, which also works without a GPU. CALIBRATE=1: choose the density of the headline ground again.
-# If there is no .venv, the packages in .wheels are installed into a temporary folder, and the code of this checkout is
-# used without installing it.
+# On a bare machine, scripts/bare_python.sh uses the packages in .wheels.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/bare_python.sh
 minutes=${MINUTES:-8} out=${OUT:-runs/paper-gpu-files} preset=${PRESET:-paper}
 
 if [ "${1:-}" = wheels ]; then
-  exec "${PYTHON:-python3}" -m pip download --no-deps --only-binary=:all: --python-version 3.12 --implementation cp \
-    --platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
-    -d .wheels -c constraints.txt license-expression boolean.py pydantic pydantic_core annotated-types \
-    typing-inspection typing_extensions ruamel.yaml captum affine OpenEXR trimesh platformdirs pyzmq
+  download_wheels license-expression boolean.py pydantic pydantic_core annotated-types typing-inspection \
+    typing_extensions ruamel.yaml captum affine OpenEXR trimesh platformdirs pyzmq
+  exit
 fi
 
-python=${PYTHON:-python3}
-if [ -x .venv/bin/python ]; then
-  python=${PYTHON:-.venv/bin/python}
-elif ls .wheels/*.whl >/dev/null 2>&1; then
-  site=$(mktemp -d)
-  trap 'rm -rf "$site"' EXIT
-  "$python" -m pip install -q --no-index --no-deps --no-compile --no-cache-dir --target "$site" .wheels/*.whl
-fi
-export PYTHONPATH="${site:+$site:}$PWD/shared:$PWD/render:$PWD/train${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
+start_python
 [ "$preset" = tiny ] && runs=runs/paper-tiny || runs=runs/paper-gpu
 # Pack the finished runs even if the experiment fails.
 "$python" scripts/paper.py --preset "$preset" --part gpu --attitude ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
