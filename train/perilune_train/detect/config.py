@@ -186,6 +186,9 @@ class DetectConfig(Section):
     teacher: str | None = None
     """Teacher for distillation, in addition to the labels: best.ckpt of a detect run, usually of a wider network. Both
     networks must have equal strides and in_channels. This network uses the teacher's anchors."""
+    trained: Literal["all", "ellipses"] = "all"
+    """Weights to train: all, or only the heads of the ellipses, on top of `init_from`. `ellipses` changes neither boxes
+    nor scores, and keeps the weights of the last epoch."""
     validate_every: Count = 1
     """Epochs between validations; `epochs` must be a multiple. The weights of the best validation are kept."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] = 8
@@ -246,4 +249,6 @@ class DetectConfig(Section):
             raise ValueError("frozen_epochs below epochs")
         if self.epochs % self.validate_every:
             raise ValueError("epochs a multiple of validate_every")
+        if self.trained == "ellipses" and not (self.ellipses and self.init_from and not self.frozen_epochs):
+            raise ValueError("trained=ellipses with ellipses=true, init_from and frozen_epochs=0")
         return self

@@ -257,6 +257,32 @@ def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(few, tmp_path
     assert same(frozen["frozen"], after_average["frozen"]) == {False}
 
 
+@pytest.mark.usefixtures("no_pictures")
+def test_the_heads_of_the_ellipses_are_trained_alone(few, tmp_path):
+    """All other weights and batch statistics stay, through optimiser, weight decay and moving average."""
+    architecture = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
+    start = YOLOv3(torch.rand(3, 3, 2) + 4, 1, 0.125, "cbam_identity", (4, 8, 16))
+    runs.save_weights(tmp_path / "best.ckpt", architecture, start)
+    settings = (*QUICK, "detect.frozen_epochs=0", f"detect.init_from={tmp_path / 'best.ckpt'}")
+    settings = (*settings, "detect.attention=cbam_identity", "detect.trained=ellipses")
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
+    run = run_detect(config, few, tmp_path / "runs", "a")
+    trained = runs.load_weights(run.best)["state_dict"]
+    assert {key for key, value in start.state_dict().items() if not torch.equal(trained[key], value)} == set()
+    heads = [key for key in trained if key.startswith("ellipse_heads.") and key.endswith("conv.weight")]
+    assert heads and all(trained[key].std() > 0 for key in heads)
+    # The weights are those after the last step.
+    last = runs.read_saved(run.last, "last state", {"state_dict"}, "a state")["state_dict"]
+    assert all(torch.equal(last[f"evaluated.{key}"], value) for key, value in trained.items())
+
+
+@pytest.mark.parametrize("missing", ["detect.ellipses=false", "detect.init_from=null", "detect.frozen_epochs=1"])
+def test_heads_of_ellipses_alone_need_a_trained_network(missing):
+    given = ("detect.trained=ellipses", "detect.init_from=a.ckpt", "detect.ellipses=true", "detect.epochs=2")
+    with pytest.raises(UserError, match="trained=ellipses with ellipses=true, init_from and frozen_epochs=0"):
+        resolve(DetectConfig, "detect", "perilune_train", "tiny", None, (*given, missing))
+
+
 @pytest.mark.parametrize("attention", ["none", "cbam_identity"])
 def test_the_frozen_forward_keeps_no_graph_that_nobody_needs(dataset_detect, tmp_path, attention):
     split = load_split(open_dataset(dataset_detect), "train", LabelSettings())

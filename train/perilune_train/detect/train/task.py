@@ -74,7 +74,8 @@ class DetectTask(lightning.LightningModule):
     """Training with AdamW, warm-up and cosine schedule; a moving average of the weights is evaluated.
 
     While the backbone is frozen, its weights and batch statistics do not change, except the weights of its attention
-    gates. `train` and `val` are this process's shares of the splits.
+    gates. With `detect.trained=ellipses`, nothing changes but the heads of the ellipses. `train` and `val` are this
+    process's shares of the splits.
     """
 
     def __init__(
@@ -90,6 +91,8 @@ class DetectTask(lightning.LightningModule):
         self.config, self.frozen_epochs, self.teacher = config, frozen_epochs, teacher
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.evaluated = copy.deepcopy(self.network).eval().requires_grad_(False)
+        if config.trained == "ellipses":
+            self.network.requires_grad_(False).ellipse_heads.requires_grad_(True)
         self.architecture = {
             "in_channels": config.in_channels,
             "width": config.width,
@@ -152,8 +155,12 @@ class DetectTask(lightning.LightningModule):
         self.images_seen = checkpoint.get("images_seen", 0)
 
     def configure_optimizers(self) -> Any:
-        decayed = [p for p in self.network.parameters() if p.ndim > 1]
-        plain = [p for p in self.network.parameters() if p.ndim <= 1]
+        # Layers of a frozen backbone are trained later; with `trained=ellipses`, the other weights never are.
+        only_ellipses = self.config.trained == "ellipses"
+        trained = (self.network.ellipse_heads if only_ellipses else self.network).parameters()
+        decayed, plain = [], []
+        for p in trained:
+            (decayed if p.ndim > 1 else plain).append(p)
         # A captured step reads the learning rate from the device, so make it a tensor.
         rate = self.config.learning_rate
         optimizer = torch.optim.AdamW(
@@ -172,6 +179,9 @@ class DetectTask(lightning.LightningModule):
     def on_train_epoch_start(self) -> None:
         frozen = self.current_epoch < self.frozen_epochs
         self.evaluated.eval()
+        if self.config.trained == "ellipses":
+            self.network.eval().ellipse_heads.train()
+            return
         backbone = self.network.backbone
         for part in (backbone.stem, backbone.downs, backbone.units):
             part.requires_grad_(not frozen)
@@ -191,7 +201,7 @@ class DetectTask(lightning.LightningModule):
         images, targets = self.resident_batch(batch) if isinstance(batch, Tensor) else batch
         self.images_seen += len(images) * self.process[1]
         settings, masks = self.config.loss, {}
-        guided = settings.lambda_guide > 0 and self.config.attention != "none"
+        guided = settings.lambda_guide > 0 and self.config.attention != "none" and self.config.trained == "all"
         if guided:
             outputs, masks = self.network.outputs_and_masks(images)
         else:
@@ -324,7 +334,8 @@ class DetectTask(lightning.LightningModule):
             matches = joined(parts)
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
-        self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall})
+        steps = float(self.global_step)
+        self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall, "val/steps": steps})
         if isinstance(self.logger, TensorBoardLogger) and self.process[0] == 0:
             images = preview_images(split, self.detections, points.best_threshold())
             for name, image in images.items():
