@@ -156,11 +156,9 @@ class DetectTask(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         # Layers of a frozen backbone are trained later; with `trained=ellipses`, the other weights never are.
-        only_ellipses = self.config.trained == "ellipses"
-        trained = (self.network.ellipse_heads if only_ellipses else self.network).parameters()
-        decayed, plain = [], []
-        for p in trained:
-            (decayed if p.ndim > 1 else plain).append(p)
+        part = self.network.ellipse_heads if self.config.trained == "ellipses" else self.network
+        decayed = [p for p in part.parameters() if p.ndim > 1]
+        plain = [p for p in part.parameters() if p.ndim <= 1]
         # A captured step reads the learning rate from the device, so make it a tensor.
         rate = self.config.learning_rate
         optimizer = torch.optim.AdamW(
