@@ -16,10 +16,8 @@ class Shipment:
     """metrics.json of the run."""
     figures: dict[str, Any]
     """benchmark.json of the run."""
-    manifest: str
-    """Name of the shared manifest of the training data."""
-    sha256: str
-    """SHA-256 of dataset.json of this manifest."""
+    manifests: dict[str, str]
+    """Shared manifests of the training data: SHA-256 of dataset.json, by name. The second is only of the ellipses."""
     size_mb: float
     """Size of the weights, MB."""
     precision: str = "half precision"
@@ -52,18 +50,33 @@ def _scores(shipment: Shipment) -> tuple[str, str]:
 
 def _facts(shipment: Shipment, network: str) -> list[str]:
     commit = str(shipment.metrics.get("run/commit", "unknown"))[:7]
-    data = f"manifest `{shipment.manifest}`, SHA-256 of dataset.json {shipment.sha256[:16]}; rendered frames only"
+    named = [f"`{name}` ({sha256[:16]})" for name, sha256 in shipment.manifests.items()]
+    data = f"manifest {named[0]}" + (f"; its ellipses also {named[1]}" if len(named) > 1 else "")
+    data += "; in brackets the SHA-256 of dataset.json. Rendered frames only"
     threshold, meaning = _scores(shipment)
     rows = {
         "Network": network,
         "Weights": f"{shipment.size_mb:.1f} MB, {shipment.precision}, safetensors",
         "Training data": data,
         "Trained at": f"commit {commit}, {shipment.metrics.get('run/hardware', 'unknown hardware')}",
+        "Ellipses": _ellipses(shipment),
         "Threshold": threshold,
         "Scores": meaning,
         "Licence": "Apache-2.0",
     }
     return ["| | |", "|---|---|", *[f"| {key} | {value} |" for key, value in rows.items() if value]]
+
+
+def _ellipses(shipment: Shipment) -> str:
+    """Text on the heads of the ellipses; empty if there are none."""
+    if not shipment.content["architecture"].get("ellipses"):
+        return ""
+    commit = str(shipment.metrics.get("ellipses/run/commit", "unknown"))[:7]
+    score = _figure(shipment.figures, "visible/ellipse_score")
+    return (
+        "centre, semi-axes, direction and standard deviations; the heads were trained alone on top of the other "
+        f"weights, commit {commit}. NASA's score on the locked benchmark, labels `visible`: {score} of 100"
+    )
 
 
 def _figure(figures: dict[str, Any], key: str) -> str:
@@ -125,9 +138,15 @@ def _detector(shipment: Shipment) -> list[str]:
         "- It was trained on rendered frames of 256 x 256 pixels over 50 degrees; real images differ from them.",
         "- It finds craters with a radius of about 2 to 80 pixels. Reduce the size of images with larger craters "
         "(`--scale`).",
-        "- The training data has no views far from straight down.",
+        _views(shipment),
         *_seeds(shipment),
     ]
+
+
+def _views(shipment: Shipment) -> str:
+    if shipment.content["architecture"].get("ellipses"):
+        return "- Boxes and scores were trained on views from straight down; the ellipses up to 60 degrees from it."
+    return "- The training data has no views far from straight down."
 
 
 def _seeds(shipment: Shipment) -> list[str]:
