@@ -86,7 +86,7 @@ def add_ellipses(
     other = [
         key
         for key, value in content["state_dict"].items()
-        if not key.startswith("ellipse_heads.") and not torch.equal(value, installed["state_dict"][key])
+        if not key.startswith("ellipse_tower.") and not torch.equal(value, installed["state_dict"][key])
     ]
     if other or not content["architecture"].get("ellipses"):
         found = f"{len(other)} other weights changed" if other else "no ellipses"

@@ -52,7 +52,7 @@ def elliptic(numbers: int, value: float | None = None) -> dict:
     """Weights of a detector of ellipses whose last layers have `numbers` outputs, all `value` if it is given."""
     weights = dict(YOLOv3(torch.ones(3, 3, 2), **DETECTOR | {"ellipses": True}).state_dict())
     for key, old in weights.items():
-        if key.startswith("ellipse_heads.") and ".1." in key:
+        if key.startswith("ellipse_tower.output."):
             weights[key] = old[:numbers].clone() if value is None else torch.full_like(old[:numbers], value)
     return weights
 
@@ -205,14 +205,14 @@ CHECKPOINTS: dict[str, tuple[Callable[[], bytes], str]] = {
     "strides of 2": (lambda: saved(DETECTOR | {"strides": [2, 4, 8]}), "strides [8, 16, 32] or [4, 8, 16]"),
     "ellipses are text": (lambda: saved(DETECTOR | {"ellipses": "\x1b[31myes"}), "architecture.ellipses"),
     "ellipses of 2": (lambda: saved(DETECTOR | {"ellipses": 2}), "architecture.ellipses"),
-    "ellipses without weights": (lambda: saved(DETECTOR | {"ellipses": True}), "ellipse_heads.16"),
+    "ellipses without weights": (lambda: saved(DETECTOR | {"ellipses": True}), "ellipse_tower"),
     "weights of ellipses without the setting": (
-        lambda: saved(weights=state() | {"ellipse_heads.8.1.bias": torch.zeros(15)}),
-        "ellipse_heads.8.1.bias: got (15,), expected no such tensor",
+        lambda: saved(weights=state() | {"ellipse_tower.output.8.bias": torch.zeros(15)}),
+        "ellipse_tower.output.8.bias: got (15,), expected no such tensor",
     ),
     "weights of other ellipses": (
         lambda: saved(DETECTOR | {"ellipses": True}, elliptic(5)),
-        "ellipse_heads.16.1.bias: got (5,), expected (15,)",
+        "ellipse_tower.output.16.bias: got (5,), expected (15,)",
     ),
     "deviations that are NaN": (
         lambda: saved(DETECTOR | {"ellipses": True}, elliptic(15, float("nan"))),

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from perilune_train.config import Attention
 from perilune_train.models.darknet import AttentionDarknet53, conv_block, scaled
-from perilune_train.models.ellipse import ELLIPSE_OUTPUTS, decode_correlation, decode_sigmas
+from perilune_train.models.ellipse import EllipseTower, decode_correlation, decode_sigmas
 
 ANCHORS_PER_SCALE = 3
 OUTPUTS = 5
@@ -30,9 +30,8 @@ class YOLOv3(nn.Module):
     objectness. The heads may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than
     6 px. The neck then still starts at stride 32, with one 1 x 1 convolution. `width` scales backbone and neck.
 
-    With `ellipses`, a second head on each stride, of the same form, predicts 5 further numbers per anchor: the shape of
-    the ellipse in the box, and standard deviations (models/ellipse.py). The first 5 numbers and their weights do not
-    change. Both heads share the branch.
+    With `ellipses`, a tower on the backbone predicts 5 further numbers per anchor: the shape of the ellipse in the box,
+    and standard deviations (models/ellipse.py). The first 5 numbers and their weights do not change.
     """
 
     anchors: Tensor
@@ -54,7 +53,7 @@ class YOLOv3(nn.Module):
         self.register_buffer("anchors", torch.ones(3, ANCHORS_PER_SCALE, 2) if anchors is None else anchors.float())
         self.backbone = AttentionDarknet53(in_channels, width, attention)
         self.branches, self.heads, self.laterals = nn.ModuleDict(), nn.ModuleDict(), nn.ModuleDict()
-        above = 0
+        above, joined = 0, {}
         for stride in _STRIDES[:0:-1]:
             if stride < self.strides[0]:
                 break
@@ -69,17 +68,17 @@ class YOLOv3(nn.Module):
                     conv_block(2 * channels, channels, 1),
                 )
                 self.heads[str(stride)] = nn.Sequential(conv_block(channels, 2 * channels, 3), _output(2 * channels))
+                joined[stride] = channels + self.backbone.channels[_STRIDES.index(stride)]
                 inputs = channels
             if stride > self.strides[0]:
                 above = channels // 2
                 self.laterals[str(stride)] = nn.Sequential(conv_block(inputs, above, 1), nn.Upsample(scale_factor=2))
         # Create these layers last, so that all other initial weights are the same with and without ellipses.
-        self.ellipse_heads = nn.ModuleDict()
+        self.ellipse_tower: EllipseTower | None = None
         if ellipses:
-            for stride in self.strides:
-                channels = scaled(16 * stride, width)
-                output = _ellipse_output(2 * channels)
-                self.ellipse_heads[str(stride)] = nn.Sequential(conv_block(channels, 2 * channels, 3), output)
+            below = self.backbone.channels[_STRIDES.index(self.strides[0]) - 1]
+            joined_channels = [joined[stride] for stride in self.strides]
+            self.ellipse_tower = EllipseTower(self.strides, below, joined_channels, ANCHORS_PER_SCALE)
 
     @property
     def n_features(self) -> int:
@@ -90,7 +89,7 @@ class YOLOv3(nn.Module):
     @property
     def ellipses(self) -> bool:
         """Whether the network predicts ellipses with standard deviations."""
-        return len(self.ellipse_heads) > 0
+        return self.ellipse_tower is not None
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Convert images (N, in_channels, H, W) to raw outputs in float32, finest stride first.
@@ -108,7 +107,7 @@ class YOLOv3(nn.Module):
     def _outputs(self, features: list[Tensor], pooled: list[Tensor] | None = None) -> list[Tensor]:
         """Raw outputs of the backbone's features; appends the mean features (N, C) of each branch to `pooled`."""
         outputs: list[Tensor] = []
-        above = None
+        above, maps = None, {}
         for index in range(len(_STRIDES) - 1, _STRIDES.index(self.strides[0]) - 1, -1):
             stride = str(_STRIDES[index])
             x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
@@ -116,13 +115,15 @@ class YOLOv3(nn.Module):
                 x = self.branches[stride](x)
                 if pooled is not None:
                     pooled.append(x.float().mean((2, 3)))
-                raw = _per_anchor(self.heads[stride](x))
-                if stride in self.ellipse_heads:
-                    raw = torch.cat([raw, _per_anchor(self.ellipse_heads[stride](x))], dim=-1)
-                outputs.insert(0, raw.float())
+                maps[stride] = features[index], x
+                outputs.insert(0, _per_anchor(self.heads[stride](x)).float())
             if stride in self.laterals:
                 above = self.laterals[stride](x)
-        return outputs
+        if self.ellipse_tower is None:
+            return outputs
+        below = features[_STRIDES.index(self.strides[0]) - 1]
+        shapes = self.ellipse_tower(below, maps).values()
+        return [torch.cat([raw, _per_anchor(shape).float()], -1) for raw, shape in zip(outputs, shapes, strict=True)]
 
     @torch.no_grad()
     def detect(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,14 +170,6 @@ def _per_anchor(output: Tensor) -> Tensor:
     """Convert the output (N, 3 x numbers, h, w) of a layer to (N, 3, h, w, numbers)."""
     n, channels, h, w = output.shape
     return output.view(n, ANCHORS_PER_SCALE, channels // ANCHORS_PER_SCALE, h, w).permute(0, 1, 3, 4, 2)
-
-
-def _ellipse_output(channels: int) -> nn.Conv2d:
-    """Layer of the ellipse outputs of a head. Its initial ellipses are axis-aligned with typical deviations."""
-    layer = nn.Conv2d(channels, ANCHORS_PER_SCALE * ELLIPSE_OUTPUTS, 1)
-    nn.init.normal_(layer.weight, std=0.01)
-    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    return layer
 
 
 def _output(channels: int) -> nn.Conv2d:

@@ -47,8 +47,9 @@ def lively(attention="cbam_identity", strides=(4, 8, 16), in_channels=1, ellipse
     for head in network.heads.values():
         nn.init.normal_(head[1].weight, std=0.5)
         nn.init.constant_(head[1].bias, -1.0)
-    for layer in network.ellipse_heads.values():
-        nn.init.normal_(layer[1].weight, std=0.3)
+    if network.ellipse_tower is not None:
+        for layer in network.ellipse_tower.output.values():
+            nn.init.normal_(layer.weight, std=0.3)
     with torch.no_grad():
         network.train()(torch.randn(4, in_channels, SIZE, SIZE))
     return network.eval()

@@ -254,7 +254,7 @@ def test_a_detector_comes_back_as_it_was_saved(finished):
         ([], ()),
         (["detect.attention=cbam"], ("backbone.attentions.",)),
         (["detect.attention=none"], ()),
-        (["detect.strides=[8,16,32]"], ("branches.", "heads.", "ellipse_heads.", "laterals.", "anchors")),
+        (["detect.strides=[8,16,32]"], ("branches.", "heads.", "ellipse_tower.", "laterals.", "anchors")),
     ],
 )
 def test_a_run_starts_from_what_an_earlier_one_has_for_it(finished, tmp_path, changes, stays):

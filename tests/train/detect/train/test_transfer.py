@@ -269,7 +269,7 @@ def test_the_heads_of_the_ellipses_are_trained_alone(few, tmp_path):
     run = run_detect(config, few, tmp_path / "runs", "a")
     trained = runs.load_weights(run.best)["state_dict"]
     assert {key for key, value in start.state_dict().items() if not torch.equal(trained[key], value)} == set()
-    heads = [key for key in trained if key.startswith("ellipse_heads.") and key.endswith("conv.weight")]
+    heads = [key for key in trained if key.startswith("ellipse_tower.") and key.endswith("conv.weight")]
     assert heads and all(trained[key].std() > 0 for key in heads)
     # The weights are those after the last step.
     last = runs.read_saved(run.last, "last state", {"state_dict"}, "a state")["state_dict"]
@@ -353,9 +353,9 @@ def test_ellipse_outputs_come_from_a_file_that_has_them(tmp_path, given, wanted)
     before = {key: value.clone() for key, value in network.state_dict().items()}
     start_from(network, tmp_path / "a.ckpt", DetectConfig(**shape, ellipses=wanted))
     after, saved = network.state_dict(), source.state_dict()
-    assert any(key.startswith("ellipse_heads.") for key in after) == wanted
+    assert any(key.startswith("ellipse_tower.") for key in after) == wanted
     for key, value in after.items():
-        kept = key.startswith("ellipse_heads.") and not given
+        kept = key.startswith("ellipse_tower.") and not given
         assert torch.equal(value, before[key] if kept else saved[key]), key
     images = torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
     source.eval(), network.eval()

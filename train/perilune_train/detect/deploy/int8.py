@@ -27,7 +27,7 @@ MAX_AP_LOSS = 0.005
 """Largest accepted loss of AP on the validation split."""
 _CALIBRATION_FRAMES = 64
 _TIMED = 30
-_KEPT_FLOAT = re.compile(r"/(squeeze|excite|spatial)|/heads\.\d+\.1/|/ellipse_heads")
+_KEPT_FLOAT = re.compile(r"/(squeeze|excite|spatial)|/heads\.\d+\.1/|/ellipse_tower")
 """Operations that stay in floating point: the gates, which are cheap, and the last convolutions of each head, which
 give boxes and ellipses."""
 

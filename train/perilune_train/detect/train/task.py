@@ -74,7 +74,7 @@ class DetectTask(lightning.LightningModule):
     """Training with AdamW, warm-up and cosine schedule; a moving average of the weights is evaluated.
 
     While the backbone is frozen, its weights and batch statistics do not change, except the weights of its attention
-    gates. With `detect.trained=ellipses`, nothing changes but the heads of the ellipses. `train` and `val` are this
+    gates. With `detect.trained=ellipses`, nothing changes but the tower of the ellipses. `train` and `val` are this
     process's shares of the splits.
     """
 
@@ -92,7 +92,8 @@ class DetectTask(lightning.LightningModule):
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.evaluated = copy.deepcopy(self.network).eval().requires_grad_(False)
         if config.trained == "ellipses":
-            self.network.requires_grad_(False).ellipse_heads.requires_grad_(True)
+            self.network.requires_grad_(False)
+            self.tower.requires_grad_(True)
         self.architecture = {
             "in_channels": config.in_channels,
             "width": config.width,
@@ -113,6 +114,12 @@ class DetectTask(lightning.LightningModule):
     def process(self) -> tuple[int, int]:
         """Rank of this process and number of processes that train together."""
         return (self._trainer.global_rank, self._trainer.world_size) if self._trainer else (0, 1)
+
+    @property
+    def tower(self) -> nn.Module:
+        """The part of the network that predicts ellipses."""
+        assert self.network.ellipse_tower is not None
+        return self.network.ellipse_tower
 
     @property
     def resides(self) -> bool:
@@ -156,7 +163,7 @@ class DetectTask(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         # Layers of a frozen backbone are trained later; with `trained=ellipses`, the other weights never are.
-        part = self.network.ellipse_heads if self.config.trained == "ellipses" else self.network
+        part = self.tower if self.config.trained == "ellipses" else self.network
         decayed = [p for p in part.parameters() if p.ndim > 1]
         plain = [p for p in part.parameters() if p.ndim <= 1]
         # A captured step reads the learning rate from the device, so make it a tensor.
@@ -178,7 +185,8 @@ class DetectTask(lightning.LightningModule):
         frozen = self.current_epoch < self.frozen_epochs
         self.evaluated.eval()
         if self.config.trained == "ellipses":
-            self.network.eval().ellipse_heads.train()
+            self.network.eval()
+            self.tower.train()
             return
         backbone = self.network.backbone
         for part in (backbone.stem, backbone.downs, backbone.units):

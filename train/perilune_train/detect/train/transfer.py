@@ -27,7 +27,7 @@ from perilune_train.training import runs
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
 """Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. The deviation is a power of two,
 so scaling by it is exact."""
-_GATES, _ELLIPSES = "backbone.attentions.", "ellipse_heads."
+_GATES, _ELLIPSES = "backbone.attentions.", "ellipse_tower."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
 
