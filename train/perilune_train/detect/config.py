@@ -187,8 +187,8 @@ class DetectConfig(Section):
     """Teacher for distillation, in addition to the labels: best.ckpt of a detect run, usually of a wider network. Both
     networks must have equal strides and in_channels. This network uses the teacher's anchors."""
     trained: Literal["all", "ellipses"] = "all"
-    """Weights to train: all, or only the layers that predict ellipses, on top of `init_from`. `ellipses` does not change
-    boxes and scores, and keeps the weights of the last epoch."""
+    """Weights to train: all, or only the layers that predict ellipses, on top of `init_from`. `ellipses` leaves boxes
+    and scores as they are, and keeps the weights of the last epoch."""
     validate_every: Count = 1
     """Epochs between validations; `epochs` must be a multiple. The weights of the best validation are kept."""
     batch_size: Annotated[int, Field(ge=1, le=65_536)] = 8
