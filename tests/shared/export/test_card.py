@@ -146,6 +146,18 @@ def test_the_page_warns_of_terrain_in_two_splits(tmp_path):
     assert "1 of 1 terrains are in more than one split" in html and "Split by trajectory" in html
 
 
+def test_the_page_cites_the_elevation_model(crowded, card, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
+    info = open_dataset(root).info
+    (recipe,) = info.recipes.values()
+    terrain = {**recipe.config.get("terrain", {}), "elevation": {"citation": "LOLA | PDS"}}
+    cited = recipe.model_copy(update={"config": {**recipe.config, "terrain": terrain}})
+    write_info(root, info.model_copy(update={"recipes": {key: cited for key in info.recipes}}))
+    page = html_of(card_files(root)[0])
+    assert "<td>citation of the terrain</td>" in page and "LOLA | PDS" in page.replace("&#124;", "|")
+    assert "citation" not in html_of(card / "README.md")
+
+
 def test_text_from_a_dataset_is_escaped(crowded, card, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/scenes/all.parquet"
