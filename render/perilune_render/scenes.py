@@ -58,7 +58,7 @@ TERRAINS: dict[str, tuple[str, ...]] = {
 
 - `mare`: dark ground, gentle slopes, few boulders (configs/mare.yaml).
 - `highland`: bright ground, slopes 2.4 times as steep as in `mare`, denser craters (configs/highland.yaml).
-- `polar`: highland ground at latitude -85 degrees, where the Sun is never higher than 6.5 degrees; here it is at 5."""
+- `polar`: highland ground at latitude -85 degrees, where the Sun is never higher than 6.6 degrees; here it is at 5."""
 _BASE = "small"
 _CONFIGURATIONS = (".yaml", ".yml")
 

@@ -33,6 +33,8 @@ cores, training is slower below 30,000 rounds. Beside a busy process, training i
 """
 NUMBERS_OF_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Environment variables that set the threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL, OpenCV."""
+WORKER_NUMBER = "PERILUNE_WORKER"
+"""Environment variable with the number of a worker process, from 0."""
 _MAX_THREADS = 1024
 _PATTERNS = {
     **dict.fromkeys(
@@ -63,6 +65,14 @@ def usable_cores() -> int:
     """
     quota = processor_quota()
     return cores_in_affinity() if quota is None else max(1, min(cores_in_affinity(), math.ceil(quota)))
+
+
+def worker_number() -> int:
+    """Number of this worker process on its machine, from 0; 0 in a process that is no worker."""
+    value = os.environ.get(WORKER_NUMBER, "0")
+    if not value.isdecimal():
+        raise UserError("environment", WORKER_NUMBER, value, "the number of a worker process, from 0")
+    return int(value)
 
 
 def set_up_program() -> None:

@@ -7,8 +7,9 @@ from perilune_render.config.terrain import TerrainConfig
 from perilune_shared.console.terminal import say
 from perilune_shared.dataset.names import Kind
 
-_LARGEST_SUN_LATITUDE_DEG = 1.54
-"""Largest distance of the Sun from the Moon's equator: the tilt of the Moon's axis to the ecliptic, degrees."""
+_LARGEST_SUN_LATITUDE_DEG = 1.59
+"""Largest distance of the Sun from the Moon's equator, degrees: 1.54, the mean tilt of the Moon's axis to the ecliptic,
+and libration (tests/render/poses/test_suns.py)."""
 
 
 def highest_sun_deg(latitude_deg: float) -> float:

@@ -288,6 +288,9 @@ class RenderConfig(Section):
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Processor of the engine `heightfield`: cpu, cuda (a GPU of NVIDIA), or auto (a GPU if there is one). Frames of
     both agree within 1e-4 outside the edges of shadows, but not to the byte."""
+    cycles_device: Literal["cpu", "cuda", "optix", "hip", "oneapi", "metal"] = "cpu"
+    """Processor of the engine `cycles`: cpu, or a GPU by one of Cycles's interfaces. Each worker process uses one GPU.
+    Frames of a GPU are not equal to the byte."""
     samples: Annotated[int, Field(ge=1, le=4096)] = 4
     """Camera rays per pixel."""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
@@ -301,6 +304,8 @@ class RenderConfig(Section):
     def _device_of_engine(self) -> "RenderConfig":
         if self.device != "cpu" and self.engine != "heightfield":
             raise ValueError("device cpu, or engine heightfield")
+        if self.cycles_device != "cpu" and self.engine != "cycles":
+            raise ValueError("cycles_device cpu, or engine cycles")
         return self
 
 

@@ -78,7 +78,7 @@ METRES_PER_UNIT = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937, "
 HeightUnit = Literal["m", "km", "ft", "us-ft", "cm", "mm"]
 SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
 """Settings that place the site in an elevation model: set the first two, the last two, or none."""
-FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "vrt_files", "allow_unseen")
+FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "vrt_files", "allow_unseen", "citation")
 """Settings that supply what the file of an elevation model does not state."""
 
 
@@ -143,6 +143,8 @@ class ElevationConfig(Section):
     """Files that a VRT model (a GDAL text file that joins rasters) may refer to, as paths relative to its folder."""
     allow_unseen: bool = False
     """Whether to accept a model that has no heights within the ground in view."""
+    citation: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
+    """Source and licence of the model, as text. The recipe and the dataset card state it."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
     """Columns of the crater catalogue."""
     rims: RimSource = "measured"

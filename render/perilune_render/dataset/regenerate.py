@@ -21,7 +21,7 @@ from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines.frame_source import FrameSource
-from perilune_render.engines.open_engine import open_engine
+from perilune_render.engines.open_engine import check_engine, open_engine
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.flight.rig import Rig, rig_of
 from perilune_render.flight.view import view_of
@@ -30,7 +30,6 @@ from perilune_render.imaging.exr import local_exr, read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.provenance.recipe import config_of, same_source, settings_of
-from perilune_render.provenance.versions import check_installed
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.interrupts import interrupts_held
@@ -180,14 +179,19 @@ def _of_scene(
 
 
 def _on_this_machine(config: DatasetConfig, where: str) -> DatasetConfig:
-    """The configuration with the device `cpu` if the recipe has `cuda` and this machine has no CUDA device."""
+    """The configuration with the device `cpu` if the recipe has another device, which this machine does not have."""
+    on_processor = config.render.model_copy(update={"device": "cpu", "cycles_device": "cpu"})
     try:
-        check_installed(config.render.engine, config.render.device)
+        check_engine(config.render)
     except UserError:
-        if config.render.device != "cuda":
+        if config.render == on_processor:
             raise
-        say(f"{where}: its frames were rendered on a CUDA device and are rendered on the processor here: bytes differ")
-        return config.model_copy(update={"render": config.render.model_copy(update={"device": "cpu"})})
+        kind = (
+            "a CUDA device" if config.render.device == "cuda" else f"a device {config.render.cycles_device} of Cycles"
+        )
+        say(f"{where}: its frames were rendered on {kind} and are rendered on the processor here: bytes differ")
+        check_engine(on_processor)
+        return config.model_copy(update={"render": on_processor})
     return config
 
 

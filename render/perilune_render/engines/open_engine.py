@@ -1,10 +1,11 @@
-"""Open the engine of a configuration: `cycles` (Blender) or `heightfield` (ray casting)."""
+"""Open the engine of a configuration: `cycles` (Blender) or `heightfield` (ray casting); check that it can be used."""
 
 import contextlib
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
-from perilune_render.config.dataset import DatasetConfig
+from perilune_render.config.dataset import DatasetConfig, RenderConfig
 from perilune_render.engines.frame_source import Engine
 from perilune_render.provenance.versions import check_installed, device_of
 from perilune_render.terrain.scene import Scene
@@ -34,15 +35,34 @@ def open_engine(
 
         return HeightfieldEngine(scene, config, camera, sun, config.render.threads or usable_cores(), surface)
     check_installed(config.render.engine)
-    try:
+    with _blender_imported():
         # Import Blender only for this engine, since the import takes a second.
         from perilune_render.engines.blender.renderer import Renderer
+
+    return Renderer(scene, config, camera, sun)
+
+
+def check_engine(render: RenderConfig) -> None:
+    """Raise UserError if the engine is not installed or its device does not exist on this machine.
+
+    Imports Blender only for a device of Cycles other than the processor.
+    """
+    check_installed(render.engine, render.device)
+    if render.cycles_device != "cpu":
+        with _blender_imported():
+            from perilune_render.engines.blender.devices import check_device
+        check_device(render.cycles_device)
+
+
+@contextlib.contextmanager
+def _blender_imported() -> Iterator[None]:
+    """Raise UserError if the block cannot import Blender's module, which is installed."""
+    try:
+        yield
     except ImportError as error:
         # The module is installed, so a system library is missing.
         expected = "the X11 libraries that Blender needs; `scripts/system-libraries` lists them"
         raise UserError("configuration", "dataset.render.engine", f"cycles ({error})", expected) from None
-
-    return Renderer(scene, config, camera, sun)
 
 
 def load_engine(name: str) -> None:

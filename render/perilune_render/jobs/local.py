@@ -149,7 +149,9 @@ class LocalWorkers:
     def _start(self, n_workers: int) -> None:
         """Start workers until there are `n_workers`."""
         while len(self._workers) < n_workers:
-            worker = start_worker(self._scratch.name, self._job.config.render.engine)
+            taken = {worker.number for worker in self._workers.values()}
+            number = next(number for number in range(n_workers) if number not in taken)
+            worker = start_worker(self._scratch.name, self._job.config.render.engine, number)
             self._workers[worker.connection] = worker
 
     def _end(self, worker: Worker, *, at_once: bool = False) -> None:

@@ -19,6 +19,7 @@ from perilune_render.dataset.begin import begin_or_resume, is_begun, is_complete
 from perilune_render.dataset.finish import finish as finish_dataset
 from perilune_render.dataset.from_manifest import Recorded
 from perilune_render.dataset.work import committed
+from perilune_render.engines.open_engine import check_engine
 from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.flight.pose_checks import check_plan
 from perilune_render.jobs import records
@@ -144,7 +145,8 @@ def _render(job: Job, out: Store, indices: list[int], executor: Executor, progre
 
 
 def check(job: Job) -> None:
-    """Check settings, poses and files of a job before any terrain is generated. Raises UserError."""
+    """Check engine, settings, poses and files of a job before any terrain is generated. Raises UserError."""
+    check_engine(job.config.render)
     grid = check_ground(job.config, job.plan.view)
     check_plan(job.plan, grid, job.where)
     if job.config.hazard is not None:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 
 from perilune_shared.errors import ends_run
+from perilune_shared.threads import WORKER_NUMBER
 
 WORKER = ("-m", "perilune_render.jobs.worker")
 """Arguments of Python that start a worker process."""
@@ -50,6 +51,8 @@ class Worker:
     """Id of the scene that the worker holds in memory, if any."""
     n_done: int = 0
     """Number of trajectories that the worker has rendered."""
+    number: int = 0
+    """Number among the workers that run at the same time, from 0; it selects the worker's GPU."""
 
     def send(self, command: str, target: object) -> None:
         """Send a command. An ended worker causes no error here, but when its next message is received."""
@@ -74,8 +77,11 @@ class Worker:
             self.process.wait()
 
 
-def start_worker(scratch: str, engine: str) -> Worker:
-    """Start a worker that loads `engine` and writes its temporary files into the folder `scratch`."""
+def start_worker(scratch: str, engine: str, number: int = 0) -> Worker:
+    """Start a worker that loads `engine` and writes its temporary files into the folder `scratch`.
+
+    `number` is `Worker.number`.
+    """
     ours, theirs = Pipe()
     arguments = [str(theirs.fileno()), str(os.getpid()), scratch, engine]
     with theirs:
@@ -83,12 +89,12 @@ def start_worker(scratch: str, engine: str) -> Worker:
             # -P: a module in the current folder must not take the place of an installed one.
             [sys.executable, "-P", *WORKER, *arguments],
             pass_fds=[theirs.fileno()],
-            env={**os.environ, **dict.fromkeys(ONE_THREAD, "1")},
+            env={**os.environ, **dict.fromkeys(ONE_THREAD, "1"), WORKER_NUMBER: str(number)},
             stdin=subprocess.DEVNULL,
             # Ctrl-C reaches only the parent, which then ends its workers.
             process_group=0,
         )
-    return Worker(process, ours)
+    return Worker(process, ours, number=number)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.real_ground import draw_outline, outline_m
 from perilune_render.dataset.shots import planned_shot
 from perilune_render.engines.frame_source import FrameSource
-from perilune_render.engines.open_engine import open_engine
+from perilune_render.engines.open_engine import check_engine, open_engine
 from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
@@ -19,7 +19,6 @@ from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.preview.map_picture import map_picture
 from perilune_render.preview.site_horizon import shadow_warnings, site_horizon_of
 from perilune_render.preview.site_map import LARGEST_WIDTH, site_map
-from perilune_render.provenance.versions import check_installed
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import ElevationModel
 from perilune_render.terrain.scene import Scene, check_ground, model_of
@@ -40,7 +39,7 @@ def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, 
     each Sun that leaves the site in shadow. Raises UserError if the engine is not installed or if a pose fails
     `check_poses`; `where` names the source of the poses in the message.
     """
-    check_installed(config.render.engine)
+    check_engine(config.render)
     scene_plan = plan.scenes[0]
     trajectories = [next(t for t in plan.of_scene(scene_plan.scene_id) if t.camera == name) for name in plan.rig]
     check_ground(config, plan.view)

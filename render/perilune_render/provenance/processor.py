@@ -11,8 +11,9 @@ import sys
 
 SETTINGS = {
     # Use NumPy's baseline code: its code for AVX-512 gives different last digits in log, power and other functions.
+    # NumPy 2.4 and later have other names for the same features; NumPy ignores names that it does not know.
     "NPY_DISABLE_CPU_FEATURES": "SSSE3 SSE41 POPCNT SSE42 AVX F16C FMA3 AVX2 AVX512F AVX512CD AVX512_KNL AVX512_KNM"
-    " AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
+    " AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR X86_V3 X86_V4",
     # These need SSE 4.2, as Blender does.
     "OPENBLAS_CORETYPE": "Nehalem",
     "OPENBLAS_NUM_THREADS": "1",

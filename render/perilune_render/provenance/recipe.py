@@ -80,8 +80,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
     plain["render"]["device"] = device_of(config.render)
-    if plain["render"]["device"] == "cpu":
-        del plain["render"]["device"]
+    for name in ("device", "cycles_device"):
+        if plain["render"][name] == "cpu":
+            del plain["render"][name]
     for name in _SINCE:
         if plain["sensor"][name] == SensorConfig.model_fields[name].default:
             del plain["sensor"][name]

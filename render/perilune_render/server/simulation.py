@@ -14,14 +14,14 @@ from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines.frame_source import Frame, FrameSource, Shot
 from perilune_render.engines.heightfield.query import first_hits, heights_m
 from perilune_render.engines.heightfield.surface import Surface, surface_of
-from perilune_render.engines.open_engine import open_engine
+from perilune_render.engines.open_engine import check_engine, open_engine
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS, Poses, check_places, check_poses
 from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.poses.plan import scene_seed
-from perilune_render.provenance.versions import check_installed, device_of
+from perilune_render.provenance.versions import device_of
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.scene import Scene, check_ground
@@ -211,7 +211,7 @@ def simulation_over(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Sim
 
     Raises UserError if the engine is not installed or the ground is too large.
     """
-    check_installed(config.render.engine)
+    check_engine(config.render)
     if config.render.engine == "cycles":
         # Use one mesh, since levels fit only one descent. `check_ground` rejects ground that is too large for one mesh.
         view = replace(view, seen=None)

@@ -48,6 +48,7 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
             files = raster_files(path, tiles=config.terrain.elevation.vrt_files).paths if name == "dem" else (path,)
             terrain[name] = [path.name, *(sha256_of(file) for file in files)]
     terrain.pop("max_vertices")  # limits meshes, and does not change the ground
+    terrain["elevation"].pop("citation")
     versions = ground_versions(with_dem=config.terrain.dem is not None)
     content = {
         "versions": {name: version for name, version in versions.items() if not name.startswith("perilune")},

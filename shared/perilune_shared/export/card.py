@@ -7,6 +7,7 @@ Datasets are untrusted, so each text from a dataset is written as a code span, i
 import os
 import shlex
 from collections.abc import Iterable
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -153,7 +154,18 @@ def _scenes(dataset: Dataset) -> str:
         counted = scenes[name].value_counts()
         shown = ", ".join(f"{code_span(value)} ({number})" for value, number in counted.head(8).items())
         rows.append([title, shown + (f" and {len(counted) - 8} more" if len(counted) > 8 else "")])
+    citations = dict.fromkeys(filter(None, map(_citation, dataset.info.recipes.values())))
+    if citations:
+        rows.append(["citation of the terrain", ", ".join(map(code_span, citations))])
     return _table([f"{len(scenes)} scenes", ""], rows)
+
+
+def _citation(recipe: Recipe) -> str | None:
+    """Source and licence of a recipe's elevation model, if its configuration states them."""
+    part: Any = recipe.config
+    for name in ("terrain", "elevation", "citation"):
+        part = part.get(name) if isinstance(part, dict) else None
+    return None if part is None else str(part)
 
 
 def _splits(dataset: Dataset) -> str:

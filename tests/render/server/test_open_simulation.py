@@ -50,6 +50,7 @@ def test_a_horizon_of_too_high_descents_is_refused():
 
 
 def test_blender_refuses_a_ground_of_which_it_would_show_only_one_descent():
+    pytest.importorskip("bpy")
     config = config_of(None)
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": "cycles"})})
     whole = graded_grid(config.terrain, view_envelope(camera_of(config.camera), config.nav.flight)).n_vertices

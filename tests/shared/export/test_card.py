@@ -25,7 +25,7 @@ from perilune_shared.cli.main import app
 from perilune_shared.console.progress import NO_PROGRESS
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.metadata import NOT_STATED
+from perilune_shared.dataset.metadata import NOT_STATED, recipes_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
@@ -144,6 +144,22 @@ def test_the_page_warns_of_terrain_in_two_splits(tmp_path):
     root = build_dataset(tmp_path / "nav", "nav", splits=splits, scenes=1, n_frames=2, side_px=32)
     html = html_of(card_files(root)[0])
     assert "1 of 1 terrains are in more than one split" in html and "Split by trajectory" in html
+
+
+def test_the_page_cites_the_elevation_model(crowded, card, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
+    info = open_dataset(root).info
+    (recipe,) = info.recipes.values()
+    terrain = {**recipe.config.get("terrain", {}), "elevation": {"citation": "LOLA, PDS"}}
+    cited = recipe.model_copy(update={"config": {**recipe.config, "terrain": terrain}})
+    write_info(root, info.model_copy(update={"recipes": recipes_of(cited)}))
+    part = root / "manifest/scenes/all.parquet"
+    rows = [{**row, "recipe": cited.key} for row in pq.read_table(part).to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows, schema=TABLES["scenes"]), part)
+    seal(root)
+    page = html_of(card_files(root)[0])
+    assert "<td>citation of the terrain</td>" in page and "<code>LOLA, PDS</code>" in page
+    assert "citation" not in html_of(card / "README.md")
 
 
 def test_text_from_a_dataset_is_escaped(crowded, card, tmp_path):

@@ -1,4 +1,4 @@
-"""Rendering with Cycles on the CPU: settings, and one frame at a time through a temporary EXR."""
+"""Rendering with Cycles: settings, and one frame at a time through a temporary EXR."""
 
 import contextlib
 import errno
@@ -16,6 +16,7 @@ import numpy as np
 
 from perilune_render.config.dataset import DatasetConfig, LightConfig, RenderConfig
 from perilune_render.engines.blender import stage as blender_stage
+from perilune_render.engines.blender.devices import use_device
 from perilune_render.flight.sub_poses import RowPoses
 from perilune_render.imaging.exr import read_exr
 from perilune_render.imaging.radiance import Radiance
@@ -224,7 +225,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     """Configure Cycles: direct light and at most one bounce, linear float32.
 
     The acceleration structure is kept between frames. A bounce traces one random ray per sample, so the light in
-    shadows is noisy with few samples.
+    shadows is noisy with few samples. Raises UserError without the device of the settings.
     """
     render, cycles = stage.render, stage.cycles
     render.engine = "CYCLES"
@@ -243,7 +244,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     render.image_settings.color_depth = "32"
     render.image_settings.exr_codec = "NONE"
     render.film_transparent = False
-    cycles.device = "CPU"
+    use_device(stage, settings.cycles_device)
     cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = False

@@ -107,7 +107,15 @@ def test_almost_all_is_not_all(tmp_path):
 
 
 def test_the_settings_of_a_file_need_a_file(tmp_path):
-    for setting in ("height_unit=km", "band=1", "nodata=0", "crs=EPSG:4326", "allow_unseen=true", "vrt_files=[a.tif]"):
+    for setting in (
+        "height_unit=km",
+        "band=1",
+        "nodata=0",
+        "crs=EPSG:4326",
+        "allow_unseen=true",
+        "vrt_files=[a.tif]",
+        "citation=x",
+    ):
         line = refused(tmp_path, f"--set=dataset.terrain.elevation.{setting}")
         assert f"elevation.{setting.split('=')[0]}: got" in line and "--dem, an elevation model" in line
     assert "height_unit" in refused(tmp_path, "--set=dataset.terrain.elevation.height_unit=mile")
@@ -116,9 +124,9 @@ def test_the_settings_of_a_file_need_a_file(tmp_path):
 def test_a_recipe_records_only_settings_that_were_made():
     plain = recorded_settings(config_with(), "detect")["terrain"]["elevation"]
     assert set(plain) == {"outside"}
-    made = config_with(terrain={"dem": "a.tif", "elevation": {"height_unit": "km", "nodata": 0.0}})
+    made = config_with(terrain={"dem": "a.tif", "elevation": {"height_unit": "km", "nodata": 0.0, "citation": "PDS"}})
     recorded = recorded_settings(made, "detect")["terrain"]["elevation"]
-    assert recorded == {"outside": "procedural", "height_unit": "km", "nodata": 0.0}
+    assert recorded == {"outside": "procedural", "height_unit": "km", "nodata": 0.0, "citation": "PDS"}
 
 
 def vrt(folder):
