@@ -27,6 +27,7 @@ import numpy as np
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.lens_models import PARAMETERS
 
 PORT = 10364
 """Default TCP port of the server for this client."""
@@ -146,6 +147,8 @@ class SceneClient:
         head, _ = self._ask({"request": "scene"})
         camera = dict(head["camera"])
         camera["distortion"] = tuple(camera["distortion"])
+        if "parameters" in camera:
+            camera["parameters"] = tuple(camera["parameters"][name] for name in PARAMETERS[camera["model"]])
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
     def health(self) -> dict[str, str]:
