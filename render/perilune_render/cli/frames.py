@@ -113,7 +113,8 @@ def _lens(camera: "Camera") -> dict[str, Any] | None:
     from perilune_shared.geometry.lens_models import PARAMETERS
 
     named = dict(zip(PARAMETERS[camera.model], camera.parameters, strict=True))
-    settings: dict[str, Any] = {"model": camera.model, **{k: v for k, v in named.items() if k in LensConfig.model_fields}}
+    settings: dict[str, Any] = {name: value for name, value in named.items() if name in LensConfig.model_fields}
+    settings["model"] = camera.model
     for vector, names in {"o": ("o_x", "o_y", "o_z"), "r": ("r0", "r1", "r2"), "e": ("e0_m", "e1_m", "e2_m")}.items():
         if names[0] in named:
             settings[vector] = [named[name] for name in names]

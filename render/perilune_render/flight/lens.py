@@ -99,7 +99,8 @@ def _focal_px(config: CameraConfig, section: str, parameters: tuple[float, ...])
 
 def _named(lens: LensConfig | None) -> str:
     """The parameters of a lens that differ from the defaults, for messages."""
-    return "" if lens is None else ", ".join(f"{k} {v}" for k, v in lens.model_dump(exclude_defaults=True).items() if k != "model")
+    stated = {} if lens is None else lens.model_dump(exclude={"model"}, exclude_defaults=True)
+    return ", ".join(f"{name} {value}" for name, value in stated.items())
 
 
 def _where(camera: Camera) -> str:

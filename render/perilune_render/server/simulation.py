@@ -15,8 +15,8 @@ from perilune_render.engines.heightfield.query import first_hits, heights_m
 from perilune_render.engines.heightfield.surface import Surface, surface_of
 from perilune_render.engines.open_engine import open_engine
 from perilune_render.flight.lens import camera_of
-from perilune_render.flight.rig import rig_of
 from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS, Poses, check_places, check_poses
+from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles

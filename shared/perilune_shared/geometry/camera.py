@@ -87,8 +87,8 @@ class Camera:
     def project(self, points_camera_m: ArrayLike) -> Array:
         """Project points (..., 3) in O_C, metres, to image coordinates (..., 2), pixels.
 
-        Returns NaN for a point that is not in front of the camera (of a lens model: more than 90 degrees from the axis),
-        or so far off the axis that the distortion folds back.
+        Returns NaN for a point that is not in front of the camera, or so far off the axis that the distortion folds
+        back. A lens model has an image up to 90 degrees from its axis.
         """
         p = np.asarray(points_camera_m, np.float64)
         lens = self.lens

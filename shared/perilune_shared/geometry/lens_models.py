@@ -189,7 +189,9 @@ def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
         axis, linearity = axis / np.linalg.norm(axis), value.get("linearity", 1.0)
         c = (1.0 + value["r0"], value["r1"], value["r2"])
     pupil = value.get("e0_m", 0.0), value.get("e1_m", 0.0), value.get("e2_m", 0.0)
-    lens = Lens(axis, np.array(c), linearity, value.get("xi"), pupil, value.get("skew_px", 0.0), np.inf, np.zeros((2, 1)))
+    lens = Lens(
+        axis, np.array(c), linearity, value.get("xi"), pupil, value.get("skew_px", 0.0), np.inf, np.zeros((2, 1))
+    )
     fold = _fold_rad(lens)
     # tan and, without xi, the unified model have no image at 90 degrees.
     unbounded = (lens.linearity if lens.xi is None else 1 - min(lens.xi, 1)) == 1

@@ -340,8 +340,8 @@ def see(ground, rocks, tops, view, tile):
 def see_along(ground, rocks, view, tile, starts, rays):
     """Render a tile as `see`, with given rays (S, h, w, 3), O_L, of a lens model; a ray of NaN sees nothing.
 
-    `starts` (S, h, w, 3) are the positions of the rays relative to the grid's centre, metres. `view.origin` and the last
-    row of `view.basis` are overwritten; its other rows must be 0.
+    `starts` (S, h, w, 3) are the positions of the rays relative to the grid's centre, metres. `view.origin` and the
+    last row of `view.basis` are overwritten; its other rows must be 0.
     """
     n_samples, height, width, _ = tile.moved.shape
     nowhere = Block(np.inf, -1)
