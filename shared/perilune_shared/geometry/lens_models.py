@@ -22,7 +22,7 @@ Mei and Rives 2007, doi 10.1109/ROBOT.2007.364084 (unified, as in OpenCV's omnid
 10.1016/0146-664X(78)90112-0 (CAHV); Gennery 2006, doi 10.1007/s11263-006-5168-1 (CAHVORE, with CAHVOR as a part).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -92,7 +92,8 @@ class Lens:
     def directions(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Unit vectors (..., 3), O_C, of the rays to x' and y' (...), and the positions of their pupils on the axis.
 
-        The positions (...) are metres from C. Returns NaN if no ray within 90 degrees and before the fold reaches x', y'.
+        The positions (...) are metres from C. Returns NaN if no ray within 90 degrees and before the fold reaches x' and
+        y'.
         """
         d = np.stack([x, y, np.ones_like(x)], axis=-1)
         axial = d @ self.axis
@@ -181,7 +182,8 @@ def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
     if model not in PARAMETERS or len(parameters) != len(PARAMETERS[model]):
         raise ValueError(f"{len(parameters)} parameters of the lens model {model}")
     value = dict(zip(PARAMETERS[model], parameters, strict=True))
-    axis, linearity, c = np.array([0.0, 0.0, 1.0]), 0.0, (1.0,)
+    axis, linearity = np.array([0.0, 0.0, 1.0]), 0.0
+    c: tuple[float, ...] = (1.0,)
     if model == "kannala_brandt":
         c = (1.0, *parameters)
     if model in ("cahvor", "cahvore"):
@@ -189,18 +191,17 @@ def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
         axis, linearity = axis / np.linalg.norm(axis), value.get("linearity", 1.0)
         c = (1.0 + value["r0"], value["r1"], value["r2"])
     pupil = value.get("e0_m", 0.0), value.get("e1_m", 0.0), value.get("e2_m", 0.0)
-    lens = Lens(
-        axis, np.array(c), linearity, value.get("xi"), pupil, value.get("skew_px", 0.0), np.inf, np.zeros((2, 1))
-    )
+    skew_px, unknown = value.get("skew_px", 0.0), np.zeros((2, 1))
+    lens = Lens(axis, np.array(c), linearity, value.get("xi"), pupil, skew_px, np.inf, unknown)
     fold = _fold_rad(lens)
     # tan and, without xi, the unified model have no image at 90 degrees.
-    unbounded = (lens.linearity if lens.xi is None else 1 - min(lens.xi, 1)) == 1
+    unbounded = linearity == 1 if lens.xi is None else lens.xi == 0
     angles = np.linspace(0, min(fold, _HALF_TURN - 1e-7 if unbounded else _HALF_TURN), _N_TABLE)
-    return Lens(axis, lens.c, linearity, lens.xi, pupil, lens.skew_px, fold, np.stack([angles, lens.radius(angles)]))
+    return replace(lens, fold_rad=fold, table=np.stack([angles, lens.radius(angles)]))
 
 
 def _fold_rad(lens: Lens) -> float:
-    """Smallest theta below 90 degrees at which dr/dt = c0 + 3 c1 t^2 + 5 c2 t^4 + ... is not positive, else infinite."""
+    """Smallest theta below 90 degrees at which dr/dt = c0 + 3 c1 t^2 + 5 c2 t^4 + ... is not positive, or infinity."""
     slope = lens.c * (2 * np.arange(len(lens.c)) + 1)
     if slope[0] <= 0:
         return 0.0
