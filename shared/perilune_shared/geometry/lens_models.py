@@ -92,8 +92,8 @@ class Lens:
     def directions(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Unit vectors (..., 3), O_C, of the rays to x' and y' (...), and the positions of their pupils on the axis.
 
-        The positions (...) are metres from C. Returns NaN if no ray within 90 degrees and before the fold reaches x' and
-        y'.
+        The positions (...) are metres from C. Returns NaN if no ray within 90 degrees of the axis, before the fold, has
+        this image.
         """
         d = np.stack([x, y, np.ones_like(x)], axis=-1)
         axial = d @ self.axis
