@@ -177,7 +177,7 @@ class Lens:
 def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
     """The lens of a model with the parameters in the order of `PARAMETERS`.
 
-    Raises ValueError on an unknown model or a wrong number of parameters.
+    Raises ValueError on an unknown model, a wrong number of parameters, or parameters out of range.
     """
     if model not in PARAMETERS or len(parameters) != len(PARAMETERS[model]):
         raise ValueError(f"{len(parameters)} parameters of the lens model {model}")
@@ -188,8 +188,11 @@ def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
         c = (1.0, *parameters)
     if model in ("cahvor", "cahvore"):
         axis = np.array([value[name] for name in _AXIS])
-        axis, linearity = axis / np.linalg.norm(axis), value.get("linearity", 1.0)
+        with np.errstate(invalid="ignore"):
+            axis, linearity = axis / np.linalg.norm(axis), value.get("linearity", 1.0)
         c = (1.0 + value["r0"], value["r1"], value["r2"])
+    if not np.isfinite(axis).all() or not -1 <= linearity <= 1 or value.get("xi", 0.0) < 0:
+        raise ValueError("an axis O that is not 0, linearity from -1 to 1, and xi of at least 0")
     pupil = value.get("e0_m", 0.0), value.get("e1_m", 0.0), value.get("e2_m", 0.0)
     skew_px, unknown = value.get("skew_px", 0.0), np.zeros((2, 1))
     lens = Lens(axis, np.array(c), linearity, value.get("xi"), pupil, skew_px, np.inf, unknown)
