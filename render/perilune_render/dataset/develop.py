@@ -193,8 +193,8 @@ def _rig(source: Dataset, config: DatasetConfig) -> Rig:
         exr_camera = source.info.exr_camera_of(name).intrinsics()
         camera = rig[name].camera
         if camera != exr_camera and (camera.lens is not None or exr_camera.lens is not None):
-            found = f"{camera.model}, for EXRs of the model {exr_camera.model}"
-            expected = "the camera of the EXRs, since a lens model needs a rendering of its own"
+            found = f"a camera of the model {camera.model} that differs from the camera of the EXRs, {exr_camera.model}"
+            expected = "the camera of the EXRs; a lens model needs a new rendering"
             raise UserError("--set or --config", "dataset.camera.lens", found, expected)
         if not exr_camera.covers(camera):
             raise UserError(
