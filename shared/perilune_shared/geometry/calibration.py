@@ -36,6 +36,7 @@ _LARGEST_FIT_PX = 0.05
 _WIDEST_RAD = np.radians(80)
 _HALF_PX = 0.5
 _LARGEST_XI = 1000.0
+_LARGEST_COEFFICIENT = 1e6
 _UNIT_TOLERANCE = 1e-3
 _SMALL_SKEW_PX = 1e-4
 """Skew that is ignored in a CAHV model, pixels; the text values are rounded."""
@@ -227,6 +228,8 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
     field = "distortion_model equidistant"
     if len(coefficients) != 4:
         raise UserError(path, field, f"{len(coefficients)} coefficients", "4")
+    if max(map(abs, coefficients)) > _LARGEST_COEFFICIENT:
+        raise UserError(path, field, f"{max(coefficients, key=abs):g}", f"at most {_LARGEST_COEFFICIENT:g}")
     angle = np.linspace(0, _WIDEST_RAD, 4001)
     square = angle**2
     factor = np.ones_like(angle)

@@ -10,6 +10,7 @@ from tests.helpers.scenes import config_with
 from perilune_render.cli.frames import read_camera
 from perilune_render.cli.main import main as render
 from perilune_render.config.cameras import CameraConfig
+from perilune_render.config.scene import SceneConfig, ViewConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.rig import mounted
 from perilune_render.flight.view import scene_view
@@ -110,7 +111,7 @@ def test_recipes_of_pinholes_have_no_lens():
 def test_the_ground_has_the_finest_scale_of_the_lens():
     """At the edge of an equidistant image, the scale along the edge is pi / 2 of the scale at the centre."""
     camera = camera_with({"model": "equidistant"})
-    scene = config_with(scene={"horizon": True, "views": [{"height_m": 100, "reach_m": 100}]}).scene
+    scene = SceneConfig(horizon=True, views=(ViewConfig(height_m=100.0, reach_m=100.0),))
     assert scene_view(scene, camera).focal_px == pytest.approx(camera.fx_px * np.pi / 2, rel=0.02)
 
 
@@ -186,11 +187,9 @@ def test_masks_of_a_fisheye_show_the_rims(wide):
     large = (labels["radius_px"] > 4).to_numpy() & (labels["bbox_x0_px"] > 0).to_numpy()
     assert large.sum() > 3
     np.testing.assert_allclose(area[large], (np.pi * labels["radius_px"] ** 2).to_numpy()[large], rtol=0.1)
-    visible = np.array([mask.visible.sum() for mask in masks]) / np.maximum(area, 1)
-    assert (
-        np.corrcoef(visible[large], labels["visible_fraction"].to_numpy()[large])[0, 1] > 0
-        or visible[large].min() > 0.9
-    )
+    # Most of a rim that the label calls visible is visible in the mask.
+    shown = large & (labels["visible_fraction"] == 1).to_numpy()
+    assert min(masks[k].visible.sum() / area[k] for k in np.flatnonzero(shown)) > 0.8
     # The crater index of the EXR agrees with the masks.
     k = int(np.argmax(np.where(large, labels["radius_px"], 0)))
     index = exr["crater"][masks[k].window][masks[k].visible]
