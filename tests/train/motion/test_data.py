@@ -68,9 +68,7 @@ def test_a_camera_with_a_lens_model_is_refused(dataset_nav):
     dataset = open_dataset(dataset_nav)
     fisheye = dataset.info.camera.model_copy(update={"model": "equidistant"})
     dataset.info = dataset.info.model_copy(update={"camera": fisheye})
-    with pytest.raises(
-        UserError, match=r"camera\.model: got equidistant, expected pinhole, with or without distortion"
-    ):
+    with pytest.raises(UserError, match=r"camera\.model: got equidistant, expected pinhole, with or"):
         load_trajectories(dataset)
 
 
