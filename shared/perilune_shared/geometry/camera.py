@@ -35,6 +35,10 @@ _MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""
 
 
+_FARTHEST = 1e100
+"""Radius at which the search for the edge of an image ends, if the coefficients hide the fold."""
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Camera intrinsics."""
@@ -299,7 +303,7 @@ class Camera:
         k1, k2, _, _, k3 = self.distortion
         fold = _fold_radius(self.distortion)
         end = min(fold, 1.0)
-        while end < fold and end * (1 + end**2 * (k1 + end**2 * (k2 + end**2 * k3))) < largest:
+        while end < min(fold, _FARTHEST) and end * (1 + end**2 * (k1 + end**2 * (k2 + end**2 * k3))) < largest:
             end = min(2 * end, fold)
         r = np.linspace(0, end, 2000, endpoint=False)
         r2 = r * r

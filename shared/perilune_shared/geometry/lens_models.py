@@ -188,7 +188,7 @@ def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
         c = (1.0, *parameters)
     if model in ("cahvor", "cahvore"):
         axis = np.array([value[name] for name in _AXIS])
-        with np.errstate(invalid="ignore"):
+        with np.errstate(all="ignore"):
             axis, linearity = axis / np.linalg.norm(axis), value.get("linearity", 1.0)
         c = (1.0 + value["r0"], value["r1"], value["r2"])
     if not np.isfinite(axis).all() or not -1 <= linearity <= 1 or value.get("xi", 0.0) < 0:
@@ -196,24 +196,29 @@ def lens_of(model: str, parameters: tuple[float, ...]) -> Lens:
     pupil = value.get("e0_m", 0.0), value.get("e1_m", 0.0), value.get("e2_m", 0.0)
     skew_px, unknown = value.get("skew_px", 0.0), np.zeros((2, 1))
     lens = Lens(axis, np.array(c), linearity, value.get("xi"), pupil, skew_px, np.inf, unknown)
-    fold = _fold_rad(lens)
     # tan and, without xi, the unified model have no image at 90 degrees.
     unbounded = linearity == 1 if lens.xi is None else lens.xi == 0
-    angles = np.linspace(0, min(fold, _HALF_TURN - 1e-7 if unbounded else _HALF_TURN), _N_TABLE)
-    return replace(lens, fold_rad=fold, table=np.stack([angles, lens.radius(angles)]))
+    end = _HALF_TURN - 1e-7 if unbounded else _HALF_TURN
+    fold = _fold_rad(lens, end)
+    angles = np.linspace(0, min(fold, end), _N_TABLE)
+    with np.errstate(all="ignore"):
+        return replace(lens, fold_rad=fold, table=np.stack([angles, lens.radius(angles)]))
 
 
-def _fold_rad(lens: Lens) -> float:
-    """Smallest theta below 90 degrees at which dr/dt = c0 + 3 c1 t^2 + 5 c2 t^4 + ... is not positive, or infinity."""
+def _fold_rad(lens: Lens, end_rad: float) -> float:
+    """Smallest theta up to `end_rad` at which dr/dt = c0 + 3 c1 t^2 + 5 c2 t^4 + ... is not positive, or infinity."""
     slope = lens.c * (2 * np.arange(len(lens.c)) + 1)
-    if slope[0] <= 0:
-        return 0.0
-    squares = np.roots(slope[::-1])
-    real = squares.real[(np.abs(squares.imag) < 1e-12 * np.maximum(np.abs(squares), 1)) & (squares.real > 0)]
-    if not len(real):
-        return np.inf
-    t = np.sqrt(real.min())
-    if lens.xi is None and lens.linearity < 0 and -lens.linearity * t >= 1:
-        return np.inf
-    theta = float(lens._inverse_of_g(np.array(t)))
-    return theta if theta < _HALF_TURN else np.inf
+
+    def grows(theta: Array) -> Array:
+        return np.polynomial.polynomial.polyval(np.square(lens._g(theta)), slope) > 0
+
+    with np.errstate(all="ignore"):
+        angles = np.linspace(0, end_rad, _N_TABLE)
+        first = int(np.argmin(grows(angles)))
+        if grows(angles[first]):
+            return np.inf
+        low, high = angles[max(first - 1, 0)], angles[first]
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if grows(middle) else (low, middle)
+    return float(high)
