@@ -45,6 +45,9 @@ def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
             f"no distortion that folds back within the image{_where(camera)}; use a weaker one, or a narrower view",
         )
     if camera.lens is not None:
+        if not np.isfinite(camera.scale_px):
+            found = "an image without a ray within 90 degrees of the axis"
+            raise UserError("configuration", f"{section}.lens", found, "a principal point nearer to the image")
         return camera
     covering = camera.covering_pinhole()
     if covering.width_px * covering.height_px > _LARGEST_COVER * width * height:

@@ -115,7 +115,7 @@ class Camera:
         distortion folds back, or within 90 degrees of the axis of a lens model.
         """
         if self.model != "pinhole":
-            return self._rays_and_pupils(pixels)[0]
+            return self.rays_and_starts(pixels)[0]
         uv = np.asarray(pixels, np.float64)
         x = (uv[..., 0] - self.cx_px) / self.fx_px
         y = (uv[..., 1] - self.cy_px) / self.fy_px
@@ -131,13 +131,25 @@ class Camera:
         lens = self.lens
         if lens is None or lens.is_central:
             return np.zeros((*np.shape(pixels)[:-1], 3))
-        return self._rays_and_pupils(pixels)[1][..., None] * lens.axis
+        return self.rays_and_starts(pixels)[1]
+
+    def rays_and_starts(self, pixels: ArrayLike) -> tuple[Array, Array]:
+        """Return `rays` and `ray_starts` (..., 3) of image coordinates (..., 2), pixels."""
+        lens = self.lens
+        if lens is None:
+            return self.rays(pixels), self.ray_starts(pixels)
+        x, y = self._normalised(pixels)
+        if any(self.distortion):
+            x, y = self._undistorted(x, y)
+        rays, pupil_m = lens.directions(x, y)
+        return rays, pupil_m[..., None] * lens.axis
 
     def points(self, pixels: ArrayLike, depth_m: ArrayLike) -> Array:
         """Return the points (..., 3), O_C, metres, at image coordinates (..., 2), pixels, and depths (...), metres."""
-        along = self.rays(pixels) * np.asarray(depth_m)[..., None]
-        lens = self.lens
-        return along if lens is None or lens.is_central else along + self.ray_starts(pixels)
+        if self.model == "pinhole":
+            return self.rays(pixels) * np.asarray(depth_m)[..., None]
+        rays, starts = self.rays_and_starts(pixels)
+        return rays * np.asarray(depth_m)[..., None] + starts
 
     def depth_m(self, points_camera_m: Array) -> Array:
         """Return the depths (...) of points (..., 3), O_C, metres: z, or the distance for a lens model."""
@@ -242,14 +254,6 @@ class Camera:
         skew = 0.0 if lens is None else lens.skew_px * y
         return (uv[..., 0] - self.cx_px - skew) / self.fx_px, y
 
-    def _rays_and_pupils(self, pixels: ArrayLike) -> tuple[Array, Array]:
-        """Return the rays (..., 3) of a lens model, and the distances (...) of their pupils from C, metres."""
-        lens = lens_of(self.model, self.parameters)
-        x, y = self._normalised(pixels)
-        if any(self.distortion):
-            x, y = self._undistorted(x, y)
-        return lens.directions(x, y)
-
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Return distorted coordinates, or NaN where the distortion has folded back.
 
@@ -321,12 +325,16 @@ def _fold_radius(distortion: Distortion) -> float:
 
 @lru_cache(maxsize=64)
 def _finest_px(camera: Camera) -> float:
-    """Return the largest number of pixels per radian in the image of a lens model, sampled at 65 x 65 places."""
+    """Return the largest number of pixels per radian in the image of a lens model, sampled at 65 x 65 places.
+
+    Returns NaN if no place has a ray.
+    """
     u, v = (np.linspace(0, size - 0.5, 65) for size in (camera.width_px, camera.height_px))
     places = np.stack(np.meshgrid(u, v), axis=-1)
     rays = camera.rays(places)
     steps = [np.linalg.norm(camera.rays(places + step) - rays, axis=-1) for step in ([0.5, 0.0], [0.0, 0.5])]
-    return float(0.5 / np.nanmin(steps))
+    seen = np.isfinite(steps)
+    return float(0.5 / np.min(steps, where=seen, initial=np.inf)) if seen.any() else np.nan
 
 
 def camera_from_site(points_site_m: ArrayLike, position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> Array:

@@ -75,6 +75,11 @@ def test_the_field_of_view_of_each_model_spans_the_width(lens, view_deg):
         ({"model": "equidistant"}, {"horizontal_fov_deg": 181}, "horizontal_fov_deg: got 181, expected at most 180"),
         (None, {"horizontal_fov_deg": 121}, "horizontal_fov_deg of at most 120 without dataset.camera.lens"),
         ({"model": "equidistant"}, {"distortion": {"k1": 0.1}}, "no distortion with lens model equidistant"),
+        (
+            {"model": "equidistant"},
+            {"principal_x_px": 900.0},
+            "lens: got an image without a ray within 90 degrees of the axis, expected a principal point nearer",
+        ),
         ({"model": "cahvor"}, {}, "horizontal_fov_deg: got 180.0, expected below 180 for lens model cahvor"),
         (
             {"model": "kannala_brandt", "k1": -0.25},

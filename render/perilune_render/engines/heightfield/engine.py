@@ -190,9 +190,8 @@ class HeightfieldEngine:
         row, column = np.ogrid[first[0] : first[0] + height, first[1] : first[1] + width]
         pixels = moved.astype(np.float64)
         pixels += np.stack(np.broadcast_arrays(column + 0.5, row + 0.5), axis=-1)
-        rays = self.camera.rays(pixels) @ rotation_camera_from_site
-        starts = origin + self.camera.ray_starts(pixels) @ rotation_camera_from_site
-        return starts, rays
+        rays, starts = self.camera.rays_and_starts(pixels)
+        return origin + starts @ rotation_camera_from_site, rays @ rotation_camera_from_site
 
     def _horizon_now(self, n_pixels: int | None = None) -> Horizon:
         """The horizon, or `NOWHERE` while computing it would not save time; `n_pixels` None means a whole image.
