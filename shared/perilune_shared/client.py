@@ -60,7 +60,8 @@ class ServedFrame:
     depth_m: np.ndarray | None
     """Depth (h, w) along the camera's axis, metres, float32; infinite for the sky; None if not requested.
 
-    If the lens distorts, depth and normals have the pixels of an undistorted camera that covers the whole view."""
+    If the lens distorts, depth and normals have the pixels of an undistorted camera that covers the whole view. With a
+    lens model, the depth is the distance along the ray."""
     normal: np.ndarray | None
     """Unit normals (h, w, 3), O_L, float32, in the pixels of `depth_m`; None if not requested."""
     labels: dict[str, np.ndarray] | None

@@ -33,10 +33,10 @@ ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
 For a level body this is the viewing direction in the paper by Song et al., "along the negative axis of Z_L"."""
 _MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""
-
-
 _FARTHEST = 1e100
 """Radius at which the search for the edge of an image ends, if the coefficients hide the fold."""
+_N_FOLD = 721
+"""Number of angles at which tangential distortion is tested for a fold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +209,18 @@ class Camera:
             angle = float(np.arctan(radius)) if lens is None else float(lens.angle(np.array(radius)))
         if lens is not None:
             angle = lens.fold_rad if np.isnan(angle) else min(angle, lens.fold_rad)
+        if any(self.distortion[2:4]):
+            angle = min(angle, self._tangential_fold_rad())
         return float(np.degrees(angle))
+
+    def _tangential_fold_rad(self) -> float:
+        """Return the smallest of _N_FOLD angles from the axis at which distortion mirrors the image, or infinity."""
+        theta, turn = np.linspace(0, np.pi / 2 - 1e-6, _N_FOLD), np.linspace(0, 2 * np.pi, 73)[:-1]
+        r = np.tan(theta) if self.lens is None else self.lens.radius(theta)
+        with np.errstate(all="ignore"):
+            xx, xy, yy = self._jacobian(r[:, None] * np.cos(turn), r[:, None] * np.sin(turn))
+            folded = ~(xx * yy > xy * xy).all(axis=1)
+        return float(theta[np.argmax(folded)]) if folded.any() else np.inf
 
     def rendered(self) -> "Camera":
         """Return the camera in whose pixels an engine renders: this camera, or the pinhole that covers a distortion."""

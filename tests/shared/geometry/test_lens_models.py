@@ -164,6 +164,15 @@ def test_the_unified_model_folds_where_its_distortion_does():
     assert np.sin(theta) / (np.cos(theta) + 0.8) == pytest.approx(1 / np.sqrt(3)) and camera.folds_back()
 
 
+def test_a_tangential_fold_is_found():
+    # With p2 alone, dx'/dx = 1 + 6 p2 x and dy'/dy = 1 + 2 p2 x: the first is 0 at x = -1 / (6 p2).
+    camera = replace(BENT, distortion=(0.0, 0.0, 0.0, 0.3, 0.0))
+    theta = np.radians(camera.fold_angle_deg)
+    assert np.sin(theta) / (np.cos(theta) + 0.8) == pytest.approx(1 / 1.8, abs=0.01) and camera.folds_back()
+    assert np.isnan(camera.rays(camera.outline())).any()
+    assert not replace(camera, fx_px=900.0, fy_px=900.0).folds_back()
+
+
 def test_the_scale_is_the_largest_number_of_pixels_per_radian():
     assert FISHEYE.scale_px == pytest.approx(FISHEYE.fx_px * np.pi / 2, rel=0.01)  # across the edge at 90 degrees
     assert CAHVOR.scale_px > 240 and Camera(9, 9, 5.0, 7.0, 4.0, 4.0).scale_px == 5.0
