@@ -18,8 +18,9 @@ The rays of CAHVORE do not meet in one point: the entrance pupil of a ray lies o
 No model has rays more than 90 degrees from O.
 
 Sources: Kannala and Brandt 2006, doi 10.1109/TPAMI.2006.153 (their radially symmetric part, as in OpenCV's fisheye);
-Mei and Rives 2007, doi 10.1109/ROBOT.2007.364084 (unified, as in OpenCV's omnidir); Yakimovsky and Cunningham 1978, doi
-10.1016/0146-664X(78)90112-0 (CAHV); Gennery 2006, doi 10.1007/s11263-006-5168-1 (CAHVORE, with CAHVOR as a part).
+Mei and Rives 2007, doi 10.1109/ROBOT.2007.364084 (unified, as in OpenCV's omnidir); Yakimovsky and Cunningham 1978,
+Computer Graphics and Image Processing 7, 195 (CAHV); Gennery 2006, doi 10.1007/s11263-006-5168-1 (CAHVOR, CAHVORE; the
+formulas agree with JPL's library cmod).
 """
 
 from dataclasses import dataclass, replace
