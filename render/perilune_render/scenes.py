@@ -70,8 +70,9 @@ class RenderedFrame:
     image: np.ndarray
     """Grey values, DN (h, w): uint8, or uint16 above 8 bits."""
     depth_m: np.ndarray
-    """Depth along the camera's axis, metres (h, w) float32, infinite for the sky. With lens distortion, its pixels
-    belong to a pinhole camera that covers the view, so its shape may differ from the shape of `image`."""
+    """Depth along the camera's axis, metres (h, w) float32, infinite for the sky. With a lens model, it is the distance
+    along the ray. With lens distortion, its pixels belong to a pinhole camera that covers the view, so its shape may
+    differ from the shape of `image`."""
     labels: pd.DataFrame
     """One row per crater, with the columns of the table `labels` except `frame_id`, and with the depth and diameter of
     the crater, `depth_m` and `diameter_m`, metres."""

@@ -27,6 +27,7 @@ import numpy as np
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.lens_models import PARAMETERS
 
 PORT = 10364
 """Default TCP port of the server for this client."""
@@ -59,7 +60,8 @@ class ServedFrame:
     depth_m: np.ndarray | None
     """Depth (h, w) along the camera's axis, metres, float32; infinite for the sky; None if not requested.
 
-    If the lens distorts, depth and normals have the pixels of an undistorted camera that covers the whole view."""
+    If the lens distorts, depth and normals have the pixels of an undistorted camera that covers the whole view. With a
+    lens model, the depth is the distance along the ray."""
     normal: np.ndarray | None
     """Unit normals (h, w, 3), O_L, float32, in the pixels of `depth_m`; None if not requested."""
     labels: dict[str, np.ndarray] | None
@@ -146,6 +148,8 @@ class SceneClient:
         head, _ = self._ask({"request": "scene"})
         camera = dict(head["camera"])
         camera["distortion"] = tuple(camera["distortion"])
+        if "parameters" in camera:
+            camera["parameters"] = tuple(camera["parameters"][name] for name in PARAMETERS[camera["model"]])
         return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
 
     def health(self) -> dict[str, str]:

@@ -1,20 +1,23 @@
 """The command `perilune-render frames`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from perilune_render.cli.dataset import JobOptions, finished_or_exit, first_worker
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
 from perilune_render.cli.sun import warn_of_sun
-from perilune_render.config.cameras import CameraConfig
+from perilune_render.config.cameras import CameraConfig, LensConfig
 from perilune_render.config.dataset import DatasetConfig
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.terminal import answer
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
+
+if TYPE_CHECKING:
+    from perilune_shared.geometry.camera import Camera
 
 Scene = Annotated[
     Path | None,
@@ -103,6 +106,21 @@ def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
     return config.model_copy(update={"camera": read_camera(path)})
 
 
+def _lens(camera: "Camera") -> dict[str, Any] | None:
+    """The settings `dataset.camera.lens` of a camera."""
+    if camera.model == "pinhole":
+        return None
+    from perilune_shared.geometry.lens_models import PARAMETERS
+
+    named = dict(zip(PARAMETERS[camera.model], camera.parameters, strict=True))
+    settings: dict[str, Any] = {name: value for name, value in named.items() if name in LensConfig.model_fields}
+    settings["model"] = camera.model
+    for vector, names in {"o": ("o_x", "o_y", "o_z"), "r": ("r0", "r1", "r2"), "e": ("e0_m", "e1_m", "e2_m")}.items():
+        if names[0] in named:
+            settings[vector] = [named[name] for name in names]
+    return settings
+
+
 def read_camera(path: Path) -> CameraConfig:
     """The camera of a file with settings of `dataset.camera` or a calibration of another program.
 
@@ -122,5 +140,6 @@ def read_camera(path: Path) -> CameraConfig:
             "principal_x_px": camera.cx_px,
             "principal_y_px": camera.cy_px,
             "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True)),
+            "lens": _lens(camera),
         }
     return resolve_over(CameraConfig, "camera", str(path), content)

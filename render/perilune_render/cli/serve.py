@@ -6,6 +6,7 @@ import typer
 
 from perilune_render.cli.frames import CameraFile, Scene, read_camera
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
+from perilune_render.config.cameras import MAX_PINHOLE_FOV_DEG
 from perilune_render.config.scene import SceneConfig
 from perilune_shared.console.progress import say
 from perilune_shared.errors import UserError
@@ -122,5 +123,5 @@ def _start(simulated: "SimulatedScene") -> tuple[int, int, float, "Array", int]:
 
     camera, stated = simulated.config.camera, simulated.config.scene or SceneConfig()
     sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
-    field_of_view_rad = float(np.radians(camera.horizontal_fov_deg))
+    field_of_view_rad = float(np.radians(min(camera.horizontal_fov_deg, MAX_PINHOLE_FOV_DEG)))
     return camera.width_px, camera.height_px, field_of_view_rad, sun, trajectory_seed(simulated.scene.seed, 0)

@@ -4,7 +4,7 @@ Nothing is rendered, so Blender is not needed. A run that was interrupted resume
 commit (`dataset/work.py`).
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from perilune_render.provenance.versions import imaging_versions
 from perilune_shared.config.resolve import resolve_over
 from perilune_shared.console.progress import Progress
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
+from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, fields_of, recipes_of
 from perilune_shared.dataset.names import SCENE_FILE_KINDS
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.writer import with_column
@@ -191,7 +191,12 @@ def _rig(source: Dataset, config: DatasetConfig) -> Rig:
         if name not in rig:
             raise UserError(source.store.at("dataset.json"), "cameras", name, "a camera of its recipe")
         exr_camera = source.info.exr_camera_of(name).intrinsics()
-        if not exr_camera.covers(rig[name].camera):
+        camera = rig[name].camera
+        if camera != exr_camera and (camera.lens is not None or exr_camera.lens is not None):
+            found = f"a camera of the model {camera.model} that differs from the camera of the EXRs, {exr_camera.model}"
+            expected = "the camera of the EXRs; a lens model needs a new rendering"
+            raise UserError("--set or --config", "dataset.camera.lens", found, expected)
+        if not exr_camera.covers(camera):
             raise UserError(
                 "--set or --config",
                 "dataset.camera" if name is None else f"dataset.cameras.{name}",
@@ -207,8 +212,8 @@ def _records(source: Dataset, rig: Rig) -> dict[str, Any]:
     info = source.info
     if info.cameras is None:
         (name,) = source.table("frames", ["camera"])["camera"].unique().to_pylist()
-        return {"camera": info.camera.model_copy(update=asdict(rig[name].camera))}
-    cameras = {n: each.model_copy(update=asdict(rig[n].camera)) for n, each in info.cameras.items()}
+        return {"camera": info.camera.model_copy(update=fields_of(rig[name].camera))}
+    cameras = {n: each.model_copy(update=fields_of(rig[n].camera)) for n, each in info.cameras.items()}
     return {"camera": next(iter(cameras.values())), "cameras": cameras}
 
 

@@ -19,12 +19,12 @@ def real_ground_share(
 ) -> float:
     """Share of a frame's ground pixels that show ground from the elevation model; 0 if no pixel shows ground.
 
-    `depth_m` (h, w) is the depth along the camera's axis, infinite where a pixel shows no ground.
+    `depth_m` (h, w) is the depth as in `Camera.points`, infinite where a pixel shows no ground.
     """
     hit = np.isfinite(depth_m)
     if not hit.any() or not scene.real.any():
         return 0.0
-    seen = camera.rays(camera.pixel_centres()[hit]) * depth_m[hit][:, None]
+    seen = camera.points(camera.pixel_centres()[hit], depth_m[hit])
     ground = seen @ rotation_camera_from_site + position_m
     return float((value_at(scene.real, scene.grid, ground[:, 0], ground[:, 1]) > 0.5).mean())
 

@@ -83,7 +83,10 @@ class Engine(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """Camera of the renderings, without distortion. It covers the view of the camera of the frames."""
+        """Camera of the renderings, without distortion. It covers the view of the camera of the frames.
+
+        If the camera of the frames has a lens model, both are equal.
+        """
 
     @property
     def sun(self) -> Array:
@@ -189,6 +192,8 @@ class FrameSource:
         shot, camera, depth_m = frame.shot, self.engine.camera, frame.radiance.depth_m.astype(np.float64)
         depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan)[..., None]
         rays = camera.rays(camera.pixel_centres())
+        if camera.lens is not None:
+            rays, depth_m = camera.points(camera.pixel_centres(), depth_m[..., 0]), np.ones_like(depth_m)
         if not self._rolls(shot):
             return depth_m * (rays @ shot.rotation_camera_from_site) + shot.position_m
         rows = self._row_poses(shot)

@@ -35,6 +35,9 @@ def open_engine(
 
         return HeightfieldEngine(scene, config, camera, sun, config.render.threads or usable_cores(), surface)
     check_installed(config.render.engine)
+    if camera.lens is not None:
+        found = f"cycles with the lens model {camera.model}"
+        raise UserError("configuration", "dataset.render.engine", found, "heightfield")
     with _blender_imported():
         # Import Blender only for this engine, since the import takes a second.
         from perilune_render.engines.blender.renderer import Renderer

@@ -144,7 +144,7 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, hori
     """
     _check_over(poses, grid, where, horizon=horizon)
     matrices = matrix_from_quaternion(poses.rotation_wxyz)
-    rays = np.einsum("nji,sj->nsi", matrices, camera.rays(_edge_points(camera)))
+    rays = np.einsum("nji,sj->nsi", matrices, camera.border_rays(edge_points(camera)))
     if horizon:
         _check_not_only_sky(poses, camera, matrices, where)
         return rays
@@ -207,7 +207,7 @@ def ground_in_view(position_m: Array, matrices: Array, camera: Camera) -> np.nda
     return hits_sphere(position_m, np.einsum("nji,sj->nsi", matrices, camera.rays(points))).any(axis=1)
 
 
-def _edge_points(camera: Camera) -> Array:
+def edge_points(camera: Camera) -> Array:
     """Image coordinates (S, 2) of points on the image border, including the corners, pixels."""
     share = np.arange(_POINTS_PER_SIDE) / _POINTS_PER_SIDE
     sides = [(share, 0 * share), (1 + 0 * share, share), (1 - share, 1 + 0 * share), (0 * share, 1 - share)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from perilune_render.config.cameras import MountingConfig
 from perilune_render.config.dataset import DatasetConfig, FlightConfig
-from perilune_render.flight.lens import camera_of
+from perilune_render.flight.lens import camera_of, check_engine
 from perilune_render.flight.trajectories import Flight
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
@@ -34,7 +34,7 @@ class MountedCamera:
     camera: Camera
     """Camera of the frames."""
     exr_camera: Camera
-    """Camera of the renderings and EXRs: a pinhole that covers the view of `camera`."""
+    """Camera of the renderings and EXRs: a pinhole that covers the view of `camera`, or `camera` with a lens model."""
     rotation_camera_from_body: Array
     """Rotation matrix (3, 3)."""
     position_in_body_m: Array
@@ -75,17 +75,22 @@ class MountedCamera:
         Its focal length is so large that its pixels cover no more ground than the smallest pixel of this camera. Raises
         UserError if this camera could see the horizon while the body is level.
         """
-        if np.array_equal(self.rotation_camera_from_body, ROTATION_CAMERA_FROM_BODY):
-            return self.exr_camera
-        corners = np.array(
-            [[u, v] for u in (0, self.exr_camera.width_px) for v in (0, self.exr_camera.height_px)], np.float64
-        )
-        rays = self.exr_camera.rays(corners) @ self.rotation_camera_from_body
+        camera = self.exr_camera
+        if camera.lens is None and np.array_equal(self.rotation_camera_from_body, ROTATION_CAMERA_FROM_BODY):
+            return camera
+        corners = np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)], np.float64)
+        places = corners if camera.lens is None else camera.outline()
+        rays = camera.border_rays(places) @ self.rotation_camera_from_body
         if (-rays[:, 2] < _LOWEST_RAY * np.linalg.norm(rays, axis=1)).any():
-            raise UserError("configuration", "dataset.cameras", "a view with the horizon", "a view of the ground alone")
+            expected = "a view of the ground alone, or given poses with dataset.scene.horizon=true"
+            field = "dataset.cameras" if camera.lens is None else "dataset.camera.lens"
+            expected = "a view of the ground alone" if camera.lens is None else expected
+            raise UserError("configuration", field, "a view with the horizon", expected)
         half = float(np.abs(rays[:, :2] / rays[:, 2:]).max())
         # From this image to the level image, lengths grow by at most the square of the ratio of depths.
-        focal = max(self.exr_camera.fx_px, self.exr_camera.fy_px) * max(1.0, float(-rays[:, 2].min())) ** 2
+        focal = max(camera.fx_px, camera.fy_px) * max(1.0, float(-rays[:, 2].min())) ** 2
+        if camera.lens is not None:
+            focal = camera.scale_px
         side = int(np.ceil(2 * half * focal))
         return Camera(side, side, focal, focal, side / 2, side / 2)
 
@@ -100,21 +105,26 @@ Rig = Mapping[str | None, MountedCamera]
 
 
 def rig_of(config: DatasetConfig) -> dict[str | None, MountedCamera]:
-    """The cameras of a configuration. Raises UserError if a distortion is too strong."""
+    """The cameras of a configuration.
+
+    Raises UserError if a distortion is too strong, or for a lens model that the engine does not render.
+    """
     if not config.cameras:
         camera = camera_of(config.camera)
-        return {None: MountedCamera(camera, camera.covering_pinhole(), ROTATION_CAMERA_FROM_BODY, np.zeros(3))}
+        check_engine(camera, config.render, "dataset.camera")
+        return {None: mounted(camera)}
     rig: dict[str | None, MountedCamera] = {}
     for name, settings in config.cameras.items():
         camera, mounting = camera_of(settings, f"dataset.cameras.{name}"), settings.mounting
+        check_engine(camera, config.render, f"dataset.cameras.{name}")
         position = np.array(mounting.position_in_body_m)
-        rig[name] = MountedCamera(camera, camera.covering_pinhole(), _rotation(mounting), position)
+        rig[name] = MountedCamera(camera, camera.rendered(), _rotation(mounting), position)
     return rig
 
 
 def mounted(camera: Camera) -> MountedCamera:
     """A camera with the default mounting."""
-    return MountedCamera(camera, camera.covering_pinhole(), ROTATION_CAMERA_FROM_BODY, np.zeros(3))
+    return MountedCamera(camera, camera.rendered(), ROTATION_CAMERA_FROM_BODY, np.zeros(3))
 
 
 def _rotation(mounting: MountingConfig) -> Array:

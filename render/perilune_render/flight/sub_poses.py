@@ -49,8 +49,8 @@ class RowPoses:
         depth_m (h, w) is the depth at the middle pose.
         """
         position, rotation = self.pose_at(0.0)
-        depth = np.where(np.isfinite(depth_m), depth_m, _SKY_M)[..., None]
-        points = (camera.rays(camera.pixel_centres()) * depth) @ rotation + position
+        points = camera.points(camera.pixel_centres(), np.where(np.isfinite(depth_m), depth_m, _SKY_M))
+        points = points @ rotation + position
         first, last = (
             camera.project(camera_from_site(points, *self.pose_at(float(self.time_s[end])))) for end in (0, -1)
         )
@@ -67,6 +67,8 @@ def sensor_rows(camera: Camera, exr_camera: Camera) -> np.ndarray:
 
     `camera` is the sensor's camera. Pixels outside its image get the nearest row.
     """
+    if camera == exr_camera:
+        return np.tile(np.arange(camera.height_px)[:, None], camera.width_px)
     row = camera.project(exr_camera.rays(exr_camera.pixel_centres()))[..., 1]
     # Far outside the image the distortion may fold back; those pixels are not used.
     return np.clip(np.floor(np.nan_to_num(row)), 0, camera.height_px - 1).astype(np.int64)

@@ -31,11 +31,11 @@ def view_of(config: DatasetConfig, rig: Rig, kind: str) -> ViewEnvelope:
 
 
 def scene_view(scene: SceneConfig, *cameras: Camera) -> ViewEnvelope:
-    """The views of a given scene, for pinhole cameras. Raises UserError if the scene has no views."""
+    """The views of a given scene, for the cameras of the renderings. Raises UserError if the scene has no views."""
     if not scene.views:
         raise UserError("configuration", "dataset.scene.views", "none", "at least one height_m with its reach_m")
     height, reach = (np.array([getattr(view, name) for view in scene.views]) for name in ("height_m", "reach_m"))
-    focal_px = max(max(camera.fx_px, camera.fy_px) for camera in cameras)
+    focal_px = max(_focal_px(camera) for camera in cameras)
     if scene.horizon:
         return ViewEnvelope(*_up_to_horizon(height, reach), focal_px, horizon=True)
     return ViewEnvelope(height, reach, focal_px)
@@ -68,9 +68,12 @@ def horizon_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
         raise UserError("configuration", "dataset.scene.views", "none", expected)
     reach = np.maximum.accumulate(nominal_distance_m(flight, altitude) + max(spread, 0.1 * flight.end_altitude_m))
     height = np.append(_lowest_m(flight, altitude), highest)
-    return ViewEnvelope(
-        *_up_to_horizon(height, np.append(reach, reach[-1])), max(camera.fx_px, camera.fy_px), horizon=True
-    )
+    return ViewEnvelope(*_up_to_horizon(height, np.append(reach, reach[-1])), _focal_px(camera), horizon=True)
+
+
+def _focal_px(camera: Camera) -> float:
+    """Largest number of pixels per radian near the axis of a pinhole, or in the image of a lens model."""
+    return max(camera.fx_px, camera.fy_px) if camera.lens is None else camera.scale_px
 
 
 def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
@@ -79,7 +82,7 @@ def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
     Raises UserError as `view_envelope` does.
     """
     if flight.is_oblique:
-        lens = max((each.exr_camera for each in rig.values()), key=lambda camera: max(camera.fx_px, camera.fy_px))
+        lens = max((each.exr_camera for each in rig.values()), key=_focal_px)
         flights = [each.flight_settings(flight) for each in rig.values()]
         return horizon_envelope(lens, max(flights, key=lambda each: each.position_sigma_m))
     views = [view_envelope(each.levelled(), each.flight_settings(flight)) for each in rig.values()]

@@ -27,6 +27,8 @@ from perilune_shared.geometry.frames import Array
 
 _STRETCH = 1.5
 """Approximate upper bound on the factor by which distortion stretches motion at the image edges."""
+_SKY_M = 1e9
+"""Depth assumed for pixels that show the sky, metres."""
 MIN_MOTION_PX = 0.05
 """Motion during the exposure below which no blur is computed, pixels."""
 FAINT_E = 100.0
@@ -194,16 +196,20 @@ def motion_px(
 ) -> np.ndarray:
     """Motion of the ground in the image, pixels (h, w, 2) float32.
 
-    `depth_m` (h, w) is the depth of the ground along the camera's axis, metres. The camera moves by `move_camera_m`
+    `depth_m` (h, w) is the depth of the ground as in `Camera.points`, metres. The camera moves by `move_camera_m`
     (3,) in its axes O_C and rotates by the rotation vector `turn_rad` (3,) in these axes. The result is of first order
     in the rotation and in the ratio of motion to depth. Pixels of the sky (infinite depth) move only by the rotation.
     """
+    if camera.lens is not None:
+        points = camera.points(camera.pixel_centres(), np.where(np.isfinite(depth_m), depth_m, _SKY_M))
+        after = points - move_camera_m - np.cross(np.asarray(turn_rad, np.float64), points)
+        return np.nan_to_num(camera.project(after) - camera.project(points)).astype(np.float32)
     rays = _rays(camera)
     step = np.asarray(move_camera_m, np.float32)
     move = (rays * step[2] - step[:2]) / depth_m[..., None]
     if np.any(turn_rad):
         move += _turned(rays, np.asarray(turn_rad, np.float32))
-    if not any(camera.distortion):
+    if not camera.distorts:
         return move * np.array([camera.fx_px, camera.fy_px], np.float32)
     moved = np.concatenate([rays + move, np.ones_like(depth_m)[..., None]], axis=-1)
     start = np.concatenate([rays, np.ones_like(depth_m)[..., None]], axis=-1)
@@ -222,10 +228,11 @@ def _turned(rays: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
 def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, move_camera_m: Array, turn_rad: Array) -> float:
     """Approximate upper bound on the motion of any pixel of `camera`, pixels; `pinhole` covers its view."""
     corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
-    widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
+    widest = 1.0 if camera.lens is not None else np.linalg.norm(pinhole.rays(corners), axis=-1).max()
     nearest_m = max(float(depth_m.min()), 1e-9)
     share = np.linalg.norm(move_camera_m) / nearest_m + np.linalg.norm(turn_rad) * widest
-    return float(share * widest * max(camera.fx_px, camera.fy_px) * _STRETCH)
+    focal_px = camera.scale_px if camera.lens is not None else max(camera.fx_px, camera.fy_px)
+    return float(share * widest * focal_px * _STRETCH)
 
 
 @lru_cache(maxsize=4)

@@ -19,7 +19,7 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
 from perilune_shared.geometry.frames import Array
-from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
+from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII, crater_masks
 
 _N_RIM = 48
 _ANGLES = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
@@ -132,9 +132,9 @@ def centred_labels(
 ) -> Labels:
     """The labels of `label_frame`, with NaN for everything that is read from the pixels of a rendering."""
     pose, (min_radius_px, max_radius_px) = (position_m, rotation_camera_from_site), radii_px
-    if any(camera.distortion):
+    if camera.distorts:
         in_camera = _in_camera(circles.centre_m, *pose)
-        rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
+        rough = camera.scale_px * circles.radius_m / np.maximum(camera.depth_m(in_camera), 1e-9)
         candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
         in_camera = in_camera[candidate]
     else:
@@ -232,7 +232,7 @@ def _visible_fraction(
     if not len(rows):
         return np.empty(0)
     radii = circles.radius_m[rows]
-    if not any(camera.distortion):
+    if not camera.distorts:
         return rim_shares(rims_of(circles, rows), camera, position_m, rotation, depth_m)
     points_m = rim_points(circles.centre_m[rows], circles.normal[rows], radii, _N_RIM)
     points = camera_from_site(points_m, position_m, rotation)
@@ -240,9 +240,10 @@ def _visible_fraction(
     inside = camera.inside(pixels)
     column = np.where(inside, pixels[..., 0], 0).astype(int)
     row = np.where(inside, pixels[..., 1], 0).astype(int)
-    slack = np.maximum(SLACK_RADII * radii, SLACK_PX * points[:, 0, 2] / camera.fx_px)
+    point_m = camera.depth_m(points)
+    slack = np.maximum(SLACK_RADII * radii, SLACK_PX * point_m[:, 0] / camera.scale_px)
     depth = depth_m[row, column]
-    return (inside & np.isfinite(depth) & (points[..., 2] <= depth + slack[:, None])).mean(axis=1)
+    return (inside & np.isfinite(depth) & (point_m <= depth + slack[:, None])).mean(axis=1)
 
 
 def crater_index(
@@ -256,15 +257,20 @@ def crater_index(
 
     A pixel shows a crater if it shows the interior, the disc within the rim. The interior is hidden where the ground is
     nearer than the disc by more than SLACK_RADII radii and by more than SLACK_PX pixel widths. `depth_m` (h, w) is the
-    depth of the ground along the camera's axis, metres; without it, no interior is hidden. Pixels of the sky (infinite
-    depth) are -1. All craters at least a pixel wide are included, even if they have no label. `camera` has no
-    distortion.
+    depth of the ground, metres; without it, no interior is hidden. Pixels of the sky (infinite depth) are -1. All
+    craters at least a pixel wide are included, even if they have no label. `camera` has no distortion, but may have a
+    lens model.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     candidate = _reaching_in(camera, in_camera, circles.radius_m)
     candidate = candidate[np.argsort(-circles.radius_m[candidate], kind="stable")]
     centres, radii = in_camera[candidate], circles.radius_m[candidate]
     normals = circles.normal[candidate] @ rotation_camera_from_site.T
+    if camera.distorts:
+        image = np.full((camera.height_px, camera.width_px), -1, np.float32)
+        for mask in crater_masks(camera, circles.crater_id[candidate].tolist(), centres, normals, radii, depth_m):
+            image[mask.window][mask.amodal if mask.visible is None else mask.visible] = mask.crater_id
+        return image
     boxes = project_circles(camera, centres, normals, radii).bounding_boxes()
     image = smallest_crater(circles.crater_id[candidate], Circles(centres, normals, radii), boxes, camera, depth_m)
     if depth_m is not None:
@@ -278,6 +284,8 @@ def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray
     `centre_m` is (N, 3), `radius_m` is (N,).
     """
     x, y, z = centre_m.T
+    if camera.distorts:
+        return np.flatnonzero((z > 0) & (2 * camera.scale_px * radius_m > camera.depth_m(centre_m)))
     rows = np.flatnonzero((z > 0) & (2 * camera.fx_px * radius_m > z))
     x, y, z, radius = x[rows], y[rows], z[rows], radius_m[rows]
     with np.errstate(divide="ignore"):

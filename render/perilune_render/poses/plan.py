@@ -9,7 +9,7 @@ import numpy as np
 from perilune_render.config.dataset import DatasetConfig
 from perilune_render.config.scene import HIGHEST_M, SceneConfig, ViewConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, seen_by
-from perilune_render.flight.pose_checks import ground_in_view
+from perilune_render.flight.pose_checks import edge_points, ground_in_view
 from perilune_render.flight.rig import MountedCamera, Rig, rig_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import scene_view
@@ -149,11 +149,12 @@ def _is_ground_shown(position_m: Array, rotation_wxyz: Array, rig: Rig, *, horiz
 
 
 def _corner_rays(camera: Camera, matrices: Array) -> Array:
-    """Rays (N, 4, 3), O_L, through the corners of the image.
+    """Rays (N, 4, 3), O_L, through the corners of the image; of a lens model, through S points of its edge.
 
     `matrices` are rotation_camera_from_site (N, 3, 3).
     """
-    corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
+    places = np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)])
+    corners = camera.border_rays(places if camera.lens is None else edge_points(camera))
     return np.einsum("nji,sj->nsi", matrices, corners)
 
 

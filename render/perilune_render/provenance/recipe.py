@@ -65,6 +65,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for camera in (plain["camera"], *plain.get("cameras", {}).values()):
         if camera["focal_length_y_px"] is None:
             del camera["focal_length_y_px"]
+        if camera["lens"] is None:
+            del camera["lens"]
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:
             del plain["terrain"]["elevation"][name]

@@ -17,6 +17,7 @@ from perilune_render.engines.heightfield.surface import Surface, surface_of
 from perilune_render.engines.open_engine import check_engine, open_engine
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS, Poses, check_places, check_poses
+from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
@@ -149,8 +150,8 @@ class SimulatedScene:
 
     def check_view(self, view: View) -> None:
         """Raise UserError if `perilune-render frames` would reject the view."""
-        pinhole = view.camera.covering_pinhole()
-        check_poses(_poses(view.position_m, view.rotation_camera_from_site), pinhole, self.scene, "request")
+        rendered = view.camera.rendered()
+        check_poses(_poses(view.position_m, view.rotation_camera_from_site), rendered, self.scene, "request")
 
     def hits(self, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
         """Distances (N,) and normals (N, 3) of the first hits of rays, as from `heightfield.query.first_hits`."""
@@ -175,9 +176,9 @@ class SimulatedScene:
         if cycles:
             self._note("building the scene in Blender for another camera or Sun")
         stack = ExitStack()
-        pinhole = view.camera.covering_pinhole()
+        rendered = view.camera.rendered()
         engine = stack.enter_context(
-            open_engine(self.scene, self.config, pinhole, view.sun, None if cycles else self.surface)
+            open_engine(self.scene, self.config, rendered, view.sun, None if cycles else self.surface)
         )
         return FrameSource.of(engine, self.config, view.camera, self._circles), stack
 
@@ -197,12 +198,14 @@ def open_simulation(config: DatasetConfig) -> SimulatedScene:
 
     Its ground covers the views in `dataset.scene.views` or, without them, the flights of `dataset.nav`.
     """
-    pinhole = camera_of(config.camera).covering_pinhole()
+    (mounted_camera,) = rig_of(config).values()
     scene = config.scene or SceneConfig()
     if scene.views:
-        view = scene_view(scene, pinhole)
+        view = scene_view(scene, mounted_camera.exr_camera)
+    elif scene.horizon:
+        view = horizon_envelope(mounted_camera.exr_camera, config.nav.flight)
     else:
-        view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
+        view = view_envelope(mounted_camera.levelled(), config.nav.flight)
     return simulation_over(config, view, scene_seed(config))
 
 

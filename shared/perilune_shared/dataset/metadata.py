@@ -20,6 +20,7 @@ from pydantic import (
 from perilune_shared.dataset.names import CAMERA_PATTERN, ImageState, Kind, SplitUnit
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.lens_models import PARAMETERS, lens_of
 
 NOT_STATED = "LicenseRef-not-stated"
 """Licence of a dataset whose author has not stated one. A merge keeps it as a term of the licence."""
@@ -49,6 +50,9 @@ class _Info(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+_OF_LENS = ("model", "parameters")
+
+
 class CameraRecord(_Info):
     """Camera in dataset.json: the fields of `Camera` with limits, and the mounting on the lander (O_B)."""
 
@@ -66,6 +70,12 @@ class CameraRecord(_Info):
     """Principal point, pixels below the top edge."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """Brown-Conrady k1, k2, p1, p2, k3, for coordinates divided by the focal length."""
+    model: Annotated[str, Field(max_length=40)] = "pinhole"
+    """pinhole, or the lens model: equidistant, kannala_brandt, unified, cahvor, cahvore (geometry.lens_models).
+
+    Omitted for a pinhole."""
+    parameters: dict[str, Annotated[float, Field(ge=-_FAR, le=_FAR)]] = {}
+    """Parameters of the lens model by name; omitted for a pinhole."""
     rotation_camera_from_body: tuple[_Row, _Row, _Row]
     """Rotation matrix (3, 3), row by row."""
     position_in_body_m: _Row
@@ -78,7 +88,23 @@ class CameraRecord(_Info):
         rows = np.array(self.rotation_camera_from_body)
         if not (np.abs(rows @ rows.T - np.eye(3)) < _ROTATION_TOLERANCE).all() or np.linalg.det(rows) < 0:
             raise ValueError("rotation_camera_from_body to be a rotation")
+        if self.model != "pinhole" and self.model not in PARAMETERS:
+            raise ValueError(f"model pinhole, {', '.join(PARAMETERS)}")
+        names = PARAMETERS.get(self.model, ())
+        if sorted(self.parameters) != sorted(names):
+            raise ValueError(f"parameters {', '.join(names) or '{}'} of the model {self.model}")
+        if self.model != "pinhole":
+            lens_of(self.model, self._parameters())
         return self
+
+    @model_serializer(mode="wrap")
+    def _without_lens(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit `model` and `parameters` of a pinhole, so that its record keeps the older form."""
+        values: dict[str, Any] = handler(self)
+        return {key: value for key, value in values.items() if self.model != "pinhole" or key not in _OF_LENS}
+
+    def _parameters(self) -> tuple[float, ...]:
+        return tuple(self.parameters[name] for name in PARAMETERS.get(self.model, ()))
 
     @classmethod
     def of(
@@ -90,11 +116,20 @@ class CameraRecord(_Info):
         """Record a camera. By default it is at the origin of O_B and looks along -Z_B."""
         x, y, z = rotation_camera_from_body.tolist()
         rows = tuple(x), tuple(y), tuple(z)
-        return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=position_in_body_m)
+        return cls(**fields_of(camera), rotation_camera_from_body=rows, position_in_body_m=position_in_body_m)
 
     def intrinsics(self) -> Camera:
         """Return the camera model, without the mounting."""
-        return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
+        size, focal = (self.width_px, self.height_px), (self.fx_px, self.fy_px)
+        return Camera(*size, *focal, self.cx_px, self.cy_px, self.distortion, self.model, self._parameters())
+
+
+def fields_of(camera: Camera) -> dict[str, Any]:
+    """Return the fields of a camera as in its record, without the mounting; a lens model has named parameters."""
+    fields = asdict(camera)
+    if camera.model == "pinhole":
+        return {name: value for name, value in fields.items() if name not in _OF_LENS}
+    return fields | {"parameters": dict(zip(PARAMETERS[camera.model], camera.parameters, strict=True))}
 
 
 _LATER_TABLES = ("star_tracker", "doppler_lidar")
@@ -205,7 +240,9 @@ class DatasetInfo(_Info):
     camera: CameraRecord
     """Camera of all frames (PNG)."""
     exr_camera: CameraRecord | None = None
-    """Camera of the EXRs, without distortion, with at least the view of `camera`; null without EXRs."""
+    """Camera of the EXRs, without distortion, with at least the view of `camera`; null without EXRs.
+
+    With a lens model, it is equal to `camera`, and depths are distances along the rays."""
     cameras: dict[_CameraName, CameraRecord] | None = None
     """Cameras by name; null if there is only one camera.
 

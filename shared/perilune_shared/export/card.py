@@ -199,6 +199,9 @@ def _files(dataset: Dataset) -> str:
 
 def _camera(camera: CameraRecord) -> str:
     lens = "no distortion" if not any(camera.distortion) else f"distortion {', '.join(map(str, camera.distortion))}"
+    if camera.model != "pinhole":
+        values = "".join(f", {name} {value:g}" for name, value in camera.parameters.items())
+        lens += f", lens model {camera.model}{values}"
     return (
         f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px, principal point "
         f"({camera.cx_px:.6g}, {camera.cy_px:.6g}) px from the outer corner of the top-left pixel, {lens}."

@@ -1,14 +1,18 @@
-"""Read a camera from a YAML file: settings, or a calibration of OpenCV, ROS, Kalibr or EuRoC.
+"""Read a camera from a file: settings, a calibration of OpenCV, ROS, Kalibr or EuRoC, or CAHV, CAHVOR, CAHVORE.
 
 In these calibrations the centre of the top-left pixel is at (0, 0). In perilune it is at (0.5, 0.5), so half a pixel is
-added to the principal point. The distortion model of perilune is Brown-Conrady (`plumb_bob`, `radtan`). An equidistant
-distortion (Kannala and Brandt 2006, doi 10.1109/TPAMI.2006.153) is replaced by the best-fitting Brown-Conrady
-distortion. The file is refused if the fit error exceeds 0.05 px.
+added to the principal point. An equidistant distortion (Kannala and Brandt 2006, doi 10.1109/TPAMI.2006.153) is
+replaced by the best-fitting Brown-Conrady distortion if the fit error is at most 0.05 px. Otherwise it is kept as the
+lens model `kannala_brandt`.
+
+CAHV, CAHVOR and CAHVORE are read from text files as JPL's programs write them, lines `Model = CAHVORE3,0.5 = general`,
+`Dimensions = width height` and `C = x y z` to `E = x y z`. O_C has its z axis along A and its y axis along V's part
+normal to A.
 """
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +35,12 @@ _LARGEST_FIT_PX = 0.05
 """Maximum fit error of a Brown-Conrady distortion that replaces an equidistant distortion, pixels."""
 _WIDEST_RAD = np.radians(80)
 _HALF_PX = 0.5
+_LARGEST_XI = 1000.0
+_LARGEST_COEFFICIENT = 1e6
+_UNIT_TOLERANCE = 1e-3
+_SMALL_SKEW_PX = 1e-4
+"""Skew that is ignored in a CAHV model, pixels; the text values are rounded."""
+_CAHV = re.compile(r"^\s*Model\s*=\s*CAHV", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +60,10 @@ def read_camera_file(path: Path) -> Calibration | dict[str, Any]:
 
     The mapping is not validated. Raises UserError if the file is not YAML or its calibration is not supported.
     """
-    content = _mapping(path)
+    text = _text(path)
+    if _CAHV.search(text):
+        return _cahvore(path, text)
+    content = _mapping(path, text)
     keys = {key.lower(): key for key in content}
     cameras = [key for key in content if re.fullmatch(r"cam\d+", key)]
     if len(cameras) > 1:
@@ -69,16 +82,19 @@ def read_camera_file(path: Path) -> Calibration | dict[str, Any]:
     return content
 
 
-def _mapping(path: Path) -> dict[str, Any]:
+def _text(path: Path) -> str:
     if not path.is_file():
         raise UserError(path, "camera", "a folder" if path.is_dir() else "no such file", "a YAML file")
     if path.stat().st_size > _LARGEST_FILE_BYTES:
         expected = f"at most {_LARGEST_FILE_BYTES}; keep intrinsics and distortion alone"
         raise UserError(path, "camera", f"{path.stat().st_size} bytes", expected)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise UserError(path, "camera", "bytes that are not UTF-8", "a YAML file") from None
+
+
+def _mapping(path: Path, text: str) -> dict[str, Any]:
     if text.lstrip().startswith("<"):
         raise UserError(path, "camera", "an XML file of OpenCV", "YAML: give cv::FileStorage a name that ends in .yaml")
     if "CAMERA_ID" in text and text.lstrip().startswith("#"):
@@ -102,14 +118,18 @@ def _plain(text: str) -> str:
 def _kalibr(path: Path, content: dict[str, Any]) -> Calibration:
     """Return the camera in a camchain file of Kalibr or a sensor.yaml of EuRoC."""
     model = str(content.get("camera_model", "pinhole"))
-    if model != "pinhole":
-        raise UserError(path, "camera_model", model, "pinhole")
-    fx, fy, cx, cy = _numbers(path, "intrinsics", content.get("intrinsics"), (4,))
+    if model not in ("pinhole", "omni"):
+        raise UserError(path, "camera_model", model, "pinhole or omni")
+    *xi, fx, fy, cx, cy = _numbers(path, "intrinsics", content.get("intrinsics"), (4 + (model == "omni"),))
     size = _numbers(path, "resolution", content.get("resolution"), (2,))
     name = "distortion_coeffs" if "distortion_coeffs" in content else "distortion_coefficients"
     coefficients = _numbers(path, name, content.get(name, []), (0, 4, 5, 8))
     stated = str(content.get("distortion_model", "none" if not any(coefficients) else ""))
-    camera = _camera(path, size, (fx, fy, cx, cy), stated, coefficients)
+    camera = _camera(path, size, (fx, fy, cx, cy), stated, coefficients, is_omni=model == "omni")
+    if xi:
+        if not 0 <= xi[0] <= _LARGEST_XI:
+            raise UserError(path, "intrinsics: xi", xi[0], f"0 to {_LARGEST_XI:g}")
+        camera = replace(camera, model="unified", parameters=(xi[0],))
     rotation, position = None, np.zeros(3)
     for name, is_inverse in (("T_cam_imu", False), ("T_BS", True)):
         if content.get(name) is not None:
@@ -156,9 +176,15 @@ def _coefficients(path: Path, content: dict[str, Any]) -> list[float]:
 
 
 def _camera(
-    path: Path, size: Sequence[float], intrinsics: Sequence[float], model: str, coefficients: list[float]
+    path: Path,
+    size: Sequence[float],
+    intrinsics: Sequence[float],
+    model: str,
+    coefficients: list[float],
+    *,
+    is_omni: bool = False,
 ) -> Camera:
-    """Return a pinhole camera with distortion.
+    """Return a camera with distortion.
 
     Without the name of a model, the distortion is Brown-Conrady, but four coefficients then raise UserError.
     """
@@ -173,6 +199,8 @@ def _camera(
         expected = "plumb_bob or equidistant: four coefficients fit both"
         raise UserError(path, "distortion_model", "no model for four coefficients", expected)
     name = model.strip().lower() or _BROWN[0]
+    if name in _EQUIDISTANT and is_omni:
+        raise UserError(path, "distortion_model", model, "radtan or none with camera_model omni")
     if name in _EQUIDISTANT:
         return _fitted(path, pinhole, coefficients or [0.0] * 4)
     if name not in _BROWN:
@@ -195,11 +223,13 @@ def _fields(camera: Camera) -> tuple[int, int, float, float, float, float]:
 def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camera:
     """Return the camera with the Brown-Conrady distortion that best fits an equidistant distortion.
 
-    Raises UserError if the fit error is too large.
+    Returns a camera of the lens model `kannala_brandt` if the fit error is too large. Raises UserError if that folds.
     """
     field = "distortion_model equidistant"
     if len(coefficients) != 4:
         raise UserError(path, field, f"{len(coefficients)} coefficients", "4")
+    if max(map(abs, coefficients)) > _LARGEST_COEFFICIENT:
+        raise UserError(path, field, f"{max(coefficients, key=abs):g}", f"at most {_LARGEST_COEFFICIENT:g}")
     angle = np.linspace(0, _WIDEST_RAD, 4001)
     square = angle**2
     factor = np.ones_like(angle)
@@ -209,9 +239,12 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
     far = pinhole.rays(pinhole.outline())[:, :2]
     largest = float(np.hypot(*far.T).max())
     inside = int(np.argmax(distorted >= largest)) if (distorted >= largest).any() else 0
+    exact = replace(pinhole, model="kannala_brandt", parameters=tuple(coefficients))
+    if exact.folds_back():
+        found = f"coefficients that fold the image at {exact.fold_angle_deg:.2f} degrees from the axis"
+        raise UserError(path, field, found, "a fold outside the image")
     if not inside or (np.diff(distorted[: inside + 1]) <= 0).any():
-        expected = "a view of at most 80 degrees from the axis, without a fold"
-        raise UserError(path, field, f"an image whose edge is {largest:.3g} focal lengths from the centre", expected)
+        return exact
     radius, target = np.tan(angle[1 : inside + 1]), distorted[1 : inside + 1]
     powers = np.stack([radius**3, radius**5, radius**7], axis=1)
     weight = np.ones_like(radius)
@@ -223,11 +256,75 @@ def _fitted(path: Path, pinhole: Camera, coefficients: Sequence[float]) -> Camer
         weight = weight / weight.mean()
     worst_px = float(error.max()) * max(pinhole.fx_px, pinhole.fy_px)
     if not worst_px <= _LARGEST_FIT_PX:
-        found = f"a view of {np.degrees(angle[inside]):.0f} degrees from the axis, fitted to {worst_px:.2g} px"
-        expected = f"a radial-tangential fit to {_LARGEST_FIT_PX} px; undistort the images"
-        raise UserError(path, field, found, expected)
+        return exact
     k1, k2, k3 = fit.tolist()
     return Camera(*_fields(pinhole), distortion=(k1, k2, 0.0, 0.0, k3))
+
+
+def _cahvore(path: Path, text: str) -> Calibration:
+    """Return the camera of a file with a CAHV, CAHVOR or CAHVORE model.
+
+    Position and attitude are relative to the frame of the file, which is taken for the frame of the body.
+    """
+    lines = (line.partition("=") for line in text.splitlines() if not line.lstrip().startswith("#"))
+    values = {name.strip(): value.strip() for name, sign, value in lines if sign}
+    stated = values["Model"].partition("=")[0].strip()
+    match = re.fullmatch(r"(CAHV|CAHVOR)|CAHVORE(?:([123])(?:,(\S+))?)", stated)
+    linear = {"1": 1.0, "2": 0.0}.get(match[2] or "") if match else None
+    if match and match[2] == "3" and match[3]:
+        try:
+            linear = float(match[3])
+        except ValueError:
+            match = None
+    if not match or (match[2] and (linear is None or not -1 <= linear <= 1)):
+        expected = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,P with P from -1 to 1"
+        raise UserError(path, "Model", stated, expected)
+    names = {"CAHV": "CAHV", "CAHVOR": "CAHVOR"}.get(match[1] or "", "CAHVORE")
+    vectors = {name: np.array(_stated(path, name, values, 3)) for name in names}
+    width, height = _stated(path, "Dimensions", values, 2)
+    if [width, height] != [int(width), int(height)] or not 1 <= min(width, height) <= max(
+        width, height
+    ) <= _LARGEST_SIDE_PX:
+        raise UserError(path, "Dimensions", [width, height], f"two whole numbers from 1 to {_LARGEST_SIDE_PX}")
+    for name in [each for each in "AO" if each in vectors]:
+        length = float(np.linalg.norm(vectors[name]))
+        if not abs(length - 1) <= _UNIT_TOLERANCE:
+            raise UserError(path, name, f"length {length:.6g}", "a unit vector")
+        vectors[name] = vectors[name] / length
+    a, h, v = vectors["A"], vectors["H"], vectors["V"]
+    cy = float(v @ a)
+    down = v - cy * a
+    fy = float(np.linalg.norm(down))
+    y = down / fy if fy > 0 else down
+    x = np.cross(y, a)
+    fx, skew, cx = (float(h @ each) for each in (x, y, a))
+    if not (fx > 0 and fy > 0):
+        raise UserError(path, "H", h.tolist(), "A, H and V as in CAHV: A forward, H to the right, V down")
+    rotation = np.stack([x, y, a])
+    camera = Camera(int(width), int(height), fx, fy, cx + _HALF_PX, cy + _HALF_PX)
+    if names != "CAHV" or abs(skew) > _SMALL_SKEW_PX:
+        axis, r = rotation @ vectors.get("O", a), vectors.get("R", np.zeros(3))
+        parameters = (skew, *axis.tolist(), *r.tolist())
+        if names == "CAHVORE":
+            parameters = (*parameters, *vectors["E"].tolist(), float(linear or 0.0))
+        camera = replace(camera, model="cahvore" if names == "CAHVORE" else "cahvor", parameters=parameters)
+    if camera.folds_back():
+        found = f"coefficients that fold the image at {camera.fold_angle_deg:.2f} degrees from O"
+        raise UserError(path, "R", found, "a fold outside the image")
+    cx_m, cy_m, cz_m = vectors["C"].tolist()
+    return Calibration(camera, rotation, (cx_m, cy_m, cz_m))
+
+
+def _stated(path: Path, name: str, values: dict[str, str], count: int) -> list[float]:
+    """Return the numbers of a line `name = ...`. Raises UserError unless there are `count` finite numbers."""
+    text = values.get(name)
+    try:
+        numbers = [float(each) for each in (text or "").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e9:
+        raise UserError(path, name, "nothing" if text is None else text[:100], f"{count} numbers: {name} = 1.0 ...")
+    return numbers
 
 
 def _numbers(path: Path, field: str, value: object, lengths: Sequence[int]) -> list[float]:

@@ -1,4 +1,4 @@
-"""Project circles in space to ellipses in the image: exactly, or by a fit if the lens distorts.
+"""Project circles in space to ellipses in the image: exactly, or by a fit for distortion and lens models.
 
 A circle with centre c, radius r and normal n is the set c + r (cos t p + sin t q), where p and q span its plane. Its
 image is the conic H^-T diag(1, 1, -1) H^-1 with H = K [r p, r q, c] (Hartley & Zisserman, Multiple View Geometry,
@@ -75,10 +75,10 @@ def project_circles(
 ) -> Ellipses:
     """Project N circles in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3).
 
-    If the lens distorts, an ellipse is fitted to 64 points of the circle by least squares. The points are within
-    0.05 px of the ellipse for radii up to 50 px and distortions up to 5 px in the corners of 256 px images. Returns NaN
-    if the image is not an ellipse: the circle reaches behind the camera or past the fold of the distortion, or is seen
-    edge on.
+    With distortion or a lens model, an ellipse is fitted to 64 points of the circle by least squares. The points are
+    within 0.05 px of the ellipse for radii up to 50 px and distortions up to 5 px in the corners of 256 px images.
+    Returns NaN if the image is not an ellipse: the circle reaches behind the camera, past the fold of the distortion or
+    more than 90 degrees from the axis of a lens model, or is seen edge on.
     """
     c, n = np.asarray(centres_camera_m, np.float64), np.asarray(normals_camera, np.float64)
     r = np.asarray(radii_m, np.float64)
@@ -87,7 +87,7 @@ def project_circles(
     nearest = c[:, 2] - r * np.hypot(p[:, 2], q[:, 2])
     edge_on = np.abs(np.einsum("ij,ij->i", n, c)) < 1e-9 * np.linalg.norm(c, axis=1)
     bad = (nearest <= 0) | edge_on
-    if any(camera.distortion):
+    if camera.distorts:
         points = camera.project(rim_points(c, n, r, _N_FITTED))
         bad |= np.isnan(points).any(axis=(1, 2))
         points[bad] = _UNIT_CIRCLE
@@ -142,7 +142,9 @@ def fit_ellipses(points_px: ArrayLike) -> Ellipses:
     conic[:, 1, 2] = conic[:, 2, 1] = e / 2
     back = np.zeros((len(points), 3, 3))
     back[:, :2, :2], back[:, 2, 2] = whiten, 1.0
-    centre, axes, theta = _ellipse_of_conic(back.swapaxes(1, 2) @ conic @ back)
+    # A strongly curved image of a circle may be fitted by a hyperbola, whose axes are NaN.
+    with np.errstate(invalid="ignore"):
+        centre, axes, theta = _ellipse_of_conic(back.swapaxes(1, 2) @ conic @ back)
     return Ellipses(centre[:, 0] + middle[:, 0], centre[:, 1] + middle[:, 1], axes[:, 0], axes[:, 1], theta)
 
 

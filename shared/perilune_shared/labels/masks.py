@@ -22,12 +22,14 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.ellipse import project_circles, rim_points
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.rolling_shutter import Moving
 
 SLACK_RADII, SLACK_PX = 0.1, 2.0
 """Tolerances of the depth test, in crater radii and in pixel widths at the crater; the larger one applies."""
+_N_RIM = 64
+"""Number of rim points whose images bound a mask of a lens model."""
 _CRATER = ["crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 
 
@@ -120,14 +122,18 @@ def crater_masks(
     """Return the masks of the craters with the given rim circles.
 
     The N circles are in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3). Masks and `depth_m` (h, w)
-    are in the pixels of `camera`; the depth is measured along the optical axis, metres. A mask has no pixels if the rim
+    are in the pixels of `camera`; the depth is metres as `Camera.points` takes it. A mask has no pixels if the rim
     is outside the image or not wholly in front of the camera.
     """
-    rays = camera.rays(camera.pixel_centres())
+    pixels = camera.pixel_centres()
+    rays, starts = camera.rays(pixels), camera.ray_starts(pixels)
     size = np.array([camera.width_px, camera.height_px])
     boxes = project_circles(camera, centres_camera_m, normals_camera, radii_m).bounding_boxes()
     # With distortion, the ellipse is only fitted to the rim's image, which may reach beyond the ellipse's box.
-    margin = 1 if any(camera.distortion) else 0
+    margin = 1 if camera.distorts else 0
+    if camera.lens is not None and len(boxes):
+        rims = camera.project(rim_points(centres_camera_m, normals_camera, radii_m, _N_RIM))
+        boxes = np.where(np.isnan(boxes), np.nan, np.concatenate([rims.min(axis=1), rims.max(axis=1)], axis=1))
     without_box = np.isnan(boxes).any(axis=1, keepdims=True)
     first = np.clip(np.where(without_box, 0, np.floor(boxes[:, :2]) - margin), 0, size).astype(int)
     last = np.clip(np.where(without_box, 0, np.ceil(boxes[:, 2:]) + margin), first, size).astype(int)
@@ -135,14 +141,14 @@ def crater_masks(
     for k, crater_id in enumerate(crater_ids):
         (x0, y0), (x1, y1) = first[k], last[k]
         centre, normal, radius = centres_camera_m[k], normals_camera[k], radii_m[k]
-        ray = rays[y0:y1, x0:x1]
+        ray, start = rays[y0:y1, x0:x1], starts[y0:y1, x0:x1]
         with np.errstate(divide="ignore", invalid="ignore"):
-            plane_m = (centre @ normal) / (ray @ normal)
-            off = ray * plane_m[..., None] - centre
+            plane_m = (centre @ normal - start @ normal) / (ray @ normal)
+            off = ray * plane_m[..., None] + start - centre
             amodal = (plane_m > 0) & (np.einsum("ijk,ijk->ij", off, off) <= radius**2)
         visible = None
         if depth_m is not None:
-            slack_m = max(SLACK_RADII * radius, SLACK_PX * centre[2] / camera.fx_px)
+            slack_m = max(SLACK_RADII * radius, SLACK_PX * camera.depth_m(centre) / camera.scale_px)
             depth = depth_m[y0:y1, x0:x1]
             visible = amodal & np.isfinite(depth) & (depth >= np.where(amodal, plane_m, np.inf) - slack_m)
         masks.append(CraterMask(int(crater_id), int(y0), int(x0), amodal, visible))

@@ -46,7 +46,7 @@ def test_square_pixels_are_recorded_as_before(tmp_path):
     [
         ({"resolution": [8192, 8192]}, "camera.width_px: got 8192, expected at most 4096"),
         ({"intrinsics": [1e-3, 1e-3, 0, 0]}, "fold"),
-        ({"camera_model": "omni"}, "camera_model: got omni, expected pinhole"),
+        ({"camera_model": "ds"}, "camera_model: got ds, expected pinhole or omni"),
     ],
 )
 def test_what_the_renderer_cannot_do_is_refused(tmp_path, change, message):

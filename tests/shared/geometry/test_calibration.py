@@ -124,6 +124,100 @@ def test_an_equidistant_camera_is_fitted_within_a_twentieth_of_a_pixel(tmp_path,
     assert np.abs(seen_by_opencv(RAYS, NARROW, EQUIDISTANT) - truth)[inside].max() > 1
 
 
+@pytest.mark.parametrize(("matrix", "coefficients"), [(K, EQUIDISTANT), (K / [[4], [4], [1]], [0.0] * 4)])
+def test_an_equidistant_camera_without_a_good_fit_keeps_its_model(tmp_path, matrix, coefficients):
+    camera = read_camera_file(write(tmp_path, kalibr(matrix, coefficients, "equidistant"))).camera
+    assert camera.model == "kannala_brandt" and camera.parameters == tuple(coefficients)
+    truth = seen_by_opencv(RAYS, matrix, np.array(coefficients), fisheye=True)
+    assert np.abs(camera.project(RAYS) - truth - 0.5).max() < 1e-9
+
+
+def test_an_omnidirectional_camera_of_kalibr_is_read(tmp_path):
+    text = kalibr(camera_model="omni", intrinsics=[1.2, 500.0, 501.0, 320.0, 240.0])
+    camera = read_camera_file(write(tmp_path, text)).camera
+    assert (camera.model, camera.parameters) == ("unified", (1.2,)) and camera.distortion == (*RADTAN[:4], 0.0)
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (500.0, 501.0, 320.5, 240.5)
+
+
+def cahvore(model="CAHVORE3,0.2 = general", **changes):
+    """A model in the text form of JPL's programs, in a turned and shifted frame."""
+    turned = matrix_from_rotation_vector([0.4, -0.7, 1.1])
+    vectors = {
+        "C": [0.86, 0.27, -1.9],
+        "A": turned[2],
+        "H": 400 * turned[0] + 0.2 * turned[1] + 319.5 * turned[2],
+        "V": 402 * turned[1] + 239.5 * turned[2],
+        "O": turned.T @ (np.array([0.01, -0.02, 1.0]) / np.linalg.norm([0.01, -0.02, 1.0])),
+        "R": [1e-4, 0.05, -0.01],
+        "E": [0.004, 0.002, 0.0],
+    }
+    lines = {name: " ".join(f"{value:.15f}" for value in vector) for name, vector in vectors.items()}
+    lines = {"Model": model, "Dimensions": "640 480", **lines, "S": "not a number", **changes}
+    kept = (f"{name} = {value}" for name, value in lines.items() if value is not None)
+    return "# a comment with = in it\n\n" + "\n".join(kept) + "\n", turned, vectors
+
+
+@pytest.mark.parametrize(
+    ("stated", "model", "linearity"),
+    [
+        ("CAHV = perspective, linear", "cahvor", None),
+        ("CAHVOR = perspective, distortion", "cahvor", None),
+        ("CAHVORE1 = perspective, distortion, pupil", "cahvore", 1.0),
+        ("CAHVORE2 = fish-eye", "cahvore", 0.0),
+        ("CAHVORE3,-0.3 = general", "cahvore", -0.3),
+    ],
+)
+def test_planetary_camera_models_are_read(tmp_path, stated, model, linearity):
+    text, turned, vectors = cahvore(stated)
+    found = read_camera_file(write(tmp_path, text))
+    camera = found.camera
+    assert camera.model == model and (camera.width_px, camera.height_px) == (640, 480)
+    assert np.allclose(found.rotation_camera_from_body, turned, atol=1e-12)
+    assert found.position_in_body_m == tuple(vectors["C"])
+    if linearity is not None:
+        assert camera.parameters[-1] == linearity
+    # A far point on the axis O is seen where H and V put it, in any model; its pixel counts from the outer corner.
+    o = vectors["O"] if "OR" in stated else turned[2]
+    expected = np.array([vectors["H"] @ o, vectors["V"] @ o]) / (vectors["A"] @ o) + 0.5
+    assert np.allclose(camera.project(turned @ o * 1e7), expected, atol=1e-6)
+    if stated.startswith("CAHV ="):
+        point = np.array([0.3, -0.2, 5.0]) @ turned
+        expected = np.array([vectors["H"] @ point, vectors["V"] @ point]) / (vectors["A"] @ point) + 0.5
+        assert np.allclose(camera.project(turned @ point), expected, atol=1e-9)
+
+
+def test_a_cahv_model_with_perpendicular_axes_is_a_pinhole(tmp_path):
+    text, _, _ = cahvore("CAHV", H=" ".join(map(str, (400 * matrix_from_rotation_vector([0.4, -0.7, 1.1])[0]))))
+    camera = read_camera_file(write(tmp_path, text)).camera
+    assert camera.model == "pinhole" and camera.cx_px == pytest.approx(0.5) and camera.fx_px == pytest.approx(400)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": "CAHVORE4 = new"}, "Model: got CAHVORE4, expected CAHV, CAHVOR, CAHVORE1"),
+        ({"model": "CAHVORE = general"}, "Model: got CAHVORE, expected"),
+        ({"model": "CAHVORE3 = general"}, "Model: got CAHVORE3, expected"),
+        ({"model": "CAHVORE3,half = general"}, "Model: got CAHVORE3,half, expected"),
+        ({"model": "CAHVORE3,2 = general"}, "with P from -1 to 1"),
+        ({"Dimensions": None}, "Dimensions: got nothing, expected 2 numbers"),
+        ({"Dimensions": "640.5 480"}, "Dimensions: got [640.5, 480.0]"),
+        ({"Dimensions": "1e9 480"}, "Dimensions: got [1000000000.0, 480.0]"),
+        ({"O": None}, "O: got nothing, expected 3 numbers"),
+        ({"R": "0.1 0.2"}, "R: got 0.1 0.2, expected 3 numbers"),
+        ({"R": "0.1 nan 0.2"}, "R: got 0.1 nan 0.2, expected 3 numbers"),
+        ({"A": "0 0 2"}, "A: got length 2, expected a unit vector"),
+        ({"O": "0 0 0"}, "O: got length 0, expected a unit vector"),
+        ({"V": "0 0 0"}, "H: got"),
+        ({"R": "0.0 -1.5 0.0"}, "R: got coefficients that fold the image at"),
+    ],
+)
+def test_a_wrong_planetary_model_is_refused_in_one_line(tmp_path, changes, message):
+    with pytest.raises(UserError) as refused:
+        read_camera_file(write(tmp_path, cahvore(**changes)[0]))
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+
+
 def test_mountings_of_kalibr_and_euroc_are_read(tmp_path):
     rotation, place = matrix_from_rotation_vector([0.3, -1.2, 0.4]), np.array([0.1, -0.2, 0.3])
     pose = np.eye(4)
@@ -159,15 +253,22 @@ def without(content, *names):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (kalibr(camera_model="omni"), "camera_model: got omni, expected pinhole"),
-        (kalibr(camera_model="ds"), "camera_model: got ds, expected pinhole"),
+        (kalibr(camera_model="omni"), "intrinsics: got 4 values, expected 5 numbers"),
+        (kalibr(camera_model="omni", intrinsics=[-1, 9, 9, 9, 9]), "intrinsics: xi: got -1.0, expected 0 to 1000"),
+        (
+            kalibr(camera_model="omni", intrinsics=[1, 9, 9, 9, 9], model="equidistant"),
+            "distortion_model: got equidistant, expected radtan or none with camera_model omni",
+        ),
+        (kalibr(camera_model="ds"), "camera_model: got ds, expected pinhole or omni"),
         (kalibr(model="fov", coefficients=[1.0, 0, 0, 0]), "distortion_model: got fov, expected one of plumb_bob"),
         (kalibr() | {"cam1": {}}, "camera: got several cameras: cam0, cam1"),
         ({"cam0": 3}, "cam0: got int, expected a mapping"),
         (kalibr(intrinsics=[1, 2, 3]), "intrinsics: got 3 values, expected 4 numbers"),
         (kalibr(resolution=None), "resolution: got nothing, expected 2 numbers"),
-        (kalibr(model="equidistant", coefficients=EQUIDISTANT), "px, expected a radial-tangential fit to 0.05 px"),
-        (kalibr(K / [[4], [4], [1]], [0.0] * 4, "equidistant"), "expected a view of at most 80 degrees"),
+        (
+            kalibr(model="equidistant", coefficients=[-0.5, 0, 0, 0]),
+            "distortion_model equidistant: got coefficients that fold the image at 46.78 degrees from the axis",
+        ),
         (ros(coefficients=[0.1] * 8, model="rational_polynomial"), "rational_polynomial: got coefficients beyond k3"),
         (ros(coefficients=[0.1, 0.1, 0, 0], model=""), "distortion_model: got no model for four coefficients"),
         (ros(coefficients=[0.1] * 3), "distortion_coefficients: got 3 values, expected 0 or 4 or 5"),

@@ -81,6 +81,13 @@ def test_rays_invert_distortion_in_every_pixel(lens):
     assert np.abs(camera.project(camera.rays(pixels) * 70.0) - pixels).max() < 1e-7
 
 
+@pytest.mark.parametrize("lens", [(0.0, -1e300, 0.0, 0.0, -1e300), (1e300, 0.1, 0.0, 0.0, -1e300)])
+def test_absurd_distortions_have_no_rays(lens):
+    """dataset.json is untrusted: its distortion may overflow, but must not end the program."""
+    with np.errstate(all="ignore"):
+        assert np.isnan(replace(CAMERA, distortion=lens).rays(CAMERA.outline())).any()
+
+
 def test_without_distortion_the_covering_pinhole_is_the_camera():
     assert CAMERA.covering_pinhole() == CAMERA
 

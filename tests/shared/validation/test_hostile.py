@@ -105,6 +105,16 @@ INFO = {
     "a focal length of 10^300": (edit(lambda c: c["camera"].update(fx_px=1e300)), "camera.fx_px"),
     "a camera that mirrors": (edit(lambda c: c["camera"]["rotation_camera_from_body"].reverse()), "camera"),
     "distortion without end": (edit(lambda c: c["camera"].update(distortion=[1e300] * 5)), "ellipse_cx_px"),
+    "a lens model without parameters": (edit(lambda c: c["camera"].update(model="unified")), "camera"),
+    "a lens model without end": (
+        edit(
+            lambda c: c["camera"].update(
+                model="kannala_brandt", parameters=dict.fromkeys(("k1", "k2", "k3", "k4"), 1e9)
+            )
+        ),
+        "ellipse_cx_px",
+    ),
+    "a lens model by a formula": (edit(lambda c: c["camera"].update(model="=HYPERLINK()")), "camera"),
     "no recipe": (edit(lambda c: c.update(recipes={})), "recipes"),
     "a recipe under another key": (of_recipe(lambda r: r.update(seed=8)), "recipes"),
     "40 000 recipes": (edit(many_recipes), "recipes"),

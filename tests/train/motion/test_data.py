@@ -64,6 +64,14 @@ def test_frames_of_a_distorting_lens_are_undistorted():
     assert undistorted(images, plain)[0] is images
 
 
+def test_a_camera_with_a_lens_model_is_refused(dataset_nav):
+    dataset = open_dataset(dataset_nav)
+    fisheye = dataset.info.camera.model_copy(update={"model": "equidistant"})
+    dataset.info = dataset.info.model_copy(update={"camera": fisheye})
+    with pytest.raises(UserError, match=r"camera\.model: got equidistant, expected pinhole, with or"):
+        load_trajectories(dataset)
+
+
 def test_trajectories_hold_poses_and_nominal_motion(trajectories):
     assert [d.split for d in trajectories] == ["train"] * 4 + ["val", "test"]
     d = trajectories[0]

@@ -13,7 +13,7 @@ from perilune_render.config.dataset import DatasetConfig
 from perilune_render.engines.heightfield.beam import tops_of
 from perilune_render.engines.heightfield.horizon import NOWHERE, Horizon, horizon_of
 from perilune_render.engines.heightfield.light import disc_places, reflected
-from perilune_render.engines.heightfield.shade import Tile, View, see
+from perilune_render.engines.heightfield.shade import Tile, View, see, see_along
 from perilune_render.engines.heightfield.surface import Surface, surface_of
 from perilune_render.flight.sub_poses import Pose, RowPoses
 from perilune_render.imaging.radiance import Radiance
@@ -82,6 +82,7 @@ class HeightfieldEngine:
     ) -> Radiance:
         """Render one frame: mean radiance factor of each pixel, depth and normal of its central ray.
 
+        The depth is measured along the camera's axis, or along the ray for a camera with a lens model.
         `approach_deg` is not used, since the ground is one mesh.
         """
         shape = self.camera.height_px, self.camera.width_px
@@ -155,7 +156,9 @@ class HeightfieldEngine:
         position_m, rotation_camera_from_site = pose
         moved, disc = drawn
         origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
-        basis, plane = rays_of(self.camera) @ rotation_camera_from_site, np.stack(plane_basis(self.sun))
+        plane = np.stack(plane_basis(self.sun))
+        curved = self.camera.lens is not None
+        basis = np.zeros((3, 3)) if curved else rays_of(self.camera) @ rotation_camera_from_site
         view = View(origin, basis, self._far_m, self.sun, plane, horizon)
         ground, rocks = self.surface.ground, self.surface.rocks
 
@@ -163,7 +166,13 @@ class HeightfieldEngine:
             moves, suns = moved[:, *tile], disc_places(disc[:, *tile], self._disc_rad)
             angles = np.empty((5, *moves.shape[:3]), np.float32)
             first = tile[0].start, tile[1].start
-            see(ground, rocks, self.tops, view, Tile(first, moves, suns, image.depth_m, image.normal, angles))
+            results = Tile(first, moves, suns, image.depth_m, image.normal, angles)
+            if curved:
+                starts, rays = self._rays(moves, first, origin, rotation_camera_from_site)
+                own = view._replace(origin=origin.copy(), basis=basis.copy())
+                see_along(ground, rocks, own, results, starts, rays)
+            else:
+                see(ground, rocks, self.tops, view, results)
             seen = reflected(self._law, angles).mean(axis=0)
             image.radiance_factor[tile], image.sunlit[tile] = seen, seen > LIT
 
@@ -172,6 +181,17 @@ class HeightfieldEngine:
             return
         for each in tiles:
             cast(each)
+
+    def _rays(
+        self, moved: np.ndarray, first: tuple[int, int], origin: Array, rotation_camera_from_site: Array
+    ) -> tuple[Array, Array]:
+        """Starts, relative to the grid's centre, metres, and directions, O_L, of a tile's rays (S, h, w, 3) each."""
+        _, height, width, _ = moved.shape
+        row, column = np.ogrid[first[0] : first[0] + height, first[1] : first[1] + width]
+        pixels = moved.astype(np.float64)
+        pixels += np.stack(np.broadcast_arrays(column + 0.5, row + 0.5), axis=-1)
+        rays, starts = self.camera.rays_and_starts(pixels)
+        return origin + starts @ rotation_camera_from_site, rays @ rotation_camera_from_site
 
     def _horizon_now(self, n_pixels: int | None = None) -> Horizon:
         """The horizon, or `NOWHERE` while computing it would not save time; `n_pixels` None means a whole image.

@@ -161,6 +161,9 @@ class CudaEngine(HeightfieldEngine):
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array, surface: Surface | None = None):
         check_installed("heightfield", "cuda")
+        if camera.lens is not None:
+            expected = "cpu with the lens model of dataset.camera.lens"
+            raise UserError("configuration", "dataset.render.device", "cuda", expected)
         super().__init__(scene, config, camera, sun, surface=surface)
         size = sum(part.nbytes for part in (*self.surface.ground, *self.surface.rocks) if isinstance(part, np.ndarray))
         self._check_memory(size + self.bytes_of(1))

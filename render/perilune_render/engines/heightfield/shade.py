@@ -79,7 +79,7 @@ class Block(NamedTuple):
     """Start of all rays of a block of pixels."""
 
     begin_m: float
-    """Height at which the rays may begin, metres (`beam.begin_m`)."""
+    """Height at which the rays may begin, metres (`beam.begin_m`); infinite for their start."""
     part: int
     """Part of the mesh below this height, -1 if unknown (`beam.only_part`)."""
 
@@ -334,3 +334,30 @@ def see(ground, rocks, tops, view, tile):
                 for j in range(column, last_column):
                     for s in range(n_samples):
                         near_m = _see(ground, rocks, view, tile, Block(begin, part), (s, i, j))
+
+
+@njit(**WITHOUT_COUNTS)
+def see_along(ground, rocks, view, tile, starts, rays):
+    """Render a tile as `see`, with given rays (S, h, w, 3), O_L, of a lens model; a ray of NaN sees nothing.
+
+    `starts` (S, h, w, 3) are the positions of the rays relative to the grid's centre, metres. `view.origin` and the
+    last row of `view.basis` are overwritten; its other rows must be 0.
+    """
+    n_samples, height, width, _ = tile.moved.shape
+    nowhere = Block(np.inf, -1)
+    for i in range(height):
+        for j in range(width):
+            for s in range(n_samples):
+                if np.isnan(rays[s, i, j, 0]):
+                    if s == 0:
+                        row, column = tile.first[0] + i, tile.first[1] + j
+                        tile.depth[row, column] = np.inf
+                        for axis in range(3):
+                            tile.normal[row, column, axis] = 0.0
+                    # The angles of a surface that faces camera and Sun, without albedo and in shadow.
+                    for k in range(5):
+                        tile.angles[k, s, i, j] = 1.0 if k < 3 else 0.0
+                    continue
+                for axis in range(3):
+                    view.origin[axis], view.basis[2, axis] = starts[s, i, j, axis], rays[s, i, j, axis]
+                _see(ground, rocks, view, tile, nowhere, (s, i, j))

@@ -1,7 +1,6 @@
 """The native interface over ZeroMQ: requests in JSON, replies in JSON with raw arrays (`perilune_shared.client`)."""
 
 import json
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ from perilune_render.server.simulation import SimulatedScene, View
 from perilune_shared.client import CRATER_COLUMNS
 from perilune_shared.config.errors import expected_of, got_of
 from perilune_shared.config.resolve import Section
+from perilune_shared.dataset.metadata import fields_of
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
 
@@ -166,7 +166,7 @@ def _about(grounds: Grounds) -> dict[str, Any]:
         "sun_azimuth_deg": stated.sun_azimuth_deg,
         "sun_elevation_deg": stated.sun_elevation_deg,
     }
-    return {"scene": about, "camera": asdict(camera_of(config.camera)), "n_scenes": grounds.n_scenes}
+    return {"scene": about, "camera": fields_of(camera_of(config.camera)), "n_scenes": grounds.n_scenes}
 
 
 def _frame(simulated: SimulatedScene, request: FrameRequest) -> dict[str, np.ndarray]:

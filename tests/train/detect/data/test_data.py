@@ -123,6 +123,19 @@ def test_a_distorted_camera_ignores_craters_where_it_sees_them():
     np.testing.assert_allclose(shapes[:, 5], [50 + 53 * (1 - 0.3 * 0.53**2)], atol=0.02)
 
 
+def test_a_fisheye_ignores_craters_where_it_sees_them():
+    """60 degrees from the axis, a crater appears at r = f theta, and its radius is smaller than near the axis."""
+    fisheye = Camera(160, 160, 45.0, 45.0, 80.0, 80.0, model="equidistant")
+    frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
+    x = 100 * np.tan(np.radians(60))
+    shapes = unlabelled_craters(flat_craters((x, 0.0, 22.0), (-x, 0.0, 2.0)), fisheye, frame, (2.0, 50.0))
+    np.testing.assert_allclose(shapes[0, 5:7], [80 + 45 * np.radians(60), 80.0], atol=0.1)
+    # Along the image's radius, 11 m appear under 11 cos(60)^2 / 100 rad; across it, under 11 cos(60) theta / sin / 100.
+    across = 45 * 0.11 * 0.5 * np.radians(60) / np.sin(np.radians(60))
+    np.testing.assert_allclose(shapes[0, 7:9], [across, 45 * 0.11 * 0.25], rtol=0.03)
+    assert len(shapes) == 1, "the other crater is too small"
+
+
 def test_frames_that_do_not_divide_by_32_are_refused(tmp_path, make_dataset):
     root = make_dataset(tmp_path / "odd", "detect", side_px=100, n_frames=1, craters=20)
     with pytest.raises(UserError, match=r"width_px: got 100, expected a multiple of 32.* develop the frames at 96 px"):

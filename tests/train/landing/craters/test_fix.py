@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tests.train.landing.craters.crater_world import CAMERA, nearby, pose, sighted, world
 
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
@@ -22,6 +23,13 @@ def off(fix, true):
     """The step (6,) from a fix to the true pose."""
     turn = rotation_vectors(true.rotation_camera_from_site @ fix.pose.rotation_camera_from_site.T)
     return np.concatenate([true.position_m - fix.pose.position_m, turn])
+
+
+def test_a_camera_with_a_lens_model_is_refused():
+    """A fisheye taken for a pinhole would give wrong poses."""
+    fisheye = dataclasses.replace(CAMERA, model="equidistant")
+    with pytest.raises(UserError, match=r"camera\.model: got equidistant, expected pinhole"):
+        projected(WORLD, fisheye, pose(np.random.default_rng(3), 900.0))
 
 
 def test_projection_has_the_derivatives_by_the_pose():

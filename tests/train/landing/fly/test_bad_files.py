@@ -63,6 +63,8 @@ def missing(file):
         (setting("camera.yaml", "width_px", 128), ["0.png", "size", "64 x 64", "128 x 64"]),
         (setting("camera.yaml", "position_in_body_m", [0, 0, 1]), ["position_in_body_m", "[0, 0, 0]"]),
         (setting("camera.yaml", "distortion", [-3.0, 0, 0, 0, 0]), ["camera.distortion", "fold"]),
+        (setting("camera.yaml", "model", "equidistant"), ["camera.model", "equidistant", "expected pinhole"]),
+        (setting("camera.yaml", "model", "fish"), ["camera", "model pinhole, equidistant"]),
         (setting("prior.yaml", "position_m", None), ["prior.yaml", "prior.position_m", "nothing", "a value"]),
         (setting("prior.yaml", "positon_m", [1, 2, 3]), ["prior.positon_m", "unknown key", "position_m (nearest"]),
         (setting("prior.yaml", "rotation_wxyz", [1, 1, 0, 0]), ["prior", "a unit quaternion"]),

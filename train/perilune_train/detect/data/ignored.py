@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 MARGIN = np.sqrt(0.5)
 """Craters down to this fraction of the smallest evaluated radius are ignored. The IoU of a smaller crater with a box in
 the range of radii is below 0.5."""
+_VARIES = 10.0
+"""Largest ratio of a lens model's scale to the scale of a crater's image, which is also smaller if seen obliquely."""
 _CENTRE, _NORMAL = ["x_m", "y_m", "z_m"], ["normal_x", "normal_y", "normal_z"]
 _SIZE = ["diameter_m", "depth_m"]
 
@@ -70,7 +72,7 @@ def unlabelled_craters(
     rows = _right_size(craters, camera, rotation_camera_from_site[2], frame["position_m"], (low, high))
     centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation_camera_from_site)
     radius_m = craters.diameter_m[rows] / 2
-    (u, v), reach_px = camera.project(centre).T, 2 * camera.fx_px * radius_m / centre[:, 2]
+    (u, v), reach_px = camera.project(centre).T, 2 * camera.scale_px * radius_m / camera.depth_m(centre)
     near = (u > -reach_px) & (u < camera.width_px + reach_px) & (v > -reach_px) & (v < camera.height_px + reach_px)
     if labelled is not None:
         near &= ~np.isin(craters.crater_id[rows], labelled)
@@ -94,6 +96,11 @@ def _right_size(
     exact for level ground and a camera that looks straight down. The factors 0.8 and 2 allow for more than the effect
     of a tilt.
     """
+    if camera.lens is not None:
+        # The scale of a lens model varies within the image, so many candidates are projected.
+        away_m = np.linalg.norm(craters.centre_m - np.asarray(position_m, np.float64), axis=1)
+        wide = camera.scale_px * (craters.diameter_m / 2)
+        return np.flatnonzero((wide > 0.8 * range_px[0] * away_m) & (wide < _VARIES * range_px[1] * away_m))
     depth_m = craters.centre_m @ forward - np.asarray(position_m, np.float64) @ forward
     scaled = camera.fx_px * (craters.diameter_m / 2)
     return np.flatnonzero((depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
@@ -128,6 +129,8 @@ _Lens = tuple[float, float, float, float, float, float]
 
 
 def _lens(camera: Camera) -> _Lens:
+    if camera.model != "pinhole":
+        raise UserError("landing", "camera.model", camera.model, "pinhole: the filter uses no lens models")
     width, height = float(camera.width_px), float(camera.height_px)
     return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, width, height
 

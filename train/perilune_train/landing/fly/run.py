@@ -194,7 +194,7 @@ def sightings_of(found: Detections, camera: Camera) -> Sightings:
     """
     boxes = np.asarray(found.boxes, np.float64)
     sigmas_px = None if found.shapes is None else np.asarray(found.shapes[:, 1:3], np.float64)
-    if not any(camera.distortion):
+    if not camera.distorts:
         return Sightings.of_boxes(boxes, found.scores, sigmas_px)
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
     pinhole = camera.covering_pinhole()

@@ -1,7 +1,7 @@
 """Read camera.yaml and prior.yaml, the knowledge before a descent; both are untrusted input."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from perilune_shared.config.errors import user_error_of
 from perilune_shared.config.resolve import Section
 from perilune_shared.config.yaml_text import parse_yaml
-from perilune_shared.dataset.metadata import CameraRecord
+from perilune_shared.dataset.metadata import CameraRecord, fields_of
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.calibration import Calibration, read_camera_file
 from perilune_shared.geometry.camera import NO_DISTORTION, ROTATION_CAMERA_FROM_BODY
@@ -179,13 +179,15 @@ def read_camera(path: Path) -> CameraRecord:
             "[0, 0, 0]: the filter assumes that the camera is at the inertial unit; set a negligible distance to 0"
         )
         raise UserError(path, "camera.position_in_body_m", list(camera.position_in_body_m), expected)
+    if camera.model != "pinhole":
+        raise UserError(path, "camera.model", camera.model, "pinhole: the filter uses no lens models")
     if camera.intrinsics().folds_back():
         raise UserError(path, "camera.distortion", list(camera.distortion), "a distortion that does not fold back")
     return camera
 
 
 def _fields_of(calibration: Calibration) -> dict[str, Any]:
-    return asdict(calibration.camera) | {"position_in_body_m": list(calibration.position_in_body_m)}
+    return fields_of(calibration.camera) | {"position_in_body_m": list(calibration.position_in_body_m)}
 
 
 def read_prior(path: Path) -> FlightPrior:

@@ -13,6 +13,7 @@ from perilune_shared.export.foreign_text import write_csv
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, quaternion_from_matrix
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.storage.files import new_folder
+from perilune_train.data.pinhole import check_pinhole
 from perilune_train.landing.craters.catalogue import (
     MIN_DIAMETER_M,
     Catalogue,
@@ -50,8 +51,9 @@ def unpack_descent(
     `ids` are scene_id and trajectory_id. Unless `exact`, the catalogue has random errors. `offset` holds the standard
     deviations of the prior's errors per axis: position (m), velocity (m/s) and attitude (degrees). `seed` determines
     the errors of the catalogue and the prior. Raises UserError if the dataset lacks the
-    trajectory or its inertial measurements.
+    trajectory or its inertial measurements, or if its camera has a lens model.
     """
+    check_pinhole(dataset)
     columns = ["frame_id", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "png_path"]
     frames = dataset.table("frames", columns, *ids).sort_by("time_s")
     if not frames.num_rows:

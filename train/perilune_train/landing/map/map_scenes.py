@@ -17,6 +17,7 @@ from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.storage.files import new_folder
 from perilune_shared.storage.store import Address
 from perilune_train.data.frames import decode
+from perilune_train.data.pinhole import check_pinhole
 from perilune_train.detect.finished_run import config_of_run, raw_threshold
 from perilune_train.detect.images.predict import above
 from perilune_train.detect.inference.detector import Detector, open_detector
@@ -64,6 +65,7 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
             expected = "2, as `perilune-render survey` makes them"
             raise UserError(dataset.store, f"{scene_id}: frames", len(scene_frames), expected)
     camera = dataset.info.camera.intrinsics()
+    check_pinhole(dataset)
     if any(camera.distortion):
         raise UserError(dataset.store, "camera.distortion", camera.distortion, "no distortion")
     best = RunFolder(detector).best

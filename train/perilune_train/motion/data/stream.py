@@ -132,6 +132,6 @@ def _check_camera(address: str, served: Camera, expected_camera: Camera) -> None
         (c.fx_px / w, c.fy_px / h, c.cx_px / w, c.cy_px / h, w / h, *c.distortion)
         for c, (w, h) in zip((served, expected_camera), sizes, strict=True)
     ]
-    if not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
+    if served.model != expected_camera.model or not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
         expected = f"{expected_camera}, as in the dataset; another image size of the same view is allowed"
         raise UserError(address, "camera", served, expected)

@@ -15,6 +15,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_train.data.frames import frame_table, load_images
+from perilune_train.data.pinhole import check_pinhole
 from perilune_train.data.shares import ALONE, Share
 from perilune_train.motion.data.gyroscope import GyroscopeTurns, gyroscope_turns
 from perilune_train.motion.data.undistort import undistorted
@@ -112,8 +113,8 @@ def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory
     """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
 
     If there are several processes, each loads only the frames that it needs (`own_trajectories`). Frames of a
-    distorting lens are undistorted. Raises UserError if the dataset is of another kind, if a frame is missing, or if
-    there are fewer training trajectories than processes.
+    distorting lens are undistorted. Raises UserError if the dataset is of another kind or its camera has a lens model,
+    if a frame is missing, or if there are fewer training trajectories than processes.
     """
     trajectories = [trajectory for split in SPLITS for trajectory in load_split(dataset, split, share)]
     if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
@@ -125,6 +126,7 @@ def load_split(dataset: Dataset, split: str, share: Share = ALONE) -> list[Traje
     """Load the trajectories of one split in the order of their ids. Raises UserError like `load_trajectories`."""
     if dataset.info.kind != "nav":
         raise UserError(dataset.store, "kind", dataset.info.kind, "nav, a dataset of trajectories")
+    check_pinhole(dataset)
     rows = dataset.table("trajectories").to_pylist()
     curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
     return _split_trajectories(dataset, split, curves, share)

@@ -156,6 +156,9 @@ def with_answers(viewer: Viewer, frames: LabelledFrames, run: Path, dataset: Dat
     if inputs.n_detections and not RunFolder(run).best.is_file():
         text = f"No further answers: the run {run.name} has no weights."
         return replace(viewer, answers=Answers(of_score, text))
+    if inputs.n_detections and dataset.info.camera.model != "pinhole":
+        text = f"No further answers: the camera has the lens model {dataset.info.camera.model}."
+        return replace(viewer, answers=Answers(of_score, text))
     names = frames.split.frames.table["frame_id"].tolist()
     indices = [names.index(frame.name) for frame in viewer.frames]
     craters = [frames.craters_of(index) for index in indices]
