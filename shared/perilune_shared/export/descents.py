@@ -100,10 +100,13 @@ def descents_of(
 
 
 def count_descent_frames(dataset: Dataset, split: str | None = None, trajectory: str | None = None) -> int:
-    """Return the number of frames that `descents_of` yields, as the total of a progress bar."""
+    """Return the number of frames that `descents_of` yields, as the total of a progress bar.
+
+    Raises UserError if there is no such trajectory.
+    """
     if split is None and trajectory is None:
         return dataset.info.counts.frames
-    scene_id, trajectory_id = (None, None) if trajectory is None else _ids(trajectory)
+    scene_id, trajectory_id = (None, None) if trajectory is None else next(_trajectories(dataset, trajectory))
     return len(dataset.table("frames", ["frame_id"], scene_id, trajectory_id, split))
 
 

@@ -31,13 +31,15 @@ TIMELINE = "time"
 """Name of the time line: seconds since the first frame."""
 _MAX_SIDE = 512
 """Largest number of vertices on a side of the terrain mesh."""
-_MAX_RIMS = 2000
+_MAX_RIMS = 600
 _RIM_POINTS = 32
 _SIGMAS = 3.0
 """Half axes of the covariance ellipsoid, in standard deviations."""
 _IMAGE_DISTANCE_M = 100.0
 """Distance at which the viewer draws an image in the scene, metres."""
 _SAME_TIME_S = 1e-3
+_THIN = -0.75
+"""Half the width of a line; negative values are in pixels of the screen."""
 _GREEN, _ORANGE, _BLUE = (80, 220, 80), (255, 140, 60), (90, 160, 255)
 
 
@@ -97,7 +99,6 @@ class _Recording:
 
         self._rr = rr
         self.stream = getattr(rr, "new_recording", rr.RecordingStream)("perilune", recording_id=name)
-        self.stream.disable_timeline("log_time")
         # Not `save`: its thread does not report a full disk, and `flush` then waits for ever.
         self._bytes = self.stream.binary_stream()
 
@@ -128,7 +129,9 @@ class _Recording:
 def _blueprint(dataset: Dataset, with_filter: bool) -> Any:
     import rerun.blueprint as rrb
 
-    images = [rrb.Spatial2DView(origin=_camera(name), name=name) for name in _cameras(dataset)]
+    # Boxes hide small craters; the viewer shows them when they are added to the view.
+    shown = ["$origin/**", "- $origin/image/boxes"]
+    images = [rrb.Spatial2DView(origin=_camera(name), contents=shown, name=name) for name in _cameras(dataset)]
     plots = [rrb.TimeSeriesView(origin="height_m", name="Height above the site, m")]
     if with_filter:
         plots += [
@@ -172,7 +175,7 @@ def _log_ground(recording: _Recording, dataset: Dataset, descent: Descent) -> No
     )
     rims = rim_points(centre_m, normal, craters["diameter_m"].to_numpy() / 2, _RIM_POINTS)
     closed = np.concatenate([rims, rims[:, :1]], axis=1)
-    recording.log("site/craters", rr.LineStrips3D(closed, colors=[_GREEN]), static=True)
+    recording.log("site/craters", rr.LineStrips3D(closed, colors=[_GREEN], radii=[_THIN]), static=True)
 
 
 def _terrain(path: Path, sun: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.uint8]]:
@@ -227,7 +230,9 @@ def _log_frame(recording: _Recording, dataset: Dataset, shot: Shot) -> None:
     recording.log(image, rr.EncodedImage(contents=shot.png, media_type="image/png"))
     polygons = polygons_of(shot.labels)
     closed = np.concatenate([polygons, polygons[:, :1]], axis=1)
-    recording.log(f"{image}/ellipses", rr.LineStrips2D(closed, colors=[_GREEN] * len(closed)))
+    recording.log(
+        f"{image}/ellipses", rr.LineStrips2D(closed, colors=[_GREEN] * len(closed), radii=[_THIN] * len(closed))
+    )
     boxes = shot.labels[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     corners = {"mins": boxes[:, :2], "sizes": boxes[:, 2:] - boxes[:, :2]}
     names = shot.labels["crater_id"].astype(str).to_list()
