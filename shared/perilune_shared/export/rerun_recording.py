@@ -140,7 +140,11 @@ def _blueprint(dataset: Dataset, with_filter: bool) -> Any:
         ]
     scene = rrb.Spatial3DView(origin="site", name="Site: X west, Y south, Z up")
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(scene, *images[1:]), rrb.Vertical(images[0], *plots), column_shares=[3, 2]),
+        rrb.Horizontal(
+            rrb.Vertical(scene, *images[1:]),
+            rrb.Vertical(images[0], *plots, row_shares=[3, *[1] * len(plots)]),
+            column_shares=[3, 2],
+        ),
         rrb.TimePanel(state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

@@ -202,44 +202,33 @@ def laser_range(time_ns: int, range_m: float | None) -> Any:
 def detections(time_ns: int, camera: str, labels: pd.DataFrame) -> Any:
     """Return a Detection2DArray: boxes along the axes of the ellipses, twice the semi-axes long and wide."""
     header = _header(time_ns, optical_frame(camera))
-    names = ["crater_id", *(f"ellipse_{name}" for name in ("cx_px", "cy_px", "a_px", "b_px", "theta_rad"))]
-    return _new(
-        "vision_msgs/msg/Detection2DArray",
-        header=header,
-        detections=[_detection(header, *row) for row in zip(*(labels[name].tolist() for name in names), strict=True)],
-    )
-
-
-def _detection(header: Any, crater_id: int, x: float, y: float, a: float, b: float, theta: float) -> Any:
-    hypothesis = _new("vision_msgs/msg/ObjectHypothesis", class_id="crater", score=1.0)
     unknown = _new("geometry_msgs/msg/PoseWithCovariance", pose=_pose(np.zeros(3), np.eye(3)), covariance=np.zeros(36))
-    centre = _new("vision_msgs/msg/Point2D", x=x - 0.5, y=y - 0.5)
-    box = _new(
-        "vision_msgs/msg/BoundingBox2D",
-        center=_new("vision_msgs/msg/Pose2D", position=centre, theta=theta),
-        size_x=2 * a,
-        size_y=2 * b,
-    )
-    result = _new("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=unknown)
-    return _new("vision_msgs/msg/Detection2D", header=header, results=[result], bbox=box, id=str(crater_id))
+    hypothesis = _new("vision_msgs/msg/ObjectHypothesis", class_id="crater", score=1.0)
+    results = [_new("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=unknown)]
+    names = ["crater_id", *(f"ellipse_{name}" for name in ("cx_px", "cy_px", "a_px", "b_px", "theta_rad"))]
+    found = []
+    for crater_id, x, y, a, b, theta in zip(*(labels[name].tolist() for name in names), strict=True):
+        centre = _new("vision_msgs/msg/Point2D", x=x - 0.5, y=y - 0.5)
+        pose = _new("vision_msgs/msg/Pose2D", position=centre, theta=theta)
+        box = _new("vision_msgs/msg/BoundingBox2D", center=pose, size_x=2 * a, size_y=2 * b)
+        found.append(_new("vision_msgs/msg/Detection2D", header=header, results=results, bbox=box, id=str(crater_id)))
+    return _new("vision_msgs/msg/Detection2DArray", header=header, detections=found)
 
 
 def annotations(time_ns: int, labels: pd.DataFrame) -> Any:
     """Return foxglove's ImageAnnotations: a polygon of 32 corners for the ellipse of each label."""
-    colour = _new("foxglove_msgs/msg/Color", **dict(zip("rgba", _GREEN, strict=True)))
-    clear = _new("foxglove_msgs/msg/Color", r=0.0, g=0.0, b=0.0, a=0.0)
+    style = {
+        "timestamp": _time(time_ns),
+        "type": _LINE_LOOP,
+        "outline_color": _new("foxglove_msgs/msg/Color", **dict(zip("rgba", _GREEN, strict=True))),
+        "outline_colors": [],
+        "fill_color": _new("foxglove_msgs/msg/Color", r=0.0, g=0.0, b=0.0, a=0.0),
+        "thickness": 1.0,
+    }
+    point = message_types().types["foxglove_msgs/msg/Point2"]  # a frame has thousands of them
     loops = [
-        _new(
-            "foxglove_msgs/msg/PointsAnnotation",
-            timestamp=_time(time_ns),
-            type=_LINE_LOOP,
-            points=[_new("foxglove_msgs/msg/Point2", x=x, y=y) for x, y in polygon.tolist()],
-            outline_color=colour,
-            outline_colors=[],
-            fill_color=clear,
-            thickness=1.0,
-        )
-        for polygon in polygons_of(labels)
+        _new("foxglove_msgs/msg/PointsAnnotation", points=[point(x, y) for x, y in polygon], **style)
+        for polygon in polygons_of(labels).tolist()
     ]
     return _new("foxglove_msgs/msg/ImageAnnotations", circles=[], points=loops, texts=[])
 
