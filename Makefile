@@ -69,7 +69,7 @@ setup-dev: $(VENV)/.ready-dev # also install the tools of tests, checks, documen
 $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
 	@scripts/system-libraries --browser
 	@echo "installing tools for development into $(VENV)"
-	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e "train[export,geo]" -r requirements-dev.txt
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e "shared[mcap,rerun]" -e "train[export,geo]" -r requirements-dev.txt
 	@touch $@
 
 demo: setup ## run all steps on small data: frames, detection, navigation, explanation, report (PRESET=demo; PRESET=tiny only tests that all steps run)

@@ -49,6 +49,7 @@ COMMANDS: dict[str, tuple[Callable[[], object], list[str]]] = {
     "coco": (manifest, ["export", "data", "--format", "coco", "--out", "OUT"]),
     "yolo": (manifest, ["export", "data", "--format", "yolo", "--out", "OUT"]),
     "hugging face": (manifest, ["export", "data", "--format", "huggingface", "--out", "OUT"]),
+    "mcap": (manifest, ["export", "data", "--format", "mcap", "--out", "OUT"]),
     "predict": (train, ["detect", "predict", "image.png", "--run", "run", "--out", "OUT", "--threshold", "1e-6"]),
     "compare": (train, ["detect", "compare", "evaluation", "--out", "OUT"]),
     "export of a detector": (train, ["detect", "deploy", "--run", "run", "--out", "OUT", "--formats", "onnx"]),

@@ -37,7 +37,8 @@ OWN_FILES = {
 DEPENDS_ON_TIMING = "detector-int8.onnx"
 """Kept only if int8 is faster than floating point when `detect deploy` measures it."""
 MORE = tuple(
-    use("perilune-manifest export", f"data/nav --format {name} --out {name}") for name in ("yolo", "tum", "kitti")
+    use("perilune-manifest export", f"data/nav --format {name} --out {name}")
+    for name in ("yolo", "tum", "kitti", "mcap")
 )
 ALL = (*USES, *MORE)
 

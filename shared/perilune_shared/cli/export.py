@@ -1,5 +1,6 @@
 """Commands `perilune-manifest export` and `card`: other formats and the dataset card."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -11,14 +12,17 @@ from perilune_shared.console.terminal import answer, progress_bar
 from perilune_shared.errors import UserError
 from perilune_shared.storage.replacement import replaceable
 
-ExportFormat = Literal["coco", "yolo", "tum", "kitti", "croissant", "huggingface"]
-_WITH_LABELS = ("coco", "yolo", "huggingface")
+ExportFormat = Literal["coco", "yolo", "tum", "kitti", "croissant", "huggingface", "mcap", "rerun"]
+_WITH_LABELS = ("coco", "yolo", "huggingface", "mcap", "rerun")
+_WITH_TIME_LINE = ("mcap", "rerun")
 _KNOWN_BY = {
     "coco": ("instances_*.json",),
     "yolo": ("data.yaml", "labels/**/*.txt"),
     "tum": ("*/trajectory-*.txt",),
     "kitti": ("*/*.times.txt",),
     "huggingface": ("README.md", "data/*/*.parquet"),
+    "mcap": ("foxglove-layout.json", "*/*/*.mcap"),
+    "rerun": ("*/*.rrd",),
 }
 """Files that identify a folder as an export in each format."""
 
@@ -35,7 +39,7 @@ def export(
         ExportFormat,
         typer.Option(
             help="coco, yolo: boxes and ellipses; tum, kitti: camera poses; huggingface: frames with pose and labels; "
-            "croissant: metadata."
+            "croissant: metadata; mcap: descents as ROS 2 messages for Foxglove; rerun: descents for the Rerun viewer."
         ),
     ],
     out: Annotated[
@@ -48,10 +52,21 @@ def export(
     selection: Annotated[
         str,
         typer.Option(
-            help="Labels to export: all, paper or visible. coco marks the others as iscrowd, yolo omits them, "
-            "huggingface marks the selected ones."
+            help="Labels to export: all, paper or visible. coco marks the others as iscrowd, huggingface marks "
+            "the selected ones, the other formats omit the others."
         ),
     ] = "all",
+    trajectory: Annotated[
+        str | None,
+        typer.Option(metavar="SCENE/TRAJECTORY", help="Only this descent, as scene_id/trajectory_id (mcap, rerun)."),
+    ] = None,
+    estimates: Annotated[
+        Path | None,
+        typer.Option(
+            help="The landing filter's output for the descent: the folder that `perilune-train navigate trace` (full "
+            "covariance) or `navigate fly` wrote, or its table frames or estimates (mcap, rerun)."
+        ),
+    ] = None,
     link: LinkOption = False,
     overwrite: OverwriteFolder = False,
 ) -> None:
@@ -62,6 +77,8 @@ def export(
     from perilune_shared.export.coco import export_coco
     from perilune_shared.export.croissant import export_croissant
     from perilune_shared.export.hugging_face import export_hugging_face
+    from perilune_shared.export.mcap import export_mcap
+    from perilune_shared.export.rerun_recording import export_rerun
     from perilune_shared.export.rows import by_selection
     from perilune_shared.export.trajectory import export_kitti, export_tum
     from perilune_shared.export.yolo import export_yolo
@@ -76,10 +93,16 @@ def export(
     choose = by_selection(SELECTIONS[selection]) if selection != "all" else None
     if choose is not None and format not in _WITH_LABELS:
         raise UserError(
-            "--selection", "selection", selection, "--format coco, yolo or huggingface: other formats have no labels"
+            "--selection", "selection", selection, f"--format {', '.join(_WITH_LABELS)}: other formats have no labels"
         )
     if link and format != "yolo":
-        raise UserError("--link", "--format", format, "yolo: other formats have no images")
+        raise UserError("--link", "--format", format, "yolo: other formats have no image files")
+    for option, value in (("--trajectory", trajectory), ("--estimates", estimates)):
+        if value is not None and format not in _WITH_TIME_LINE:
+            raise UserError(option, "--format", format, " or ".join(_WITH_TIME_LINE))
+    if estimates is not None and trajectory is None and opened.info.counts.trajectories != 1:
+        found = f"{opened.info.counts.trajectories} descents in the dataset"
+        raise UserError("--estimates", "", found, "--trajectory SCENE/TRAJECTORY, the descent of the estimates")
     if format == "croissant":
         if split is not None:
             raise UserError("--split", "", split, "no --split: Croissant describes the whole dataset")
@@ -89,7 +112,8 @@ def export(
         return
     if out is None:
         raise UserError("--out", "", "none", f"a new folder for the {format} files")
-    known = replaceable(out, _KNOWN_BY[format], overwrite=overwrite, inputs=(dataset,))
+    inputs = (dataset,) if estimates is None else (dataset, estimates)
+    known = replaceable(out, _KNOWN_BY[format], overwrite=overwrite, inputs=inputs)
     with known as folder, progress_bar() as progress:
         match format:
             case "coco":
@@ -103,6 +127,10 @@ def export(
                 done = f"{export_tum(opened, folder, progress, split)} trajectories"
             case "kitti":
                 done = f"{export_kitti(opened, folder, progress, split)} trajectories"
+            case "mcap":
+                done = f"{export_mcap(opened, folder, progress, split, choose, trajectory, estimates)} descents"
+            case "rerun":
+                done = f"{export_rerun(opened, folder, progress, split, choose, trajectory, estimates)} descents"
     answer(f"{out}: {done}")
 
 

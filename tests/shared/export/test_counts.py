@@ -10,6 +10,7 @@ from perilune_shared.cli import export
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.export.coco import export_coco
 from perilune_shared.export.hugging_face import export_hugging_face
+from perilune_shared.export.mcap import export_mcap
 from perilune_shared.export.rows import by_selection
 from perilune_shared.export.trajectory import export_kitti, export_tum
 from perilune_shared.export.yolo import export_yolo
@@ -34,7 +35,9 @@ def test_coco_and_yolo_count_the_same_craters(drawn_root, tmp_path, split):
         assert len(counts) == 1 and counts.pop() > 0
 
 
-@pytest.mark.parametrize("export", [export_coco, export_yolo, export_tum, export_kitti, export_hugging_face])
+@pytest.mark.parametrize(
+    "export", [export_coco, export_yolo, export_tum, export_kitti, export_hugging_face, export_mcap]
+)
 def test_the_progress_bar_of_one_split_reaches_the_end(drawn_root, tmp_path, export):
     progress = Progress(disable=True)
     export(open_dataset(drawn_root), tmp_path / "out", progress, "test")
