@@ -95,8 +95,8 @@ def _focal_px(config: CameraConfig, section: str, parameters: tuple[float, ...])
         raise UserError("configuration", f"{section}.lens", found, expected)
     radius = float(lens.radius(np.array(min(half, np.pi / 2))))
     if not 0 < radius < 1e6:
-        found, expected = config.horizontal_fov_deg, f"below 180 for lens model {config.lens.model}"
-        raise UserError("configuration", f"{section}.horizontal_fov_deg", found, expected)
+        expected = f"below 180 for lens model {config.lens.model}"
+        raise UserError("configuration", f"{section}.horizontal_fov_deg", config.horizontal_fov_deg, expected)
     return config.width_px / 2 / radius
 
 

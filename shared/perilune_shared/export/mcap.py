@@ -44,9 +44,11 @@ def export_mcap(
 
     Returns the number of descents. Only labels that `choose` selects are written. `trajectory` (scene_id/trajectory_id)
     selects one descent, and `estimates` is the filter's output for this descent (see `read_estimates`). Raises
-    UserError if `out` is not empty, an image is missing, no frame is selected or rosbags is not installed.
+    UserError if `out` is not empty, an image is missing, no frame is selected, ROS has no name for a camera's lens
+    model, or rosbags is not installed.
     """
     ros2.message_types()
+    _check_cameras(dataset)
     task = progress.add_task("mcap", total=count_descent_frames(dataset, split, trajectory), unit="frames")
     topics: dict[str, str] = {}
     n_descents = 0
@@ -102,6 +104,14 @@ def _frames(dataset: Dataset, descent: Descent, advance: Any) -> Iterator[_Messa
         yield now, f"{base}/labels", ros2.detections(now, name, shot.labels)
         yield now, f"{base}/annotations", ros2.annotations(now, shot.labels)
         advance()
+
+
+def _check_cameras(dataset: Dataset) -> None:
+    """Raise UserError for a lens model that ROS cannot describe."""
+    for record in _cameras(dataset).values():
+        if ros2.distortion_of(record) is None:
+            expected = f"pinhole, {' or '.join(ros2.FISHEYES)}, which ROS can describe"
+            raise UserError(dataset.store.at("dataset.json"), "camera.model", record.model, expected)
 
 
 def _cameras(dataset: Dataset) -> dict[str, CameraRecord]:

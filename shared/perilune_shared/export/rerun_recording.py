@@ -214,6 +214,9 @@ def _log_cameras(recording: _Recording, dataset: Dataset) -> None:
         rotation_body_from_camera = np.array(record.rotation_camera_from_body).T
         mounting = rr.Transform3D(translation=record.position_in_body_m, mat3x3=rotation_body_from_camera)
         recording.log(_camera(name), mounting, static=True)
+        if record.model != "pinhole":
+            # Rerun has no lens models: show the image without its frustum.
+            continue
         pinhole = rr.Pinhole(
             image_from_camera=record.intrinsics().matrix,
             resolution=[record.width_px, record.height_px],

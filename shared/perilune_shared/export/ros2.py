@@ -145,8 +145,26 @@ def compressed_image(time_ns: int, camera: str, png: bytes, bits: int) -> Any:
     )
 
 
+FISHEYES = ("equidistant", "kannala_brandt")
+"""Lens models that ROS calls equidistant, with the coefficients k1 to k4 of OpenCV's fisheye."""
+
+
+def distortion_of(record: CameraRecord) -> tuple[str, list[float]] | None:
+    """Name and coefficients of a camera's distortion in ROS; None if ROS has no name for its lens model."""
+    if record.model == "pinhole":
+        return "plumb_bob", list(record.distortion)  # Brown-Conrady in OpenCV's order, as in the manifest
+    if record.model not in FISHEYES:
+        return None
+    return "equidistant", [record.parameters.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")]
+
+
 def camera_info(time_ns: int, camera: str, record: CameraRecord) -> Any:
-    """Return a CameraInfo. Images are not rectified, so P is K without a stereo baseline."""
+    """Return a CameraInfo. Images are not rectified, so P is K without a stereo baseline.
+
+    `distortion_of` must have a name for the camera's distortion.
+    """
+    named = distortion_of(record)
+    assert named is not None, record.model
     cx, cy = record.cx_px - 0.5, record.cy_px - 0.5
     matrix = np.array([[record.fx_px, 0, cx], [0, record.fy_px, cy], [0, 0, 1.0]])
     region = _new("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
@@ -155,8 +173,8 @@ def camera_info(time_ns: int, camera: str, record: CameraRecord) -> Any:
         header=_header(time_ns, optical_frame(camera)),
         height=record.height_px,
         width=record.width_px,
-        distortion_model="plumb_bob",  # Brown-Conrady in OpenCV's order, as in the manifest
-        d=np.array(record.distortion),
+        distortion_model=named[0],
+        d=np.array(named[1]),
         k=matrix.ravel(),
         r=np.eye(3).ravel(),
         p=np.column_stack([matrix, np.zeros(3)]).ravel(),

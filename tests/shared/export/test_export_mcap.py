@@ -6,6 +6,7 @@ import sys
 import tracemalloc
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tests.shared.export.test_estimates as estimates
@@ -207,6 +208,29 @@ def test_any_mounting_lens_and_several_cameras(descents, tmp_path):
     assert len(of_topic(messages, "/camera/side/camera_info")) == 2
     assert of_topic(messages, "/camera/side/labels")[0].header.frame_id == "side_optical_frame"
     check_layout(tmp_path / "two", {topic for topic, _, _ in messages})
+
+
+@pytest.mark.parametrize("model, coefficients", [("kannala_brandt", (0.1, -0.02, 3e-3, 0.0)), ("equidistant", ())])
+def test_a_fisheye_is_equidistant_in_ros(descents, tmp_path, model, coefficients):
+    dataset = open_dataset(descents)
+    camera = Camera(64, 64, 40.0, 41.0, 31.0, 33.0, model=model, parameters=coefficients)
+    dataset.info = dataset.info.model_copy(update={"camera": CameraRecord.of(camera, np.eye(3), (0.0, 0.0, 0.0))})
+    messages = by_rosbags(exported(dataset, tmp_path / "one", trajectory="s000/t000") / "s000/t000/t000.mcap")
+    info = of_topic(messages, "/camera/camera_info")[0]
+    assert info.distortion_model == "equidistant" and np.allclose(info.d, coefficients or np.zeros(4))
+    # OpenCV's fisheye, with pixel centres at whole numbers.
+    point = np.array([[0.4, -0.3, 1.0]])
+    drawn, _ = cv2.fisheye.projectPoints(point[:, None], np.zeros(3), np.zeros(3), info.k.reshape(3, 3), info.d)
+    assert np.allclose(drawn.ravel() + 0.5, camera.project(point)[0], atol=1e-9)
+
+
+def test_a_lens_without_a_name_in_ros_is_refused(descents, tmp_path):
+    dataset = open_dataset(descents)
+    camera = Camera(64, 64, 40.0, 41.0, 31.0, 33.0, model="unified", parameters=(1.2,))
+    dataset.info = dataset.info.model_copy(update={"camera": CameraRecord.of(camera, np.eye(3), (0.0, 0.0, 0.0))})
+    with pytest.raises(UserError, match=r"camera.model: got unified, expected pinhole, equidistant or kannala_brandt"):
+        exported(dataset, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_altimeter_looks_down(descents, bags):
