@@ -192,17 +192,18 @@ def shot_of(
     return Shot(*pose, velocity, seed, index, angular_velocity_radps=turn)
 
 
-def open_simulation(config: DatasetConfig) -> SimulatedScene:
+def open_simulation(config: DatasetConfig, kind: str = "nav") -> SimulatedScene:
     """The simulated scene of a configuration.
 
-    Its ground covers the views in `dataset.scene.views` or, without them, the flights of `dataset.nav`.
+    Its ground covers the views in `dataset.scene.views` or, without them, the flights of the dataset `kind`, detect or
+    nav.
     """
     pinhole = camera_of(config.camera).covering_pinhole()
     scene = config.scene or SceneConfig()
     if scene.views:
         view = scene_view(scene, pinhole)
     else:
-        view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
+        view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.ground_flight(kind))
     return simulation_over(config, view, scene_seed(config))
 
 
