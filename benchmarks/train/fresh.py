@@ -7,9 +7,9 @@ seed, one process trains a small detector in each of these ways:
 - larger: on the frames of a second dataset with eight training scenes. Its rendering is counted.
 - share-S: a share S of the frames is rendered during training, by a server of its own. The server is counted.
 
-All train at the same time, each with one thread. Two epochs measure the processor time of an epoch; the number of
-epochs follows from `--cpu-s`, so that each training has a whole cosine of the learning rate. Start-up and these two
-epochs are not counted, nor is the rendering of the small dataset, whose validation frames or poses all ways need. The
+All train at the same time, each with one thread. The second of two epochs measures the processor time of an epoch; the
+number of epochs follows from `--cpu-s`, so that each training has a whole cosine of the learning rate. Start-up and
+these two epochs are not counted, nor is the rendering of the small dataset, whose validation frames or poses all ways need. The
 figure is the AP of the moving average of the weights after the last epoch, over all validation frames.
 """
 
@@ -69,7 +69,7 @@ NETWORK = (
     "detect.precision=float32",
     "detect.device=cpu",
 )
-_CALIBRATION_EPOCHS = 3
+_CALIBRATION_EPOCHS = 2
 _KEPT = ("val/ap50_paper", "val/f1", "val/recall")
 
 
