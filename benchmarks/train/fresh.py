@@ -9,8 +9,8 @@ seed, one process trains a small detector in each of these ways:
 
 All train at the same time, each with one thread. The second of two epochs measures the processor time of an epoch; the
 number of epochs follows from `--cpu-s`, so that each training has a whole cosine of the learning rate. Start-up and
-these two epochs are not counted, nor is the rendering of the small dataset, whose validation frames or poses all ways need. The
-figure is the AP of the moving average of the weights after the last epoch, over all validation frames.
+these two epochs are not counted, nor is the rendering of the small dataset, whose validation frames and poses all ways
+need. The figure is the AP of the moving average of the weights after the last epoch, over all validation frames.
 """
 
 import argparse
