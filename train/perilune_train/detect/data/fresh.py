@@ -2,9 +2,9 @@
 
 A visit is a number of consecutive rendered frames of one scene. All frames of a visit have one Sun: its azimuth is
 uniform, its elevation comes from a random training frame. A rendered frame has the pose and the velocity of the
-training frame that it replaces, turned about the vertical through the site as one rigid body, so that the azimuth of
-the Sun relative to the camera stays the training frame's. So positions, attitudes, motion blur and the direction of
-light are distributed as in the training frames; only the terrain differs.
+training frame that it replaces, turned about the vertical through the site as one rigid body, by the quarter turn that
+brings the azimuth of the Sun relative to the camera nearest to the training frame's. Ground is square and fits the
+training frames, so after another turn the corners of a high frame would be beyond its edge.
 """
 
 from collections.abc import Iterator, Mapping
@@ -123,7 +123,8 @@ class FreshFrames(TrainingFrames):
         azimuth_deg, elevation_deg = drawn.uniform(0, 360), drawn.choice(self._sun_elevation_deg)
         sun = row["sun_direction"]
         turn_rad = np.arctan2(-sun[0], -sun[1]) - np.radians(azimuth_deg)
-        turn = matrix_from_rotation_vector(np.array([0.0, 0.0, turn_rad]))
+        quarter_turn_rad = np.pi / 2 * np.round(turn_rad / (np.pi / 2))
+        turn = matrix_from_rotation_vector(np.array([0.0, 0.0, quarter_turn_rad]))
         noise = np.random.default_rng([seed, _FRAMES, epoch, position])
         return FreshView(
             turn @ row["position_m"],
