@@ -74,7 +74,15 @@ def test_a_view_is_a_training_pose_turned_about_the_vertical_towards_the_sun(ope
         (x0, y0), (x1, y1) = (turn.T @ sun_direction(*view.sun_deg))[:2], row["sun_direction"][:2]
         assert x0 * x1 + y0 * y1 >= np.cos(np.radians(45)) * np.hypot(x0, y0) * np.hypot(x1, y1) - 1e-9
         np.testing.assert_allclose(view.velocity_mps, turn @ frames._velocity_mps[key[1]])
-    assert len({tuple(np.round(frames.view(key).rotation_camera_from_site.ravel())) for key in frames.keys(0)}) > 2
+        # The farthest |x| or |y| that a corner of the image shows on level ground stays.
+        rays = frames.server.served.camera.rays([[0.0, 0.0], [96.0, 0.0], [0.0, 96.0], [96.0, 96.0]])
+        reach = [
+            np.abs(place - (rays @ rotation) / (rays @ rotation)[:, 2:] * place[2])[:, :2].max()
+            for place, rotation in ((view.position_m, view.rotation_camera_from_site), (row["position_m"], before))
+        ]
+        assert reach[0] == pytest.approx(reach[1])
+    keys = [key for epoch in range(4) for key in frames.keys(epoch)]
+    assert len({tuple(np.round(frames.view(key).rotation_camera_from_site.ravel())) for key in keys}) == 4
     assert len({frames.view(key).index for key in frames.keys(0)}) == 24
 
 
